@@ -1,0 +1,1 @@
+"""Episodes on disk: rosbag2 MCAP folders and the clips cut from them."""

@@ -1,0 +1,256 @@
+"""Frozen data passed between stages: V views, T frames, J joints, A arms, O objects, H W pixels.
+
+Arrays are copied to the stated dtype only where needed, checked on construction and set
+read-only. `T_a_b` maps b-coordinates into a: `p_a = T_a_b @ p_b`. Units are SI, images are RGB.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.errors import (
+    CalibrationError,
+    MtvWorldError,
+    ObservationError,
+    TrajectoryError,
+)
+
+FloatArray = NDArray[np.float64]
+ByteArray = NDArray[np.uint8]
+BoolArray = NDArray[np.bool_]
+
+#: distortion models of sensor_msgs/CameraInfo and how many coefficients OpenCV reads for each
+DISTORTION_MODELS = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14)}
+
+
+def _freeze(
+    owner: Any,
+    field: str,
+    shape: tuple[int | None, ...],
+    dtype: type,
+    error: type[MtvWorldError] = MtvWorldError,
+) -> None:
+    """Casts, checks the shape of, and sets read-only one array field (None = any length)."""
+    array = np.asarray(getattr(owner, field), dtype=dtype)
+    fits = array.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = tuple('any' if n is None else n for n in shape)
+        raise error(f'{type(owner).__name__}.{field} has shape {array.shape}, expected {wanted}')
+    view = array.view()
+    view.flags.writeable = False
+    object.__setattr__(owner, field, view)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraModel:
+    """One calibrated view.
+
+    Attributes:
+        view: name of the view, e.g. `low`.
+        width: image width [px].
+        height: image height [px].
+        K: (3, 3) intrinsic matrix [px].
+        distortion_model: `none`, `plumb_bob` or `rational_polynomial`.
+        distortion: coefficients in OpenCV order (k1 k2 p1 p2 k3 ...); empty for `none`.
+        mount_link: robot link that carries the camera; the base link for a fixed camera.
+        T_mount_camera: (4, 4) pose of the optical frame (x right, y down, z ahead) [m].
+    """
+
+    view: str
+    width: int
+    height: int
+    K: FloatArray
+    distortion_model: str = 'none'
+    distortion: FloatArray = ()  # type: ignore[assignment]
+    mount_link: str
+    T_mount_camera: FloatArray
+
+    def __post_init__(self) -> None:
+        _freeze(self, 'K', (3, 3), np.float64, CalibrationError)
+        _freeze(self, 'T_mount_camera', (4, 4), np.float64, CalibrationError)
+        _freeze(self, 'distortion', (None,), np.float64, CalibrationError)
+        if self.width < 1 or self.height < 1:
+            raise CalibrationError(
+                f"camera '{self.view}' has size {self.width}x{self.height}; both must be positive"
+            )
+        if self.distortion_model not in DISTORTION_MODELS:
+            raise CalibrationError(
+                f"camera '{self.view}' has distortion_model '{self.distortion_model}'; known are "
+                f'{sorted(DISTORTION_MODELS)}'
+            )
+        if len(self.distortion) not in DISTORTION_MODELS[self.distortion_model]:
+            raise CalibrationError(
+                f"camera '{self.view}' has {len(self.distortion)} coefficients for "
+                f"'{self.distortion_model}', expected one of "
+                f'{DISTORTION_MODELS[self.distortion_model]}'
+            )
+        if not (np.isfinite(self.K).all() and self.K[0, 0] > 0 and self.K[1, 1] > 0):
+            raise CalibrationError(
+                f"camera '{self.view}' is not calibrated: K = {self.K.tolist()}; fx and fy must "
+                'be positive (set them in CameraInfo or the calibration file)'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointTrajectory:
+    """Joint positions over time.
+
+    Attributes:
+        joint_names: J names.
+        times: (T,) increasing [s], relative to the trajectory's start.
+        positions: (T, J) [rad or m].
+        velocities: (T, J) [rad/s or m/s], or None where not given.
+    """
+
+    joint_names: tuple[str, ...]
+    times: FloatArray
+    positions: FloatArray
+    velocities: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'joint_names', tuple(self.joint_names))
+        num_joints = len(self.joint_names)
+        _freeze(self, 'times', (None,), np.float64, TrajectoryError)
+        num_points = len(self.times)
+        _freeze(self, 'positions', (num_points, num_joints), np.float64, TrajectoryError)
+        if self.velocities is not None:
+            _freeze(self, 'velocities', (num_points, num_joints), np.float64, TrajectoryError)
+        if num_points == 0:
+            raise TrajectoryError('the trajectory is empty: it needs at least one point')
+        if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
+            bad = int(np.argmax(np.diff(self.times) <= 0)) + 1 if num_points > 1 else 0
+            raise TrajectoryError(
+                f'time_from_start is not increasing at point {bad}: '
+                f'{self.times[max(bad - 1, 0) : bad + 1].tolist()} s'
+            )
+        if not np.isfinite(self.positions).all():
+            point, joint = np.argwhere(~np.isfinite(self.positions))[0]
+            raise TrajectoryError(
+                f"joint '{self.joint_names[joint]}' is not finite at point {point}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """What the robot sees and where it stands at one instant.
+
+    Attributes:
+        cameras: V calibrated views, in the model's order, for the size of `frames`.
+        frames: (V, H, W, 3) uint8 RGB.
+        positions: (J,) in the robot's joint order [rad or m].
+        stamp_ns: time of the frames [ns].
+    """
+
+    cameras: tuple[CameraModel, ...]
+    frames: ByteArray
+    positions: FloatArray
+    stamp_ns: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'cameras', tuple(self.cameras))
+        _freeze(self, 'frames', (len(self.cameras), None, None, 3), np.uint8, ObservationError)
+        _freeze(self, 'positions', (None,), np.float64, ObservationError)
+        height, width = self.frames.shape[1:3]
+        for camera in self.cameras:
+            if (camera.width, camera.height) != (width, height):
+                raise ObservationError(
+                    f"view '{camera.view}' has frames of {width}x{height} but a camera model of "
+                    f'{camera.width}x{camera.height}'
+                )
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views, in order."""
+        return tuple(camera.view for camera in self.cameras)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MultiViewVideo:
+    """Observed, trajectory or predicted frames of all views on one clock.
+
+    Attributes:
+        views: V names.
+        times: (T,) [s], relative to the observation the video belongs to.
+        frames: (V, T, H, W, 3) uint8 RGB.
+    """
+
+    views: tuple[str, ...]
+    times: FloatArray
+    frames: ByteArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'views', tuple(self.views))
+        _freeze(self, 'times', (None,), np.float64)
+        _freeze(self, 'frames', (len(self.views), len(self.times), None, None, 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rollout:
+    """Frames a world model predicted; frame k shows the state after command k.
+
+    Attributes:
+        video: the T predicted frames; `video.times` > 0 counts from the observation.
+        seed: seed of the noise.
+        start_frame: (V, H, W, 3) uint8 RGB, the observed frame it starts from, at model size.
+        positions: (T, J) commanded positions at the predicted times [rad or m].
+    """
+
+    video: MultiViewVideo
+    seed: int
+    start_frame: ByteArray
+    positions: FloatArray
+
+    def __post_init__(self) -> None:
+        num_views, num_frames, height, width, _ = self.video.frames.shape
+        _freeze(self, 'start_frame', (num_views, height, width, 3), np.uint8)
+        _freeze(self, 'positions', (num_frames, None), np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectMasks:
+    """Masks of named objects in a video.
+
+    Attributes:
+        names: O names.
+        masks: (V, O, T, H, W) bool.
+        status: V tuples of O words: `ok`, or why the mask is not to be trusted (`absent`,
+            `ambiguous`, `out_of_palette`, `area_jump`, `teleport`).
+    """
+
+    names: tuple[str, ...]
+    masks: BoolArray
+    status: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'names', tuple(self.names))
+        object.__setattr__(self, 'status', tuple(tuple(row) for row in self.status))
+        _freeze(self, 'masks', (len(self.status), len(self.names), None, None, None), np.bool_)
+        if any(len(row) != len(self.names) for row in self.status):
+            raise MtvWorldError(f'status has rows of other length than {len(self.names)} objects')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SuccessEstimate:
+    """How likely the task succeeds, given the world model.
+
+    Attributes:
+        probability: in [0, 1]; NaN = abstains.
+        interval: (low, high); NaN where it abstains.
+        jaccard: (V, O) Jaccard index, NaN where absent.
+        reasons: what the estimate rests on, or why it abstains.
+    """
+
+    probability: float
+    interval: tuple[float, float]
+    jaccard: FloatArray
+    reasons: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'reasons', tuple(self.reasons))
+        _freeze(self, 'jaccard', (None, None), np.float64)

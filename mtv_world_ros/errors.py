@@ -1,0 +1,60 @@
+"""Errors raised on purpose: each says the value, what would be valid, and where to set it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class MtvWorldError(Exception):
+    """Base of every error a user can cause; its text is meant to be read by that user."""
+
+
+class ConfigError(MtvWorldError):
+    """A YAML file, parameter or command-line value is wrong."""
+
+
+class RobotError(MtvWorldError):
+    """A robot description cannot be used, or joints do not belong to it."""
+
+
+class CalibrationError(MtvWorldError):
+    """A camera's intrinsics or pose are missing, inconsistent or have changed."""
+
+
+class TrajectoryError(MtvWorldError):
+    """A joint trajectory is rejected."""
+
+
+class ObservationError(MtvWorldError):
+    """Images or joint states are missing, stale, out of sync or in an unsupported form."""
+
+
+class EpisodeError(MtvWorldError):
+    """A recorded episode cannot be read, or lacks something."""
+
+
+class CheckpointError(MtvWorldError):
+    """A checkpoint folder is incomplete or is for another model."""
+
+
+class ModelMemoryError(MtvWorldError):
+    """The device ran out of memory; the rollout was dropped."""
+
+
+class TrainingError(MtvWorldError):
+    """Training cannot go on (no clips, loss not finite)."""
+
+
+class SimulatorError(MtvWorldError):
+    """The simulator cannot render or build a scene."""
+
+
+class RolloutPreempted(MtvWorldError):
+    """A newer trajectory arrived; the running rollout was given up."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Returns ` (did you mean 'x'?)` for the known name nearest to `name`, else an empty text."""
+    close = get_close_matches(name, list(known), n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ''

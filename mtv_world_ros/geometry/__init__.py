@@ -1,0 +1,1 @@
+"""Robots and cameras: forward kinematics, projection, resampling."""

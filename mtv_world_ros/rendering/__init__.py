@@ -1,0 +1,1 @@
+"""Trajectory videos: the control signal drawn into each view."""

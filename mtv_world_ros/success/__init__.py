@@ -1,0 +1,1 @@
+"""Object masks, the Jaccard index and the success estimate."""
