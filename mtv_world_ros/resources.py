@@ -1,0 +1,39 @@
+"""Where the installed files that are not code lie: config, launch and resource folders."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mtv_world_ros.errors import ConfigError
+
+PACKAGE = 'mtv_world_ros'
+
+
+def _candidates() -> list[Path]:
+    source = Path(__file__).resolve().parent.parent
+    roots = [source] if (source / 'package.xml').is_file() else []
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        roots.append(Path(get_package_share_directory(PACKAGE)))
+    except (ImportError, LookupError):
+        pass
+    return [*roots, Path(sys.prefix) / 'share' / PACKAGE]
+
+
+def share_path(*parts: str) -> Path:
+    """Returns the path of a bundled file or folder.
+
+    Looks in the source tree, then in the ament share folder, then in the pip prefix.
+
+    Raises:
+        ConfigError: none of them holds it.
+    """
+    roots = _candidates()
+    for root in roots:
+        path = root.joinpath(*parts)
+        if path.exists():
+            return path
+    searched = ', '.join(str(root) for root in roots)
+    raise ConfigError(f"'{'/'.join(parts)}' is not among the installed files; looked in {searched}")
