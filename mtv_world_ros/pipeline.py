@@ -1,0 +1,353 @@
+"""The main path: an observation and a joint trajectory in, imagined video and estimate out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from math import ceil
+from types import MappingProxyType
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data_types import (
+    ByteArray,
+    CameraModel,
+    FloatArray,
+    JointTrajectory,
+    MultiViewVideo,
+    ObjectMasks,
+    Observation,
+    Rollout,
+    SuccessEstimate,
+)
+from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot import RobotModel, check_positions
+from mtv_world_ros.rendering.trajectory_video import (
+    TrajectoryVideoConfig,
+    render_trajectory_video,
+)
+from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.success.estimator import SuccessEstimator
+from mtv_world_ros.success.segmenter import Segmenter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldModelSpec:
+    """What a world model expects and gives.
+
+    Attributes:
+        views: names of the V views, in order.
+        fps: predicted frames a second [Hz].
+        num_frames: T, predicted frames a chunk (the observed frame comes on top).
+        width: frame width [px].
+        height: frame height [px].
+        robot: name of the robot it was trained with.
+    """
+
+    views: tuple[str, ...]
+    fps: float
+    num_frames: int
+    width: int
+    height: int
+    robot: str
+
+    @property
+    def chunk_seconds(self) -> float:
+        """Duration of a chunk [s]."""
+        return self.num_frames / self.fps
+
+
+class WorldModel(Protocol):
+    """Predicts one chunk of frames."""
+
+    @property
+    def spec(self) -> WorldModelSpec: ...
+
+    def predict(
+        self,
+        start_frame: ByteArray,
+        trajectory_frames: ByteArray,
+        *,
+        seed: int,
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+    ) -> ByteArray:
+        """Returns (V, T, H, W, 3) uint8 RGB predicted frames.
+
+        Args:
+            start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
+            trajectory_frames: (V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
+                command k, frame 0 the start.
+            seed: seed of the noise.
+            num_inference_steps: denoising steps.
+            should_stop: asked between steps.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+            ModelMemoryError: the device ran out of memory.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """One imagined chunk and what was made on the way.
+
+    Attributes:
+        rollout: the predicted frames; `video.times` [s] counts from the rollout's observation.
+        trajectory_video: 1 + T control frames, frame 0 at the chunk's start.
+        start_masks: object masks of the chunk's start frame (T = 1).
+        masks: object masks of the predicted frames.
+        success: the estimate at the end of this chunk.
+        cameras: the V cameras at the model's size.
+        stamp_ns: stamp of the rollout's observation [ns].
+        chunk: index of this chunk in its rollout.
+        num_chunks: chunks of the rollout.
+        seconds: time spent by stage [s].
+    """
+
+    rollout: Rollout
+    trajectory_video: MultiViewVideo
+    start_masks: ObjectMasks
+    masks: ObjectMasks
+    success: SuccessEstimate
+    cameras: tuple[CameraModel, ...]
+    stamp_ns: int
+    chunk: int
+    num_chunks: int
+    seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def end_observation(self) -> Observation:
+        """The last predicted frame as an observation, for chaining the next chunk onto it."""
+        video = self.rollout.video
+        return Observation(
+            cameras=self.cameras,
+            frames=video.frames[:, -1],
+            positions=self.rollout.positions[-1],
+            stamp_ns=self.stamp_ns + round(float(video.times[-1]) * 1e9),
+        )
+
+
+def _never() -> bool:
+    return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pipeline:
+    """Everything between a message and a prediction; holds no state between rollouts.
+
+    Attributes:
+        robot: joints, limits and tools.
+        world_model: predicts chunks.
+        segmenter: finds the objects' masks.
+        estimator: judges the outcome.
+        rendering: how trajectory videos look; must be what the model was trained with.
+        object_mask: whether trajectory videos carry the object masks.
+        objects: names of the objects; empty = the ones the instruction names.
+    """
+
+    robot: RobotModel
+    world_model: WorldModel
+    segmenter: Segmenter
+    estimator: SuccessEstimator
+    rendering: TrajectoryVideoConfig
+    object_mask: bool = True
+    objects: tuple[str, ...] = ()
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """Of the world model."""
+        return self.world_model.spec
+
+    def accept(self, trajectory: JointTrajectory, current: FloatArray | None) -> JointTrajectory:
+        """Returns the trajectory in the robot's joint order, or says why it is rejected.
+
+        Raises:
+            TrajectoryError: joints missing, positions outside the limits.
+        """
+        matched = match_joints(trajectory, self.robot, current)
+        check_positions(self.robot, matched.positions)
+        return matched
+
+    def imagine(
+        self,
+        observation: Observation,
+        trajectory: JointTrajectory,
+        *,
+        instruction: str = '',
+        seed: int = 0,
+        num_inference_steps: int = 4,
+        should_stop: Callable[[], bool] = _never,
+    ) -> Iterator[Prediction]:
+        """Yields the predicted chunks, each as soon as it is ready.
+
+        Args:
+            observation: V views in the model's order, any size.
+            trajectory: times count from the observation's stamp.
+            instruction: what the robot was told; names the objects unless they are given.
+            seed: of the noise; chunk k uses `seed + k`.
+            num_inference_steps: denoising steps a chunk.
+            should_stop: asked between denoising steps.
+
+        Raises:
+            TrajectoryError: the trajectory does not fit the robot.
+            ObservationError: the views are not the model's.
+            RolloutPreempted: `should_stop` said so.
+            ModelMemoryError: the device ran out of memory.
+        """
+        spec = self.spec
+        trajectory = self.accept(trajectory, observation.positions)
+        total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
+        num_chunks = ceil(total / spec.num_frames)
+        start = fit_observation(observation, spec)
+        names = self.objects or objects_from_instruction(instruction)
+        times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
+        positions = resample(trajectory, observation.positions, times)
+        for chunk in range(num_chunks):
+            window = slice(chunk * spec.num_frames, (chunk + 1) * spec.num_frames + 1)
+            prediction = self._imagine_chunk(
+                start,
+                times[window],
+                positions[window],
+                min(spec.num_frames, total - chunk * spec.num_frames),
+                names=names,
+                instruction=instruction,
+                seed=seed + chunk,
+                num_inference_steps=num_inference_steps,
+                should_stop=should_stop,
+                stamp_ns=observation.stamp_ns,
+                chunk=chunk,
+                num_chunks=num_chunks,
+            )
+            yield prediction
+            start = prediction.end_observation
+
+    def _imagine_chunk(
+        self,
+        start: Observation,
+        times: FloatArray,
+        positions: FloatArray,
+        num_kept: int,
+        *,
+        names: tuple[str, ...],
+        instruction: str,
+        seed: int,
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+        stamp_ns: int,
+        chunk: int,
+        num_chunks: int,
+    ) -> Prediction:
+        clock = _Clock()
+        start_masks = self.segmenter.segment(start.frames[:, None], names)
+        clock.lap('start masks')
+        control = self.draw(start.cameras, positions, times, start_masks)
+        clock.lap('trajectory video')
+        frames = self.world_model.predict(
+            start.frames,
+            control.frames,
+            seed=seed,
+            num_inference_steps=num_inference_steps,
+            should_stop=should_stop,
+        )[:, :num_kept]
+        clock.lap('model')
+        masks = self.segmenter.segment(frames, names, first_masks=start_masks.masks[:, :, 0])
+        clock.lap('masks')
+        rollout = Rollout(
+            video=MultiViewVideo(
+                views=start.views, times=times[1 : num_kept + 1], frames=frames
+            ),
+            seed=seed,
+            start_frame=start.frames,
+            positions=positions[1 : num_kept + 1],
+        )
+        success = self.estimator.estimate(
+            masks,
+            start_masks,
+            start.cameras,
+            tuple(
+                camera_poses(camera, self.robot, rollout.positions[-1:])[0]
+                for camera in start.cameras
+            ),
+            instruction,
+        )
+        clock.lap('success')
+        return Prediction(
+            rollout=rollout,
+            trajectory_video=control,
+            start_masks=start_masks,
+            masks=masks,
+            success=success,
+            cameras=start.cameras,
+            stamp_ns=stamp_ns,
+            chunk=chunk,
+            num_chunks=num_chunks,
+            seconds=MappingProxyType(clock.seconds),
+        )
+
+    def draw(
+        self,
+        cameras: tuple[CameraModel, ...],
+        positions: FloatArray,
+        times: FloatArray,
+        start_masks: ObjectMasks,
+    ) -> MultiViewVideo:
+        """Returns the 1 + T frames of the trajectory video, at the cameras' size."""
+        return render_trajectory_video(
+            cameras=cameras,
+            robot=self.robot,
+            positions=positions,
+            times=times,
+            object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
+            config=self.rendering,
+        )
+
+
+class _Clock:
+    """Time per stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
+
+
+def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:
+    """Returns the observation with frames and cameras at the model's size.
+
+    Raises:
+        ObservationError: the views are not the model's.
+    """
+    if observation.views != spec.views:
+        raise ObservationError(
+            f'the observation has views {list(observation.views)}, the model was trained on '
+            f'{list(spec.views)} in this order'
+        )
+    if observation.frames.shape[1:3] == (spec.height, spec.width):
+        return observation
+    return Observation(
+        cameras=tuple(scaled(c, spec.width, spec.height) for c in observation.cameras),
+        frames=resize_frames(observation.frames, spec.width, spec.height),
+        positions=observation.positions,
+        stamp_ns=observation.stamp_ns,
+    )
+
+
+def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
+    """Returns (N, height, width, 3) frames, averaged over the area where they shrink."""
+    if frames.shape[1:3] == (height, width):
+        return frames
+    shrinks = height <= frames.shape[1] and width <= frames.shape[2]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    size = (width, height)
+    return np.stack([cv2.resize(frame, size, interpolation=method) for frame in frames])
