@@ -254,3 +254,29 @@ class SuccessEstimate:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'reasons', tuple(self.reasons))
         _freeze(self, 'jaccard', (None, None), np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldModelSpec:
+    """What a world model expects and gives.
+
+    Attributes:
+        views: names of the V views, in order.
+        fps: predicted frames a second [Hz].
+        num_frames: T, predicted frames a chunk (the observed frame comes on top).
+        width: frame width [px].
+        height: frame height [px].
+        robot: name of the robot it was trained with.
+    """
+
+    views: tuple[str, ...]
+    fps: float
+    num_frames: int
+    width: int
+    height: int
+    robot: str
+
+    @property
+    def chunk_seconds(self) -> float:
+        """Duration of a chunk [s]."""
+        return self.num_frames / self.fps

@@ -22,6 +22,7 @@ from mtv_world_ros.data_types import (
     Observation,
     Rollout,
     SuccessEstimate,
+    WorldModelSpec,
 )
 from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
@@ -34,32 +35,6 @@ from mtv_world_ros.rendering.trajectory_video import (
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.segmenter import Segmenter
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorldModelSpec:
-    """What a world model expects and gives.
-
-    Attributes:
-        views: names of the V views, in order.
-        fps: predicted frames a second [Hz].
-        num_frames: T, predicted frames a chunk (the observed frame comes on top).
-        width: frame width [px].
-        height: frame height [px].
-        robot: name of the robot it was trained with.
-    """
-
-    views: tuple[str, ...]
-    fps: float
-    num_frames: int
-    width: int
-    height: int
-    robot: str
-
-    @property
-    def chunk_seconds(self) -> float:
-        """Duration of a chunk [s]."""
-        return self.num_frames / self.fps
 
 
 class WorldModel(Protocol):

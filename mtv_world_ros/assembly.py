@@ -1,0 +1,101 @@
+"""The composition root: a checkpoint and config files become a pipeline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.geometry.robot import load_robot
+from mtv_world_ros.pipeline import Pipeline, WorldModel
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.success.estimator import SuccessEstimator, load_tasks
+from mtv_world_ros.success.segmenter import ColourSegmenter
+
+BUNDLED = 'bundled'
+
+
+def checkpoint_path(name: str | Path) -> Path:
+    """Returns the folder of a checkpoint; `bundled` is the one that ships with the package."""
+    return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
+
+
+def robot_path(name: str | Path) -> Path:
+    """Returns the YAML of a robot given by path or by the name of a bundled one.
+
+    Raises:
+        ConfigError: neither.
+    """
+    path = Path(name)
+    if path.suffix in ('.yaml', '.yml'):
+        if not path.is_file():
+            raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
+        return path
+    return share_path('config', 'robots', f'{name}.yaml')
+
+
+def load_pipeline(
+    checkpoint: str | Path = BUNDLED,
+    *,
+    robot: str | Path | None = None,
+    objects: tuple[str, ...] = (),
+    task: str | None = None,
+    device: str = 'cpu',
+    dtype: str = 'auto',
+    num_threads: int = 0,
+) -> Pipeline:
+    """Loads a checkpoint and puts the main path together around it.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        robot: YAML file or name of a bundled robot; default: the one of the checkpoint.
+        objects: names of the objects; empty = those the instruction names.
+        task: name of the task to judge; default: the one the instruction matches.
+        device: `cpu`, `cuda`, ...
+        dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
+        num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
+
+    Raises:
+        CheckpointError, ConfigError, RobotError: see their messages.
+    """
+    from mtv_world_ros.model.checkpoint import load_checkpoint
+    from mtv_world_ros.model.runtime import choose_dtype, set_num_threads
+    from mtv_world_ros.model.world_model import DiffusionWorldModel
+
+    set_num_threads(num_threads)
+    loaded = load_checkpoint(checkpoint_path(checkpoint))
+    world_model = DiffusionWorldModel(loaded, device=device, dtype=choose_dtype(dtype, device))
+    return assemble(
+        loaded.card, world_model, robot=robot, objects=objects, task=task
+    )
+
+
+def assemble(
+    card: Any,
+    world_model: WorldModel,
+    *,
+    robot: str | Path | None = None,
+    objects: tuple[str, ...] = (),
+    task: str | None = None,
+) -> Pipeline:
+    """Puts the main path around a world model trained as the card says.
+
+    Raises:
+        CheckpointError: the robot is not the one the model was trained with.
+    """
+    model = load_robot(robot_path(robot or card['robot']))
+    if model.name != card['robot']:
+        raise CheckpointError(
+            f"the checkpoint was trained with robot '{card['robot']}', 'robot_file' describes "
+            f"'{model.name}'; use the trained one or train on this robot's episodes"
+        )
+    return Pipeline(
+        robot=model,
+        world_model=world_model,
+        segmenter=ColourSegmenter(),
+        estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task),
+        rendering=TrajectoryVideoConfig(**card['rendering']),
+        object_mask=card['object_mask'],
+        objects=objects,
+    )

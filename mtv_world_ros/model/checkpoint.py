@@ -1,0 +1,164 @@
+"""Checkpoint folders: diffusers' layout, safetensors only, and `world_model.json` beside it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import FlowMatchEulerDiscreteScheduler
+
+from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+
+CARD = 'world_model.json'
+PARTS = ('transformer', 'autoencoder', 'scheduler')
+_CARD_KEYS = {
+    'views': list,
+    'fps': (int, float),
+    'num_frames': int,
+    'width': int,
+    'height': int,
+    'robot': str,
+    'control': str,
+    'object_mask': bool,
+    'rendering': dict,
+    'trained_on': dict,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checkpoint:
+    """The parts of a trained world model.
+
+    Attributes:
+        transformer: the diffusion transformer.
+        autoencoder: pixels to latents and back.
+        scheduler: noise levels and the step rule.
+        card: `world_model.json`: views, fps, num_frames (T), width, height, robot, control,
+            object_mask, rendering, trained_on.
+    """
+
+    transformer: MultiViewWanTransformer
+    autoencoder: SpaceToDepthAutoencoder
+    scheduler: FlowMatchEulerDiscreteScheduler
+    card: Mapping[str, Any]
+
+
+def save_checkpoint(
+    checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype = torch.float32
+) -> None:
+    """Writes a checkpoint folder; it appears under its name only when it is whole."""
+    partial = folder.with_name(folder.name + '.partial')
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    _check_card(checkpoint.card, partial)
+    stored = MultiViewWanTransformer.from_config(checkpoint.transformer.config)
+    stored.load_state_dict(checkpoint.transformer.state_dict())
+    stored.to(dtype).save_pretrained(partial / 'transformer', safe_serialization=True)
+    checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
+    checkpoint.scheduler.save_pretrained(partial / 'scheduler')
+    (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
+    if folder.exists():
+        old = folder.with_name(folder.name + '.old')
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+        partial.rename(folder)
+        shutil.rmtree(old)
+    else:
+        partial.rename(folder)
+
+
+def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Checkpoint:
+    """Reads a checkpoint folder.
+
+    Raises:
+        CheckpointError: a part is missing, is a pickle, or belongs to another model.
+    """
+    folder = Path(folder)
+    card = read_card(folder)
+    for part in PARTS:
+        if not (folder / part).is_dir():
+            raise CheckpointError(f"checkpoint '{folder}' has no folder '{part}/'")
+    pickles = [p.name for p in folder.rglob('*') if p.suffix in ('.bin', '.pt', '.pth', '.ckpt')]
+    if pickles:
+        raise CheckpointError(
+            f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
+            'loaded: convert them and remove these'
+        )
+    return Checkpoint(
+        transformer=_load_part(MultiViewWanTransformer, folder / 'transformer', dtype),
+        autoencoder=_load_part(SpaceToDepthAutoencoder, folder / 'autoencoder', dtype),
+        scheduler=FlowMatchEulerDiscreteScheduler.from_pretrained(folder / 'scheduler'),
+        card=card,
+    )
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """Returns the checked contents of `world_model.json`.
+
+    Raises:
+        CheckpointError: missing, not JSON, or with missing, unknown or ill-typed keys.
+    """
+    path = Path(folder) / CARD
+    if not path.is_file():
+        raise CheckpointError(
+            f"'{folder}' is not a checkpoint: it has no {CARD}; train one with 'mtv-world train' "
+            "or set 'checkpoint' to a folder that has it"
+        )
+    try:
+        card = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
+    _check_card(card, path)
+    return card
+
+
+def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
+    """Returns what a card says of the model's input and output."""
+    return WorldModelSpec(
+        views=tuple(card['views']),
+        fps=float(card['fps']),
+        num_frames=card['num_frames'],
+        width=card['width'],
+        height=card['height'],
+        robot=card['robot'],
+    )
+
+
+def _check_card(card: Mapping[str, Any], path: Path) -> None:
+    for key in card:
+        if key not in _CARD_KEYS:
+            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, _CARD_KEYS)}")
+    for key, kind in _CARD_KEYS.items():
+        if key not in card:
+            raise CheckpointError(f"'{path}': key '{key}' is missing")
+        if not isinstance(card[key], kind):
+            raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
+
+
+def _load_part(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
+    config = json.loads((folder / 'config.json').read_text())
+    found = config.get('_class_name')
+    if found != kind.__name__:
+        raise CheckpointError(f"'{folder}' holds a {found}, expected a {kind.__name__}")
+    try:
+        part, info = kind.from_pretrained(
+            folder,
+            torch_dtype=dtype,
+            use_safetensors=True,
+            low_cpu_mem_usage=False,
+            output_loading_info=True,
+        )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise CheckpointError(f"'{folder}' cannot be loaded: {error}") from error
+    bad = {k: info[k] for k in ('missing_keys', 'unexpected_keys', 'mismatched_keys') if info[k]}
+    if bad:
+        raise CheckpointError(f"'{folder}' does not fit its config: {bad}")
+    return part.eval()

@@ -1,0 +1,67 @@
+"""What the transformer is conditioned on, in latents: control, start image, reference.
+
+Shape letters: B batch, V views, T frames, H W pixels, C latent channels, F latent frames,
+h w = latent size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conditioning:
+    """Latents a chunk is denoised under.
+
+    Attributes:
+        control: (B, V, C, F, h, w) of the trajectory video's frames 1 .. T.
+        start_control: (B, V, C, h, w) of its frame 0.
+        start: (B, V, C, F, h, w) the start image in every frame's channel slot.
+        reference: (B, V, C, h, w) of the start image.
+    """
+
+    control: Tensor
+    start_control: Tensor
+    start: Tensor
+    reference: Tensor
+
+
+def encode_frames(autoencoder: SpaceToDepthAutoencoder, frames: Tensor) -> Tensor:
+    """Returns (B, V, C, F, h, w) latents of (B, V, T, H, W, 3) uint8 RGB frames."""
+    video = frames.to(autoencoder.dtype).div(127.5).sub(1.0).movedim(-1, 2)
+    latents = autoencoder.encode(video.flatten(0, 1))
+    return latents.unflatten(0, frames.shape[:2])
+
+
+def decode_frames(autoencoder: SpaceToDepthAutoencoder, latents: Tensor) -> Tensor:
+    """Returns (B, V, T, H, W, 3) uint8 RGB frames of (B, V, C, F, h, w) latents."""
+    video = autoencoder.decode(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
+    pixels = video.float().add(1.0).mul(127.5).round().clamp(0, 255)
+    return pixels.to(torch.uint8).movedim(2, -1)
+
+
+def condition(
+    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, trajectory_frames: Tensor
+) -> Conditioning:
+    """Returns the latents to denoise under.
+
+    Args:
+        autoencoder: of the preset.
+        start_frame: (B, V, H, W, 3) uint8 RGB.
+        trajectory_frames: (B, V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
+            command k.
+    """
+    control = encode_frames(autoencoder, trajectory_frames)
+    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
+    num_frames = control.shape[3] - 1
+    return Conditioning(
+        control=control[:, :, :, 1:],
+        start_control=control[:, :, :, 0],
+        start=reference.unsqueeze(3).expand(-1, -1, -1, num_frames, -1, -1),
+        reference=reference,
+    )

@@ -1,0 +1,54 @@
+"""Rotary position embedding of several views in one token sequence."""
+
+from __future__ import annotations
+
+import torch
+from diffusers.models.transformers.transformer_wan import WanRotaryPosEmbed
+from torch import Tensor
+
+
+class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
+    """Wan's rotary embedding with the views placed side by side in width.
+
+    Args:
+        attention_head_dim: channels of one head.
+        patch_size: (time, height, width) of a token; kept for the base class.
+        max_seq_len: largest position along any axis, view offset included.
+        view_offset: `width` puts view v at columns v*w .. (v+1)*w; `none` gives all views the
+            same positions (the view embedding alone tells them apart).
+    """
+
+    def __init__(
+        self,
+        attention_head_dim: int,
+        patch_size: tuple[int, ...],
+        max_seq_len: int,
+        view_offset: str = 'width',
+    ) -> None:
+        super().__init__(attention_head_dim, patch_size, max_seq_len)  # type: ignore[arg-type]
+        self.view_offset = view_offset
+
+    def forward(self, hidden_states: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns cosines and sines, each (1, V*F*h*w, 1, head_dim).
+
+        Args:
+            hidden_states: a (B, V, F, h, w, D) token grid; only its shape is read.
+        """
+        _, num_views, num_frames, height, width, _ = hidden_states.shape
+        return (
+            self._table(self.freqs_cos, num_views, num_frames, height, width),
+            self._table(self.freqs_sin, num_views, num_frames, height, width),
+        )
+
+    def _table(self, freqs: Tensor, v: int, f: int, h: int, w: int) -> Tensor:
+        time, row, column = freqs.split([self.t_dim, self.h_dim, self.w_dim], dim=1)
+        if self.view_offset == 'width':
+            columns = column[: v * w].view(v, 1, 1, w, -1)
+        else:
+            columns = column[:w].view(1, 1, 1, w, -1)
+        table = [
+            time[:f].view(1, f, 1, 1, -1).expand(v, f, h, w, -1),
+            row[:h].view(1, 1, h, 1, -1).expand(v, f, h, w, -1),
+            columns.expand(v, f, h, w, -1),
+        ]
+        return torch.cat(table, dim=-1).reshape(1, v * f * h * w, 1, -1)

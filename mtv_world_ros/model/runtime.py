@@ -1,0 +1,37 @@
+"""Choices that depend on the machine: threads and number format."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from mtv_world_ros.errors import ConfigError
+
+_DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
+
+
+def set_num_threads(num_threads: int) -> None:
+    """Limits torch on a CPU; 0 = all usable cores but one, which callbacks keep."""
+    usable = len(os.sched_getaffinity(0))
+    torch.set_num_threads(num_threads or max(1, usable - 1))
+
+
+def choose_dtype(name: str, device: str) -> torch.dtype:
+    """Returns the number format; `auto` is bfloat16 where the device multiplies it natively.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    if name == 'auto':
+        native = device != 'cpu' or _cpu_has_bfloat16()
+        return torch.bfloat16 if native else torch.float32
+    if name not in _DTYPES:
+        raise ConfigError(f"dtype '{name}' is not one of auto, {', '.join(_DTYPES)}")
+    return _DTYPES[name]
+
+
+def _cpu_has_bfloat16() -> bool:
+    info = Path('/proc/cpuinfo')
+    return info.is_file() and 'avx512_bf16' in info.read_text()

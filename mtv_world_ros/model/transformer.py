@@ -1,0 +1,236 @@
+"""The one diffusion transformer: Wan's, over all views in one token sequence.
+
+Shape letters: B batch, V views, C latent channels, F latent frames, H W latent size,
+f h w = token grid, S = V * (1 + f) * h * w tokens, D width.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from diffusers import WanTransformer3DModel
+from diffusers.configuration_utils import register_to_config
+from torch import Tensor, nn
+
+from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
+from mtv_world_ros.model.stem import ConvStem, ReferenceDecoder, ResBlock
+
+
+class _NoContext(nn.Module):
+    """Stands where cross-attention would, in presets without text or image context."""
+
+    def forward(self, hidden_states: Tensor, *_: Any) -> Tensor:
+        return torch.zeros_like(hidden_states)
+
+
+class _ReferenceStem(nn.Module):
+    """phi for the convolutional stem: reference latents to tokens, and to keys for copying."""
+
+    def __init__(self, in_channels: int, widths: tuple[int, int, int], dim: int) -> None:
+        super().__init__()
+        c1, c2, _ = widths
+        self.conv_in = nn.Conv2d(in_channels, c1, 3, padding=1)
+        self.block1 = ResBlock(c1, c1, dim)
+        self.down1 = nn.Conv2d(c1, c2, 3, stride=2, padding=1)
+        self.block2 = ResBlock(c2, c2, dim)
+        self.to_tokens = nn.Conv2d(c2, dim, 2, stride=2)
+
+    def forward(self, x: Tensor, temb: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns tokens (R, D, h4, w4) and keys (R, c2, h2, w2)."""
+        x = self.block1(self.conv_in(x), temb)
+        keys = self.block2(self.down1(x), temb)
+        return self.to_tokens(keys), keys
+
+
+class MultiViewWanTransformer(WanTransformer3DModel):
+    """`WanTransformer3DModel` with views, control latents and reference latents.
+
+    Input channels per view are `cat[noisy | control | start image]`; reference latents pass
+    through phi (`ref_conv`), are prepended in time and dropped again. The layout follows
+    Wan2.1-Fun-Control with all views in one sequence (paper, Method).
+
+    Args (beyond the base class):
+        latent_channels: C of the autoencoder.
+        num_views: views it has an embedding for.
+        stem: `patch` (Wan's own) or `conv` (small preset).
+        stem_widths: channels of the convolutional stem at full, half and quarter latent size.
+        frames_per_token: latent frames merged by the convolutional stem.
+        context: `text_image` (cross-attention as in Wan) or `none`.
+        view_offset: see `MultiViewRotaryPosEmbed`.
+        prediction: `flow` (noise - clean, Wan) or `sample` (the clean latents).
+    """
+
+    @register_to_config
+    def __init__(
+        self,
+        patch_size: tuple[int, ...] = (1, 2, 2),
+        num_attention_heads: int = 12,
+        attention_head_dim: int = 128,
+        in_channels: int = 48,
+        out_channels: int = 16,
+        text_dim: int = 4096,
+        freq_dim: int = 256,
+        ffn_dim: int = 8960,
+        num_layers: int = 30,
+        cross_attn_norm: bool = True,
+        qk_norm: str | None = 'rms_norm_across_heads',
+        eps: float = 1e-6,
+        image_dim: int | None = None,
+        added_kv_proj_dim: int | None = None,
+        rope_max_seq_len: int = 1024,
+        pos_embed_seq_len: int | None = None,
+        latent_channels: int = 16,
+        num_views: int = 2,
+        stem: str = 'patch',
+        stem_widths: tuple[int, int, int] = (48, 96, 128),
+        frames_per_token: int = 4,
+        context: str = 'text_image',
+        view_offset: str = 'width',
+        prediction: str = 'flow',
+    ) -> None:
+        super().__init__(
+            patch_size=patch_size,
+            num_attention_heads=num_attention_heads,
+            attention_head_dim=attention_head_dim,
+            in_channels=in_channels,
+            out_channels=out_channels,
+            text_dim=text_dim,
+            freq_dim=freq_dim,
+            ffn_dim=ffn_dim,
+            num_layers=num_layers,
+            cross_attn_norm=cross_attn_norm,
+            qk_norm=qk_norm,
+            eps=eps,
+            image_dim=image_dim,
+            added_kv_proj_dim=added_kv_proj_dim,
+            rope_max_seq_len=rope_max_seq_len,
+            pos_embed_seq_len=pos_embed_seq_len,
+        )
+        dim = num_attention_heads * attention_head_dim
+        self.rope = MultiViewRotaryPosEmbed(
+            attention_head_dim, patch_size, rope_max_seq_len, view_offset
+        )
+        self.view_embedding = nn.Parameter(torch.zeros(num_views, dim))
+        if context == 'none':
+            self._drop_context()
+        if stem == 'conv':
+            self._build_conv_stem(latent_channels, tuple(stem_widths), dim, frames_per_token)
+        else:
+            self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
+
+    def _drop_context(self) -> None:
+        self.condition_embedder.text_embedder = nn.Identity()  # type: ignore[assignment]
+        for block in self.blocks:
+            block.attn2 = _NoContext()
+            block.norm2 = nn.Identity()
+
+    def _build_conv_stem(
+        self, channels: int, widths: tuple[int, int, int], dim: int, merge: int
+    ) -> None:
+        self.patch_embedding = ConvStem(self.config.in_channels, widths, dim, merge)  # type: ignore[assignment]
+        self.ref_conv = _ReferenceStem(2 * channels, widths, dim)
+        self.proj_out = ReferenceDecoder(channels, widths, dim, merge, widths[1])  # type: ignore[assignment]
+
+    def forward(  # type: ignore[override]
+        self,
+        hidden_states: Tensor,
+        timestep: Tensor,
+        control: Tensor,
+        start: Tensor,
+        reference: Tensor,
+        start_control: Tensor | None = None,
+        encoder_hidden_states: Tensor | None = None,
+        encoder_hidden_states_image: Tensor | None = None,
+    ) -> Tensor:
+        """Returns (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
+
+        Args:
+            hidden_states: (B, V, C, F, H, W) noisy latents.
+            timestep: (B,) in [0, 1000].
+            control: (B, V, C, F, H, W) latents of the trajectory video.
+            start: (B, V, C, F, H, W) latents for the start-image slot.
+            reference: (B, V, C, H, W) latents of the start image.
+            start_control: (B, V, C, H, W) latents of the control frame 0 (convolutional stem).
+            encoder_hidden_states: (B, 512, text_dim) umT5 tokens.
+            encoder_hidden_states_image: (B, V * 257, image_dim) CLIP tokens.
+
+        Raises:
+            CheckpointError: more views than the model has embeddings for.
+        """
+        num_views = hidden_states.shape[1]
+        if num_views > self.view_embedding.shape[0]:
+            raise CheckpointError(
+                f'{num_views} views given, the model was built for '
+                f'{self.view_embedding.shape[0]}; set `views` to those, or train with num_views'
+            )
+        if encoder_hidden_states is None:
+            encoder_hidden_states = hidden_states.new_zeros(hidden_states.shape[0], 1, 1)
+        temb, time_proj, context, image = self.condition_embedder(
+            timestep, encoder_hidden_states, encoder_hidden_states_image
+        )
+        if image is not None:
+            context = torch.cat([image, context], dim=1)
+        x = torch.cat([hidden_states, control, start], dim=2)
+        tokens, skips = self._embed(x, temb)
+        ref_tokens, keys = self._embed_reference(reference, start_control, temb)
+        grid = torch.cat([ref_tokens, tokens], dim=2)
+        grid = grid + self.view_embedding[:num_views, None, None, None]
+        rotary = self.rope(grid)
+        sequence = grid.flatten(1, 4)
+        time_proj = time_proj.unflatten(1, (6, -1))
+        for block in self.blocks:
+            if torch.is_grad_enabled() and self.gradient_checkpointing:
+                sequence = self._gradient_checkpointing_func(
+                    block, sequence, context, time_proj, rotary
+                )
+            else:
+                sequence = block(sequence, context, time_proj, rotary)
+        shift, scale = (self.scale_shift_table + temb.unsqueeze(1)).chunk(2, dim=1)
+        sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
+        kept = sequence.reshape(grid.shape)[:, :, 1:]
+        return self._unembed(kept, skips, temb, keys, reference, hidden_states)
+
+    def _embed(self, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W)."""
+        batch, views = x.shape[:2]
+        if self.config.stem == 'conv':
+            frames = x.transpose(2, 3).flatten(0, 2).contiguous(memory_format=torch.channels_last)
+            return self.patch_embedding(frames, temb, views)
+        tokens = self.patch_embedding(x.flatten(0, 1)).unflatten(0, (batch, views))
+        return tokens.movedim(2, -1), []
+
+    def _embed_reference(
+        self, reference: Tensor, start_control: Tensor | None, temb: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens (B, V, 1, h, w, D) of the reference latents, and keys for copying."""
+        batch, views = reference.shape[:2]
+        flat = reference.flatten(0, 1)
+        if self.config.stem == 'conv':
+            assert start_control is not None
+            flat = torch.cat([flat, start_control.flatten(0, 1)], dim=1)
+            tokens, keys = self.ref_conv(flat.contiguous(memory_format=torch.channels_last), temb)
+        else:
+            tokens = keys = self.ref_conv(flat)
+        return tokens.unflatten(0, (batch, views)).movedim(2, -1).unsqueeze(2), keys
+
+    def _unembed(
+        self,
+        kept: Tensor,
+        skips: list[Tensor],
+        temb: Tensor,
+        keys: Tensor,
+        reference: Tensor,
+        like: Tensor,
+    ) -> Tensor:
+        """(B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D)."""
+        batch, views, _, num_frames, height, width = like.shape
+        if self.config.stem == 'conv':
+            frames = self.proj_out(kept, skips, temb, keys, reference.flatten(0, 1))
+            return frames.unflatten(0, (batch, views, num_frames)).transpose(2, 3)
+        p_t, p_h, p_w = self.config.patch_size
+        out = self.proj_out(kept)
+        out = out.unflatten(-1, (p_t, p_h, p_w, -1)).permute(0, 1, 8, 2, 5, 3, 6, 4, 7)
+        return out.reshape(batch, views, -1, num_frames, height, width)
+

@@ -1,0 +1,80 @@
+"""A trained checkpoint as a world model: frames in, frames out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import ModelMemoryError
+from mtv_world_ros.model.checkpoint import Checkpoint, spec_of
+from mtv_world_ros.model.conditioning import condition, decode_frames
+from mtv_world_ros.model.sampler import sample_latents
+
+
+class DiffusionWorldModel:
+    """Denoises one chunk of multi-view video under a trajectory video.
+
+    Args:
+        checkpoint: the trained parts.
+        device: e.g. `cpu` or `cuda`.
+        dtype: of the transformer's computations.
+    """
+
+    def __init__(
+        self, checkpoint: Checkpoint, *, device: str = 'cpu', dtype: torch.dtype = torch.float32
+    ) -> None:
+        self.device = torch.device(device)
+        self.transformer = checkpoint.transformer.to(self.device, dtype).eval()
+        if self.transformer.config.stem == 'conv':
+            self.transformer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.autoencoder = checkpoint.autoencoder.to(self.device, dtype).eval()
+        self.scheduler = checkpoint.scheduler
+        self.spec = spec_of(checkpoint.card)
+
+    def predict(
+        self,
+        start_frame: ByteArray,
+        trajectory_frames: ByteArray,
+        *,
+        seed: int,
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+    ) -> ByteArray:
+        """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
+        try:
+            with torch.inference_mode():
+                conditioning = condition(
+                    self.autoencoder, self._tensor(start_frame), self._tensor(trajectory_frames)
+                )
+                latents = sample_latents(
+                    self.transformer,
+                    self.scheduler,
+                    conditioning,
+                    seed=seed,
+                    num_inference_steps=num_inference_steps,
+                    should_stop=should_stop,
+                )
+                frames = decode_frames(self.autoencoder, latents.to(self.autoencoder.dtype))
+                return frames[0].cpu().numpy()
+        except (torch.OutOfMemoryError, MemoryError) as error:
+            raise self._out_of_memory(trajectory_frames, error) from error
+        except RuntimeError as error:
+            if "can't allocate memory" not in str(error):
+                raise
+            raise self._out_of_memory(trajectory_frames, error) from error
+
+    def _tensor(self, frames: ByteArray) -> torch.Tensor:
+        return torch.from_numpy(np.array(frames))[None].to(self.device)
+
+    def _out_of_memory(self, frames: ByteArray, error: Exception) -> ModelMemoryError:
+        views, count, height, width, _ = frames.shape
+        if self.device.type == 'cuda':
+            torch.cuda.empty_cache()
+        return ModelMemoryError(
+            f'out of memory on {self.device} with {views} views of {count} frames of '
+            f'{width}x{height}; use a smaller preset, another device, or free memory there '
+            f'({str(error).splitlines()[0]})'
+        )
