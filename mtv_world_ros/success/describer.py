@@ -1,0 +1,74 @@
+"""From an instruction to the names of the objects it is about."""
+
+from __future__ import annotations
+
+import re
+from typing import Protocol
+
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.success.palette import PALETTE
+
+#: colour words that name an object although the colour segmenter cannot find it
+OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', 'silver', 'gold'})
+#: words that end a noun phrase
+_STOP = re.compile(
+    'a|an|the|to|of|on|in|into|onto|at|by|with|from|and|or|then|left|right|over|under|above|below|'
+    'behind|before|between|beside|near|next|front|back|is|are|it|its|so'
+)
+_MAX_WORDS = 4
+
+
+class Describer(Protocol):
+    """Names the objects of a scene."""
+
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[str, ...]:
+        """Returns the objects' names, each a short noun phrase.
+
+        Args:
+            first_frame: (H, W, 3) uint8 RGB, a real frame, never a predicted one.
+            instruction: what the robot was told.
+        """
+        ...
+
+
+class InstructionDescriber:
+    """Names the objects that the instruction names by colour; looks at no image."""
+
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[str, ...]:
+        """Returns `objects_from_instruction(instruction)`."""
+        del first_frame
+        return objects_from_instruction(instruction)
+
+
+def objects_from_instruction(instruction: str) -> tuple[str, ...]:
+    """Returns the objects an instruction names by colour, in order of appearance.
+
+    `place the red block to the left of the blue block` gives `('red block', 'blue block')`.
+    A name starts at its colour word and ends at the first preposition, article or mark.
+    """
+    tokens = re.findall(r"[a-z][a-z'-]*|[^\sa-z]", instruction.lower())
+    names: list[str] = []
+    at = 0
+    while at < len(tokens):
+        phrase = _phrase(tokens[at:])
+        if phrase and ' '.join(phrase) not in names:
+            names.append(' '.join(phrase))
+        at += max(1, len(phrase))
+    return tuple(names)
+
+
+def _phrase(tokens: list[str]) -> list[str]:
+    """Words from a leading colour word up to the end of its noun phrase; empty if none leads."""
+    if tokens[0] not in PALETTE and tokens[0] not in OTHER_COLOURS:
+        return []
+    phrase = tokens[:1]
+    for word in tokens[1:_MAX_WORDS]:
+        if _STOP.fullmatch(word) or word in PALETTE or not word[0].isalpha():
+            break
+        phrase.append(word)
+    return phrase if len(phrase) > 1 else []
+
+
+def colour_of(name: str) -> str | None:
+    """Returns the palette word in an object's name, or None."""
+    return next((word for word in name.lower().split() if word in PALETTE), None)

@@ -1,0 +1,185 @@
+"""Jaccard index of masks by the conventions of DAVIS 2017, per view, object and frame.
+
+Frame 0 is the condition, not a prediction: pass frames 1..T.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray, ObjectMasks
+from mtv_world_ros.errors import MtvWorldError
+
+#: a prediction of this status cannot be scored; any other (`absent`, ...) is the model's doing
+UNSCORABLE = frozenset({'ambiguous', 'out_of_palette'})
+
+
+def jaccard(pred: BoolArray, true: BoolArray, void: BoolArray | None = None) -> FloatArray:
+    """Returns |pred and true| / |pred or true| over the last two axes.
+
+    Both empty gives 1, one empty 0; void pixels leave both counts (DAVIS 2017, `db_eval_iou`).
+
+    Args:
+        pred: (..., H, W) bool.
+        true: (..., H, W) bool, of the same height and width.
+        void: (..., H, W) bool, pixels that do not count.
+
+    Raises:
+        MtvWorldError: the masks differ in height or width.
+    """
+    if pred.shape[-2:] != true.shape[-2:]:
+        raise MtvWorldError(
+            f'masks of {pred.shape[-1]}x{pred.shape[-2]} and {true.shape[-1]}x{true.shape[-2]} px '
+            'cannot be compared: bring both to one size before scoring'
+        )
+    both, either = pred & true, pred | true
+    if void is not None:
+        both, either = both & ~void, either & ~void
+    intersection = both.sum((-2, -1), dtype=np.float64)
+    union = either.sum((-2, -1), dtype=np.float64)
+    return np.where(union == 0, 1.0, intersection / np.maximum(union, 1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectScores:
+    """J of one video against another; NaN is 'not scored', with the reason in `status`.
+
+    Attributes:
+        names: O names.
+        frames: (V, O, T) J per frame.
+        visible: (V, O) mean J over the frames in which the true mask is not empty.
+        objects: (V, O) mean J over frames, both-empty frames counted as 1 (DAVIS).
+        union: (V,) mean J of the union of the scored objects (the paper's formula).
+        status: V tuples of O words: `ok`, or why there is no score, or why to doubt it.
+    """
+
+    names: tuple[str, ...]
+    frames: FloatArray
+    visible: FloatArray
+    objects: FloatArray
+    union: FloatArray
+    status: tuple[tuple[str, ...], ...]
+
+    @property
+    def object_mean(self) -> FloatArray:
+        """(V,) mean over the scored objects: the headline."""
+        return mean_of_known(self.objects, axis=1)
+
+
+def object_scores(
+    pred: ObjectMasks, true: ObjectMasks, void: BoolArray | None = None
+) -> ObjectScores:
+    """Scores predicted against true masks.
+
+    An object is not scored (NaN) where its true masks are not to be trusted or where the
+    predicted video leaves the segmenter in doubt which pixels are the object. An object that the
+    prediction lost is scored, as DAVIS does, and carries its status.
+
+    Args:
+        pred: masks in the predicted frames 1..T.
+        true: masks in the recorded frames at the same times.
+        void: (V, T, H, W) pixels that do not count.
+
+    Raises:
+        MtvWorldError: names, numbers of views or frames, or sizes differ.
+    """
+    if pred.names != true.names or pred.masks.shape[:3] != true.masks.shape[:3]:
+        raise MtvWorldError(
+            f'masks of {pred.names} {pred.masks.shape[:3]} cannot be scored against '
+            f'{true.names} {true.masks.shape[:3]}: names, views and frames must be the same'
+        )
+    blank = None if void is None else void[:, None]
+    status = tuple(
+        tuple(map(_score_status, *rows)) for rows in zip(pred.status, true.status, strict=True)
+    )
+    scored = np.array([[_is_scored(word) for word in row] for row in status], dtype=bool)
+    scored = scored.reshape(len(status), len(true.names))
+    frames = jaccard(pred.masks, true.masks, blank)
+    frames = np.where(scored[:, :, None], frames, np.nan)
+    shown = true.masks.any((-2, -1))
+    return ObjectScores(
+        names=true.names,
+        frames=frames,
+        visible=mean_of_known(np.where(shown, frames, np.nan), axis=2),
+        objects=mean_of_known(frames, axis=2),
+        union=_union(pred.masks, true.masks, scored, void),
+        status=status,
+    )
+
+
+def _score_status(pred: str, true: str) -> str:
+    """Status of a score: the truth's doubt first, then the prediction's."""
+    if true != 'ok':
+        return f'true: {true}'
+    return pred if pred == 'ok' else f'predicted: {pred}'
+
+
+def _is_scored(status: str) -> bool:
+    where, _, word = status.partition(': ')
+    return where == 'ok' or (where == 'predicted' and word not in UNSCORABLE)
+
+
+def _union(
+    pred: BoolArray, true: BoolArray, scored: BoolArray, void: BoolArray | None
+) -> FloatArray:
+    """(V,) mean over frames of J of the union of the scored objects, NaN where none is scored."""
+    keep = scored[:, :, None, None, None]
+    frames = jaccard(np.any(pred & keep, axis=1), np.any(true & keep, axis=1), void)
+    if frames.shape[1] == 0:
+        return np.full(len(frames), np.nan)
+    return np.where(scored.any(1), frames.mean(1), np.nan)
+
+
+def persistence_scores(first: BoolArray, true: ObjectMasks) -> ObjectScores:
+    """Scores the baseline that holds the first frame: J_copy.
+
+    Args:
+        first: (V, O, H, W) masks in the recorded frame 0.
+        true: masks in the recorded frames 1..T.
+    """
+    held = np.broadcast_to(first[:, :, None], true.masks.shape)
+    return object_scores(
+        ObjectMasks(names=true.names, masks=held, status=_all_ok(true.status)), true
+    )
+
+
+def _all_ok(status: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple('ok' for _ in row) for row in status)
+
+
+def skill(score: FloatArray | float, copy: FloatArray | float) -> FloatArray:
+    """Returns (J - J_copy) / (1 - J_copy): 0 = persistence, 1 = perfect; NaN where J_copy = 1."""
+    score, copy = np.asarray(score, np.float64), np.asarray(copy, np.float64)
+    room = 1.0 - copy
+    return np.where(room > 1e-9, (score - copy) / np.where(room > 1e-9, room, 1.0), np.nan)
+
+
+def moves(true: BoolArray, first: BoolArray, max_overlap: float = 0.5) -> BoolArray:
+    """Returns (V, O) whether an object really moves in the recording.
+
+    It moves if in some frame its mask and its first mask share less than `max_overlap` of the
+    smaller of the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show
+    less than a quarter of its largest area do not count.
+
+    Args:
+        true: (V, O, T, H, W) masks in the recorded frames.
+        first: (V, O, H, W) masks in the recorded frame 0.
+        max_overlap: share under which the object has left its place.
+    """
+    area = true.sum((-2, -1))
+    first_area = first.sum((-2, -1))[:, :, None]
+    shared = (true & first[:, :, None]).sum((-2, -1))
+    largest = np.maximum(area.max(2, initial=0, keepdims=True), first_area)
+    smaller = np.minimum(area, first_area)
+    shown = (smaller > 0) & (4 * smaller >= largest)
+    return (shown & (shared < max_overlap * smaller)).any(2)
+
+
+def mean_of_known(values: FloatArray, axis: int | tuple[int, ...] | None = None) -> FloatArray:
+    """Returns the mean over what is not NaN, NaN where nothing is known."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', RuntimeWarning)
+        return np.asarray(np.nanmean(values, axis=axis))

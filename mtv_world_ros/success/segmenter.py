@@ -1,0 +1,212 @@
+"""Object masks from colour words, without weights; says so where it does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.success.describer import colour_of
+from mtv_world_ros.success.palette import PALETTE
+from mtv_world_ros.success.tracking import Track, TrackingConfig, track
+
+Floats = NDArray[np.floating]
+
+
+class Segmenter(Protocol):
+    """Finds named objects in videos."""
+
+    def segment(
+        self,
+        frames: ByteArray,
+        names: tuple[str, ...],
+        first_masks: BoolArray | None = None,
+    ) -> ObjectMasks:
+        """Returns the objects' masks in every frame, with a status per view and object.
+
+        Args:
+            frames: (V, T, H, W, 3) uint8 RGB.
+            names: O object names.
+            first_masks: (V, O, H, W) masks just before the first frame, where known.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColourSegmenterConfig:
+    """Gates of the colour segmenter; saturation is CIELAB chroma / (lightness + 16).
+
+    That ratio keeps its value when a surface is shaded.
+
+    Attributes:
+        max_hue_error: largest distance to the colour word's hue [degrees]; hues nearer to
+            another word are that word's.
+        min_saturation: share of the palette colour's saturation below which nothing is found.
+        edge_range: shares of the object's own saturation between which its edge may lie.
+        min_lightness: darker pixels have no hue [0-100].
+        tracking: from pixels to one mask per frame.
+    """
+
+    max_hue_error: float = 28.0
+    min_saturation: float = 0.3
+    edge_range: tuple[float, float] = (0.25, 0.6)
+    min_lightness: float = 8.0
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_hue_error <= 90:
+            raise ConfigError(f'max_hue_error is {self.max_hue_error}; it must lie in [1, 90]')
+        if not 0 <= self.min_saturation <= 1:
+            raise ConfigError(f'min_saturation is {self.min_saturation}; it must lie in [0, 1]')
+
+
+class ColourSegmenter:
+    """Finds objects whose name holds a word of the palette.
+
+    A pixel belongs to the word whose hue is nearest. The edge of an object is where saturation
+    falls to that of a pixel half object, half background, so blur moves it little. Connected
+    pieces are then followed from frame to frame.
+    """
+
+    def __init__(self, config: ColourSegmenterConfig | None = None) -> None:
+        self.config = config or ColourSegmenterConfig()
+        self._words = tuple(PALETTE)
+        colours = _lab(np.array([list(PALETTE.values())], np.uint8))[0]
+        self._saturations = _saturation(colours)
+        self._word_of_ab = _hue_table(colours, self.config.max_hue_error)
+
+    def segment(
+        self,
+        frames: ByteArray,
+        names: tuple[str, ...],
+        first_masks: BoolArray | None = None,
+    ) -> ObjectMasks:
+        """See `Segmenter.segment`."""
+        num_views, num_frames, height, width, _ = frames.shape
+        masks = np.zeros((num_views, len(names), num_frames, height, width), np.bool_)
+        status: list[list[str]] = []
+        for view in range(num_views):
+            firsts = None if first_masks is None else first_masks[view]
+            tracks = self._segment_view(frames[view], names, firsts)
+            for index, found in enumerate(tracks):
+                masks[view, index] = found.masks
+            status.append([found.status for found in tracks])
+        return ObjectMasks(names=names, masks=masks, status=tuple(map(tuple, status)))
+
+    def _segment_view(
+        self, frames: ByteArray, names: tuple[str, ...], firsts: BoolArray | None
+    ) -> list[Track]:
+        """Tracks of the named objects in (T, H, W, 3) frames of one view."""
+        num_frames, height, width, _ = frames.shape
+        lab = cv2.cvtColor(frames.reshape(num_frames * height, width, 3), cv2.COLOR_RGB2LAB)
+        lab = np.asarray(lab, np.uint8).reshape(frames.shape)
+        words = self._word_of_ab[lab[..., 1], lab[..., 2]]
+        words[lab[..., 0] < self.config.min_lightness * 2.55] = len(self._words)
+        tracks: list[Track] = []
+        for index, name in enumerate(names):
+            word = colour_of(name)
+            if word is None:
+                tracks.append(Track.missing((num_frames, height, width), 'out_of_palette'))
+                continue
+            rivals = [
+                i for i, other in enumerate(names) if colour_of(other) == word and i != index
+            ]
+            first = None if firsts is None or not firsts[index].any() else firsts[index]
+            others = _others(tracks, rivals, index)
+            pixels = self._pixels(frames, lab, words == self._words.index(word), word)
+            found = track(pixels, first, self.config.tracking, taken=others)
+            if rivals and first is None and found.status == 'ok':
+                found = Track(masks=found.masks, status='ambiguous')
+            tracks.append(found)
+        return tracks
+
+    def _pixels(self, frames: ByteArray, lab: ByteArray, gate: BoolArray, word: str) -> BoolArray:
+        """(T, H, W) pixels of a colour, down to where the object makes up half of a pixel."""
+        floor = self.config.min_saturation * self._saturations[self._words.index(word)]
+        inside = np.flatnonzero(gate)
+        saturation = _saturation(_centred(lab.reshape(-1, 3)[inside]))
+        num_core = max(1, len(gate) * self.config.tracking.min_area(gate.shape) // 2)
+        pixels = np.zeros(gate.shape, np.bool_)
+        if np.count_nonzero(saturation > floor) > num_core:
+            core = np.partition(saturation, -num_core)[-num_core]
+            colour = np.median(frames.reshape(-1, 3)[inside[saturation > 0.8 * core]], axis=0)
+            floor = max(floor, _edge(colour, frames, core, self.config.edge_range))
+        pixels.reshape(-1)[inside[saturation > floor]] = True
+        return pixels
+
+
+def _edge(colour: Floats, frames: ByteArray, core: float, limits: tuple[float, float]) -> float:
+    """Saturation of a pixel that is half object, half background.
+
+    A dark object's edge pixels look pale beside it, a light one's do not.
+    """
+    background = np.median(frames[:, ::4, ::4].reshape(-1, 3), axis=0)
+    mixed = np.round((colour + background) / 2).astype(np.uint8)
+    edge = float(_saturation(_lab(mixed[None, None]))[0, 0])
+    return min(max(edge, limits[0] * core), limits[1] * core)
+
+
+def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolArray | None:
+    """Pixels that objects of the same colour word, found before, already hold."""
+    held = [tracks[i].masks for i in rivals if i < index]
+    return np.any(held, axis=0) if held else None
+
+
+def masks_from_ids(ids: ByteArray, objects: Sequence[str], names: Sequence[str]) -> ObjectMasks:
+    """Returns the true masks of a simulator's identity images.
+
+    Args:
+        ids: (V, T, H, W) uint8; 0 = no object, i + 1 = `objects[i]`.
+        objects: the names that the identities stand for.
+        names: O names to return, in this order; one that is not among `objects` is `absent`.
+    """
+    wanted = [objects.index(name) + 1 if name in objects else 255 for name in names]
+    masks = np.stack([ids == index for index in wanted], axis=1)
+    seen = np.asarray(masks.any((-3, -2, -1)))
+    status = tuple(tuple('ok' if known else 'absent' for known in row) for row in seen)
+    return ObjectMasks(names=tuple(names), masks=masks, status=status)
+
+
+def resize_masks(masks: BoolArray, width: int, height: int) -> BoolArray:
+    """Returns (..., height, width) masks; a pixel is set where at least half of it is covered."""
+    if masks.shape[-2:] == (height, width):
+        return masks
+    shrinks = height <= masks.shape[-2] and width <= masks.shape[-1]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    flat = masks.reshape(-1, *masks.shape[-2:]).astype(np.float32)
+    small = [cv2.resize(mask, (width, height), interpolation=method) >= 0.5 for mask in flat]
+    return np.array(small, np.bool_).reshape(*masks.shape[:-2], height, width)
+
+
+def _lab(rgb: ByteArray) -> Floats:
+    """(..., 3) CIELAB of (N, M, 3) uint8 RGB, L in 0-100, a and b around 0."""
+    return _centred(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.uint8))
+
+
+def _centred(lab: ByteArray) -> Floats:
+    """Undoes OpenCV's 8-bit packing of CIELAB."""
+    centred = lab.astype(np.float32)
+    centred[..., 0] *= 100 / 255
+    centred[..., 1:] -= 128
+    return centred
+
+
+def _saturation(lab: Floats) -> Floats:
+    return np.hypot(lab[..., 1], lab[..., 2]) / (lab[..., 0] + 16)
+
+
+def _hue_table(colours: Floats, max_error: float) -> ByteArray:
+    """(256, 256) index of the palette word nearest in hue for each 8-bit a, b; N = none."""
+    a, b = np.meshgrid(np.arange(256) - 128, np.arange(256) - 128, indexing='ij')
+    hues = np.degrees(np.arctan2(colours[:, 2], colours[:, 1]))
+    error = np.degrees(np.arctan2(b, a))[..., None] - hues
+    error = np.abs((error + 180) % 360 - 180)
+    word = error.argmin(-1)
+    word[error.min(-1) > max_error] = len(colours)
+    return word.astype(np.uint8)

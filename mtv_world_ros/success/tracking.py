@@ -1,0 +1,173 @@
+"""From the pixels of a colour to one mask per frame, and whether to believe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, hypot
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+
+Labels = NDArray[np.integer]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingConfig:
+    """How pieces are joined and followed.
+
+    Attributes:
+        min_area_share: smallest area of a piece, as a share of the image's.
+        max_area_share: a larger piece is background of that colour.
+        rival_share: a second piece of this share of the largest makes the first frame
+            ambiguous.
+        join_gap: pieces this near to the main one belong to it, as a share of its diameter (a
+            finger in front of a block splits it).
+        max_step: largest motion between frames, as a share of the image's diagonal.
+        max_growth: largest area, relative to the median of the areas before.
+        max_missing: share of frames without the object above which it is absent.
+    """
+
+    min_area_share: float = 0.0006
+    max_area_share: float = 0.15
+    rival_share: float = 0.4
+    join_gap: float = 0.5
+    max_step: float = 0.2
+    max_growth: float = 2.5
+    max_missing: float = 0.5
+
+    def min_area(self, shape: tuple[int, ...]) -> int:
+        """Smallest area of a piece [px] in frames of (..., H, W)."""
+        return max(2, ceil(self.min_area_share * shape[-2] * shape[-1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One object in one view.
+
+    Attributes:
+        masks: (T, H, W) bool.
+        status: `ok`, `absent`, `ambiguous`, `out_of_palette`, `area_jump` or `teleport`.
+    """
+
+    masks: BoolArray
+    status: str
+
+    @staticmethod
+    def missing(shape: tuple[int, int, int], status: str) -> Track:
+        """Returns empty masks with a reason."""
+        return Track(masks=np.zeros(shape, np.bool_), status=status)
+
+
+@dataclass(slots=True)
+class _State:
+    """Where the object was last seen, and how large it has been."""
+
+    centre: FloatArray | None
+    areas: list[float]
+    gap: int = 0
+    status: str = 'ok'
+
+    def doubt(self, status: str) -> None:
+        """Keeps the first reason for doubt."""
+        if self.status == 'ok':
+            self.status = status
+
+
+def track(
+    pixels: BoolArray,
+    first: BoolArray | None,
+    config: TrackingConfig,
+    taken: BoolArray | None = None,
+) -> Track:
+    """Follows one object through the pixels of its colour.
+
+    Args:
+        pixels: (T, H, W) pixels of the object's colour.
+        first: (H, W) its mask just before frame 0, where known.
+        config: how pieces are joined and followed.
+        taken: (T, H, W) pixels that another object of the same colour holds.
+    """
+    if taken is not None:
+        pixels = pixels & ~taken
+    masks = np.zeros(pixels.shape, np.bool_)
+    state = _State(centre=None, areas=[])
+    if first is not None:
+        state = _State(centre=_centroid(first), areas=[float(np.count_nonzero(first))])
+    for index, frame in enumerate(pixels):
+        found = _find(frame, state, config)
+        if found is None:
+            state.gap += 1
+            continue
+        masks[index] = found
+    missing = 1.0 - masks.any((1, 2)).mean() if len(masks) else 1.0
+    if missing > config.max_missing:
+        state.doubt('absent')
+    return Track(masks=masks, status=state.status)
+
+
+def _find(frame: BoolArray, state: _State, config: TrackingConfig) -> BoolArray | None:
+    """Finds the object in one frame and updates the state."""
+    components = cv2.connectedComponentsWithStats(frame.view(np.uint8), connectivity=8)
+    count, labels = components[:2]
+    stats, centres = np.asarray(components[2], np.int64), np.asarray(components[3], np.float64)
+    areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    areas[0] = 0
+    largest = config.max_area_share * frame.size
+    pieces = np.flatnonzero((areas >= config.min_area(frame.shape)) & (areas <= largest))
+    if not len(pieces):
+        if count > 1 and areas.max() > largest:
+            state.doubt('ambiguous')
+        return None
+    diagonal = hypot(*frame.shape)
+    if state.centre is None:
+        main = int(pieces[np.argmax(areas[pieces])])
+    else:
+        main = _nearest(pieces, areas, centres, state.centre, config.max_step * diagonal)
+    joined = _join(main, pieces, stats, config)
+    rest = [areas[piece] for piece in pieces if piece not in joined]
+    if state.centre is None and rest and max(rest) >= config.rival_share * areas[main]:
+        state.doubt('ambiguous')
+    mask = np.isin(labels, joined)
+    _check(mask, state, config, diagonal)
+    return mask
+
+
+def _nearest(
+    pieces: Labels, areas: FloatArray, centres: FloatArray, centre: FloatArray, reach: float
+) -> int:
+    """Label of the piece near where the object was; a crumb must be a reach nearer to win."""
+    steps = np.hypot(*(centres[pieces] - centre).T)
+    size = np.sqrt(areas[pieces] / areas[pieces].max())
+    return int(pieces[np.argmin(steps / reach - size)])
+
+
+def _join(main: int, pieces: Labels, stats: Labels, config: TrackingConfig) -> list[int]:
+    """Labels of the main piece and of the pieces whose boxes lie next to it."""
+    left, top, width, height = stats[:, :4].T
+    reach = config.join_gap * max(width[main], height[main])
+    across = np.maximum(left - left[main] - width[main], left[main] - left - width)
+    down = np.maximum(top - top[main] - height[main], top[main] - top - height)
+    near = np.maximum(across, down) <= reach
+    return [int(piece) for piece in pieces if piece == main or near[piece]]
+
+
+def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: float) -> None:
+    """Doubts jumps in place or area, then remembers both."""
+    centre, area = _centroid(mask), float(np.count_nonzero(mask))
+    if state.centre is not None:
+        step = hypot(*(centre - state.centre))
+        if step > config.max_step * diagonal * (1 + state.gap):
+            state.doubt('teleport')
+    if state.areas and area > config.max_growth * max(np.median(state.areas), 4):
+        state.doubt('area_jump')
+    state.centre, state.gap = centre, 0
+    state.areas.append(area)
+
+
+def _centroid(mask: BoolArray) -> FloatArray:
+    """(2,) x, y of the mean pixel [px]."""
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.mean(), rows.mean()])
