@@ -1,0 +1,125 @@
+"""metadata.yaml of a rosbag2 folder, version 9 (Jazzy), and the QoS profiles in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+VERSION = 9
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Qos:
+    """The profile a topic was offered with; `ros2 bag play` offers it again.
+
+    Attributes:
+        reliability: `reliable` or `best_effort`.
+        durability: `volatile` or `transient_local` (latched).
+        history: `keep_last` or `keep_all`.
+        depth: messages kept for `keep_last`.
+    """
+
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    history: str = 'keep_last'
+    depth: int = 10
+
+
+#: of topics whose last message later subscribers must get
+LATCHED = Qos(durability='transient_local', depth=1)
+
+
+@dataclass(slots=True, kw_only=True)
+class TopicRecord:
+    """One topic of a bag: name, message type, type hash, profile, number of messages."""
+
+    name: str
+    msgtype: str
+    type_hash: str
+    qos: Qos
+    message_count: int = 0
+
+
+def dump_qos(qos: Qos) -> str:
+    """The profile list as the MCAP channel's metadata holds it."""
+    return _dump([_qos_entry(qos)]).strip()
+
+
+def bag_information(
+    file_name: str,
+    topics: Sequence[TopicRecord],
+    first_ns: int,
+    last_ns: int,
+    custom_data: Mapping[str, str],
+) -> dict[str, Any]:
+    """Content of `rosbag2_bagfile_information` for a bag of one MCAP file."""
+    count = sum(topic.message_count for topic in topics)
+    span = {
+        'starting_time': {'nanoseconds_since_epoch': first_ns},
+        'duration': {'nanoseconds': last_ns - first_ns},
+        'message_count': count,
+    }
+    return {
+        'version': VERSION,
+        'storage_identifier': 'mcap',
+        **span,
+        'topics_with_message_count': [_topic_entry(topic) for topic in topics],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file_name],
+        'files': [{'path': file_name, **span}],
+        'custom_data': dict(custom_data) or None,
+        'ros_distro': 'jazzy',
+    }
+
+
+def dump_information(information: Mapping[str, Any]) -> str:
+    """Text of the `rosbag2` metadata record in the MCAP file."""
+    return _dump(dict(information))
+
+
+def dump_metadata_yaml(information: Mapping[str, Any]) -> str:
+    """Text of metadata.yaml."""
+    return _dump({'rosbag2_bagfile_information': dict(information)})
+
+
+def _qos_entry(qos: Qos) -> dict[str, Any]:
+    return {
+        'history': qos.history,
+        'depth': qos.depth,
+        'reliability': qos.reliability,
+        'durability': qos.durability,
+        'deadline': dict(_INFINITE),
+        'lifespan': dict(_INFINITE),
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_INFINITE),
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+def _topic_entry(topic: TopicRecord) -> dict[str, Any]:
+    return {
+        'topic_metadata': {
+            'name': topic.name,
+            'type': topic.msgtype,
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': [_qos_entry(topic.qos)],
+            'type_description_hash': topic.type_hash,
+        },
+        'message_count': topic.message_count,
+    }
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes repeated values in full: rosbag2's reader gets no anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _dump(content: Any) -> str:
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=1000)

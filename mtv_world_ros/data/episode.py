@@ -1,0 +1,147 @@
+"""A recorded episode in memory: what the cameras saw, what the arms did, what was asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.errors import EpisodeError, nearest
+
+JOINT_STATES = '/joint_states'
+JOINT_TRAJECTORY = '/joint_trajectory'
+INSTRUCTION = '/instruction'
+#: name of the MCAP metadata record that says what the episode shows
+METADATA_NAME = 'mtv_world'
+CALIBRATION_FILE = 'calibration.yaml'
+OUTCOMES = ('success', 'failure', 'unknown')
+
+
+def image_topic(view: str) -> str:
+    """Topic of the view's raw images; compressed ones are at `<it>/compressed`."""
+    return f'/{view}/image_raw'
+
+
+def camera_info_topic(view: str) -> str:
+    """Topic of the view's CameraInfo."""
+    return f'/{view}/camera_info'
+
+
+def mask_topic(view: str) -> str:
+    """Topic of the view's object masks (PNG: 0 = none, i + 1 = objects[i])."""
+    return f'/{view}/mask/compressed'
+
+
+def optical_frame(view: str) -> str:
+    """frame_id of the view."""
+    return f'{view}_optical_frame'
+
+
+def check_outcome(outcome: str) -> str:
+    """Returns `outcome` if it is one of `OUTCOMES`, else raises EpisodeError."""
+    if outcome not in OUTCOMES:
+        raise EpisodeError(
+            f"outcome '{outcome}' is not one of {', '.join(OUTCOMES)}{nearest(outcome, OUTCOMES)}"
+        )
+    return outcome
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeInfo:
+    """What an episode shows.
+
+    Attributes:
+        path: its folder or file.
+        task: name of the task; empty where not recorded.
+        outcome: `success`, `failure` or `unknown`.
+        seed: seed it was made from, or None.
+        objects: names such as `red block`; masks number them from 1.
+        instruction: what the robot was told; empty where not recorded.
+        robot: name of the robot; empty where not recorded.
+        metadata: further text by key.
+    """
+
+    path: Path
+    task: str = ''
+    outcome: str = 'unknown'
+    seed: int | None = None
+    objects: tuple[str, ...] = ()
+    instruction: str = ''
+    robot: str = ''
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+class Frames(Protocol):
+    """N frames that are decoded when asked for.
+
+    `frames[i]` is one frame, `frames[i:j]` and `frames[[i, j]]` arrays of them, and
+    `numpy.asarray(frames)` all: (N, H, W, 3) uint8 RGB, or (N, H, W) uint8 for masks.
+    """
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: Any) -> ByteArray: ...
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]: ...
+
+
+class Track(NamedTuple):
+    """Frames over time.
+
+    Attributes:
+        stamps_ns: (N,) int64, increasing.
+        frames: the N frames.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    frames: Frames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointStates:
+    """Measured joint positions over time.
+
+    Attributes:
+        stamps_ns: (N,) int64, increasing.
+        joint_names: J names.
+        positions: (N, J) [rad or m].
+    """
+
+    stamps_ns: NDArray[np.int64]
+    joint_names: tuple[str, ...]
+    positions: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Episode:
+    """A recorded episode.
+
+    Attributes:
+        info: what it shows.
+        views: names of the views, in order.
+        cameras: camera of each view at the size of its images; empty where not asked for.
+        images: images of each view.
+        joint_states: measured joint positions; None where there are none.
+        trajectories: (start stamp [ns], trajectory), by stamp.
+        masks: object masks of the views that have them; None where there are none.
+        instructions: (stamp [ns], text), by stamp.
+        truncated: the record ends before its end.
+        warnings: what was found wrong and how it was dealt with, one line each; where
+            `truncated`, the first says where the record was cut.
+    """
+
+    info: EpisodeInfo
+    views: tuple[str, ...]
+    cameras: Mapping[str, CameraModel]
+    images: Mapping[str, Track]
+    joint_states: JointStates | None
+    trajectories: list[tuple[int, JointTrajectory]]
+    masks: Mapping[str, Track] | None
+    instructions: list[tuple[int, str]]
+    truncated: bool = False
+    warnings: tuple[str, ...] = ()

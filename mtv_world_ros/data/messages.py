@@ -1,0 +1,224 @@
+"""Messages of Jazzy's standard packages as typed objects and CDR bytes, without ROS installed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+from mtv_world_ros.data_types import CameraModel, JointTrajectory
+from mtv_world_ros.errors import EpisodeError, nearest
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+JOINT_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
+STRING = 'std_msgs/msg/String'
+
+NANO = 1_000_000_000
+#: CameraInfo's names of the distortion models that are called otherwise here
+_ROS_DISTORTION = {'none': 'plumb_bob'}
+
+
+@cache
+def typestore() -> Typestore:
+    """Definitions of every message type that a Jazzy desktop installs."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def check_type(msgtype: str) -> str:
+    """Returns `msgtype` if it is known.
+
+    Raises:
+        EpisodeError: it is not among the standard message packages.
+    """
+    known = typestore().fielddefs
+    if msgtype not in known:
+        raise EpisodeError(
+            f"message type '{msgtype}' is not one of the standard packages of Jazzy"
+            f'{nearest(msgtype, known)}'
+        )
+    return msgtype
+
+
+@cache
+def definition(msgtype: str) -> str:
+    """The type's `.msg` text and those of the types in it, as rosbag2 writes them."""
+    return typestore().generate_msgdef(check_type(msgtype), ros_version=2)[0]
+
+
+@cache
+def type_hash(msgtype: str) -> str:
+    """The type's RIHS01 hash."""
+    return typestore().hash_rihs01(check_type(msgtype))
+
+
+def serialize(msgtype: str, message: object) -> bytes:
+    """CDR bytes, encapsulation header included."""
+    return bytes(typestore().serialize_cdr(message, check_type(msgtype)))
+
+
+def deserialize(msgtype: str, data: bytes) -> Any:
+    """Typed message of CDR bytes; surplus bytes at the end are ignored.
+
+    Some writers record up to a few bytes more than the message has (rclpy's
+    `serialize_message` does where trailing float64 sequences are empty).
+
+    Raises:
+        EpisodeError: the type is unknown or the bytes do not hold such a message.
+    """
+    store = typestore()
+    check_type(msgtype)
+    try:
+        if data[:2] not in (b'\x00\x00', b'\x00\x01'):
+            raise EpisodeError(f'{msgtype}: encapsulation {data[:2].hex()} is not plain CDR')
+        parsed = store.get_msgdef(msgtype)
+        read = parsed.deserialize_cdr_le if data[1] else parsed.deserialize_cdr_be
+        return read(memoryview(data)[4:], 0, parsed.cls, store)[0]
+    except (SerdeError, struct.error, ValueError, IndexError) as error:
+        raise EpisodeError(
+            f'{len(data)} bytes do not hold a whole {msgtype} message ({error})'
+        ) from error
+
+
+def make(msgtype: str, **fields: Any) -> Any:
+    """A typed message; every field must be given."""
+    return typestore().types[check_type(msgtype)](**fields)
+
+
+def make_header(stamp_ns: int, frame_id: str) -> Any:
+    """std_msgs/Header.
+
+    Raises:
+        EpisodeError: the stamp does not fit builtin_interfaces/Time.
+    """
+    return make('std_msgs/msg/Header', stamp=_make_time(stamp_ns, 'Time'), frame_id=frame_id)
+
+
+def header_stamp(message: Any) -> int:
+    """The header's stamp [ns]; 0 = not stamped."""
+    return message.header.stamp.sec * NANO + message.header.stamp.nanosec
+
+
+def _make_time(stamp_ns: int, kind: str) -> Any:
+    sec, nanosec = divmod(int(stamp_ns), NANO)
+    if not 0 <= sec < 2**31:
+        raise EpisodeError(f'stamp {stamp_ns} ns does not fit a ROS time (0 to 2^31 s)')
+    return make(f'builtin_interfaces/msg/{kind}', sec=sec, nanosec=nanosec)
+
+
+def make_camera_info(stamp_ns: int, camera: CameraModel, frame_id: str) -> Any:
+    """sensor_msgs/CameraInfo of a camera; R is the identity, P = [K 0]."""
+    coefficients = camera.distortion if len(camera.distortion) else np.zeros(5)
+    return make(
+        CAMERA_INFO,
+        header=make_header(stamp_ns, frame_id),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=_ROS_DISTORTION.get(camera.distortion_model, camera.distortion_model),
+        d=np.array(coefficients, np.float64),
+        k=np.array(camera.K, np.float64).ravel(),
+        r=np.eye(3).ravel(),
+        p=np.column_stack([camera.K, np.zeros(3)]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=make(
+            'sensor_msgs/msg/RegionOfInterest',
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        ),
+    )
+
+
+def make_joint_state(
+    stamp_ns: int, names: Sequence[str], positions: ArrayLike, velocities: ArrayLike | None = None
+) -> Any:
+    """sensor_msgs/JointState; positions, velocities (J,) [rad or m, rad/s or m/s]."""
+    given = {'position': positions, 'velocity': () if velocities is None else velocities}
+    arrays = {key: np.array(value, np.float64) for key, value in given.items()}
+    for key, array in arrays.items():
+        if array.ndim != 1 or (key == 'position' or len(array)) and len(array) != len(names):
+            raise EpisodeError(f'{key} has shape {array.shape}, expected ({len(names)},)')
+    header = make_header(stamp_ns, '')
+    return make(JOINT_STATE, header=header, name=list(names), effort=np.empty(0), **arrays)
+
+
+def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:
+    """trajectory_msgs/JointTrajectory that starts at `stamp_ns`."""
+    empty = np.empty(0)
+    rates = trajectory.velocities
+    points = [
+        make(
+            'trajectory_msgs/msg/JointTrajectoryPoint',
+            positions=np.array(row, np.float64),
+            velocities=empty if rates is None else np.array(rates[index], np.float64),
+            accelerations=empty,
+            effort=empty,
+            time_from_start=_make_time(round(seconds * NANO), 'Duration'),
+        )
+        for index, (seconds, row) in enumerate(
+            zip(trajectory.times, trajectory.positions, strict=True)
+        )
+    ]
+    return make(
+        JOINT_TRAJECTORY,
+        header=make_header(stamp_ns, ''),
+        joint_names=list(trajectory.joint_names),
+        points=points,
+    )
+
+
+def parse_joint_trajectory(message: Any) -> JointTrajectory:
+    """Trajectory of a trajectory_msgs/JointTrajectory.
+
+    Raises:
+        TrajectoryError: it is empty, not finite, or its times do not increase.
+        EpisodeError: a point has another number of positions than there are joints.
+    """
+    num_joints = len(message.joint_names)
+    for index, point in enumerate(message.points):
+        counts = (len(point.positions), len(point.velocities) or num_joints)
+        if counts != (num_joints, num_joints):
+            raise EpisodeError(
+                f'joint trajectory: point {index} has {counts[0]} positions and {counts[1]} '
+                f'velocities for {num_joints} joints'
+            )
+    with_velocities = all(len(point.velocities) for point in message.points)
+    shape = (len(message.points), num_joints)
+    times = [p.time_from_start.sec + p.time_from_start.nanosec * 1e-9 for p in message.points]
+    rates = [point.velocities for point in message.points] if with_velocities else None
+    return JointTrajectory(
+        joint_names=tuple(message.joint_names),
+        times=np.array(times),
+        positions=np.array([point.positions for point in message.points]).reshape(shape),
+        velocities=None if rates is None else np.array(rates).reshape(shape),
+    )
+
+
+def encode_jpeg(rgb: NDArray[np.uint8], quality: int) -> bytes:
+    """JPEG file of an (H, W, 3) RGB image."""
+    return _encode('.jpg', rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """PNG file of an (H, W, 3) RGB or (H, W) image."""
+    return _encode('.png', image[..., ::-1] if image.ndim == 3 else image, [])
+
+
+def _encode(extension: str, image: NDArray[np.uint8], options: list[int]) -> bytes:
+    encoded, data = cv2.imencode(extension, np.ascontiguousarray(image), options)
+    if not encoded:
+        raise EpisodeError(f'an image of shape {image.shape} cannot be encoded as {extension}')
+    return data.tobytes()
