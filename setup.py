@@ -1,0 +1,79 @@
+"""Package metadata, read by colcon (ament_python) and by pip alike.
+
+The metadata stands here and not in a [project] table of pyproject.toml, because ament_python
+installs through setup.py and two places would drift apart. Exact versions are in
+requirements/constraints.txt.
+"""
+
+import os
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'mtv_world_ros'
+SHARE = f'share/{PACKAGE}'
+MARKER = f'resource/{PACKAGE}'
+
+
+def data_files():
+    """Lists the files that are not code: the ament marker, package.xml and three folders."""
+    listed = [
+        ('share/ament_index/resource_index/packages', [MARKER]),
+        (SHARE, ['package.xml']),
+    ]
+    for root in ('config', 'launch', 'resource'):
+        for folder, folders, names in os.walk(root):
+            folders[:] = sorted(name for name in folders if not name.startswith(('.', '__')))
+            files = sorted(f'{folder}/{name}' for name in names if not name.startswith('.'))
+            files = [name for name in files if name != MARKER]
+            if files:
+                listed.append((f'{SHARE}/{folder}', files))
+    return listed
+
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='An online embodied world model for ROS 2.',
+    maintainer='mtv_world_ros maintainers',
+    maintainer_email='mtv-world-ros@example.org',
+    license='Apache-2.0',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=data_files(),
+    python_requires='>=3.11',
+    install_requires=[
+        'PyYAML>=6',
+        'av>=18',
+        'diffusers>=0.42,<0.43',
+        'mcap>=1.6',
+        'mcap-ros2-support>=0.6',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'pin>=4.1,<5',
+        'rosbags>=0.11',
+        'safetensors>=0.8',
+        'torch>=2.6',
+        'tqdm>=4.66',
+    ],
+    extras_require={
+        'train': ['accelerate>=1.15', 'peft>=0.21', 'tensorboard>=2.21'],
+        # The simulator; it also needs an OpenGL library, see README.
+        'sim': ['mujoco>=4.0,<5'],
+        # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
+        'ros': [
+            f'{name}; sys_platform == "linux" and platform_machine == "x86_64"'
+            for name in (
+                'ros-jazzy-rclpy==7.1.6',
+                'ros-jazzy-common-interfaces>=5.3.6,<6',
+                'ros-rclpy[fastrtps]==7.1.6',
+            )
+        ],
+        'dev': ['import-linter>=2.16', 'pyright[nodejs]', 'pytest>=9', 'ruff>=0.17'],
+    },
+    entry_points={
+        'console_scripts': [
+            'mtv-world = mtv_world_ros.cli:main',
+            'world_model = mtv_world_ros.ros.node:main',
+        ],
+    },
+    zip_safe=True,
+)

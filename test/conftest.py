@@ -1,0 +1,52 @@
+"""Skips what this machine cannot run, with the reason, and counts it in the closing lines."""
+
+from __future__ import annotations
+
+from collections import Counter
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import shutil
+
+import pytest
+
+
+def _no_gpu() -> str:
+    if find_spec('torch') is None:
+        return 'torch is not installed'
+    import torch
+
+    return '' if torch.cuda.is_available() else 'no CUDA device'
+
+
+def _no_weights() -> str:
+    folder = os.environ.get('MTV_WORLD_WEIGHTS', '')
+    if not folder:
+        return 'MTV_WORLD_WEIGHTS is not set'
+    return '' if Path(folder).is_dir() else f'MTV_WORLD_WEIGHTS={folder} is no folder'
+
+
+def _no_native_ros() -> str:
+    return '' if shutil.which('ros2') else 'no `ros2` command: no native ROS 2 is sourced'
+
+
+#: marker -> why its tests cannot run here; an empty text where they can
+OBSTACLES = {'gpu': _no_gpu, 'weights': _no_weights, 'native_ros': _no_native_ros}
+
+_skipped: Counter[str] = Counter()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for marker, obstacle in OBSTACLES.items():
+        marked = [item for item in items if item.get_closest_marker(marker)]
+        reason = obstacle() if marked else ''
+        if reason:
+            _skipped[f'{marker} ({reason})'] = len(marked)
+            for item in marked:
+                item.add_marker(pytest.mark.skip(reason=f'{marker}: {reason}'))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if _skipped:
+        counted = ', '.join(f'{count} {marker}' for marker, count in _skipped.items())
+        terminalreporter.write_line(f'skipped for want of: {counted}')

@@ -1,0 +1,218 @@
+"""The package as it is installed, and the rules that hold for every file of it."""
+
+from __future__ import annotations
+
+import ast
+from importlib import metadata
+import importlib.util
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+import setuptools
+
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = sorted((ROOT / 'mtv_world_ros').rglob('*.py'))
+
+#: imported name -> the distribution that setup.py asks for, where they differ
+DISTRIBUTIONS = {
+    'cv2': 'opencv-python-headless',
+    'mcap_ros2': 'mcap-ros2-support',
+    'pinocchio': 'pin',
+    'yaml': 'PyYAML',
+}
+#: ROS packages, which package.xml and the `ros` extra bring
+ROS_PACKAGES = {
+    'ament_index_python',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'rcl_interfaces',
+    'rclpy',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'trajectory_msgs',
+}
+#: distributions that the package imports through one it asks for: mcap writes zstd with it
+BROUGHT_ALONG = {'zstandard'}
+
+
+@pytest.fixture(scope='module')
+def setup_arguments() -> dict:
+    """What setup.py passes to setuptools."""
+    passed = {}
+    original = setuptools.setup
+    setuptools.setup = lambda **arguments: passed.update(arguments)
+    folder = Path.cwd()
+    os.chdir(ROOT)
+    try:
+        spec = importlib.util.spec_from_file_location('package_setup', ROOT / 'setup.py')
+        assert spec is not None and spec.loader is not None
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    finally:
+        setuptools.setup = original
+        os.chdir(folder)
+    return passed
+
+
+@pytest.fixture(scope='module')
+def manifest() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / 'package.xml').getroot()
+
+
+def _imports(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module)
+    return {name.partition('.')[0] for name in names}
+
+
+def _tracked_files() -> list[Path]:
+    listed = subprocess.run(
+        ['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if listed.returncode:
+        pytest.skip('not a git checkout: the list of files is not known')
+    paths = [ROOT / name for name in listed.stdout.split('\0') if name]
+    return [path for path in paths if path.is_file()]
+
+
+def _tracked_text_files() -> list[Path]:
+    return [path for path in _tracked_files() if b'\0' not in path.read_bytes()[:8192]]
+
+
+def _text(element: ElementTree.Element, name: str) -> str:
+    return (element.findtext(name) or '').strip()
+
+
+def test_manifest_is_format_3_of_an_ament_python_package(manifest):
+    assert manifest.attrib['format'] == '3'
+    assert _text(manifest, 'name') == 'mtv_world_ros'
+    assert _text(manifest, 'license') == 'Apache-2.0'
+    assert manifest.findtext('export/build_type') == 'ament_python'
+
+
+def test_version_is_the_same_everywhere(manifest, setup_arguments):
+    version = setup_arguments['version']
+    assert _text(manifest, 'version') == version
+    assert re.search(rf'^{re.escape(version)} \(', (ROOT / 'CHANGELOG.rst').read_text(), re.M)
+    try:
+        assert metadata.version('mtv_world_ros') == version
+    except metadata.PackageNotFoundError:
+        pytest.skip('the package is run from its source folder, not installed')
+
+
+def test_data_files_exist_and_hold_the_ament_marker(setup_arguments):
+    installed = dict(setup_arguments['data_files'])
+    assert installed['share/ament_index/resource_index/packages'] == ['resource/mtv_world_ros']
+    assert installed['share/mtv_world_ros'] == ['package.xml']
+    for files in installed.values():
+        for name in files:
+            assert (ROOT / name).is_file(), name
+
+
+def test_every_tracked_config_launch_and_resource_file_is_installed(setup_arguments):
+    installed = {name for _, files in setup_arguments['data_files'] for name in files}
+    tracked = {str(path.relative_to(ROOT)) for path in _tracked_files()}
+    wanted = {name for name in tracked if name.startswith(('config/', 'launch/', 'resource/'))}
+    assert not wanted - installed
+
+
+def test_entry_points_import(setup_arguments):
+    scripts = setup_arguments['entry_points']['console_scripts']
+    assert {script.partition(' = ')[0] for script in scripts} == {'mtv-world', 'world_model'}
+    for script in scripts:
+        module, _, function = script.partition(' = ')[2].partition(':')
+        if importlib.util.find_spec('rclpy') is None and '.ros.' in module:
+            continue
+        assert callable(getattr(importlib.import_module(module), function)), script
+
+
+def test_help_starts_without_torch_and_diffusers():
+    code = (
+        'import sys, mtv_world_ros.cli\n'
+        "print(sorted({'torch', 'diffusers', 'transformers', 'mujoco'} & set(sys.modules)))"
+    )
+    shown = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True
+    )
+    assert shown.stdout.strip() == '[]'
+
+
+@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_modules_are_short(path):
+    limit = 200 if path.name == 'node.py' else 300
+    assert len(path.read_text().splitlines()) <= limit
+
+
+def test_imports_are_declared(setup_arguments, manifest):
+    extras = [name for names in setup_arguments['extras_require'].values() for name in names]
+    requirements = setup_arguments['install_requires'] + extras
+    declared = {re.split(r'[\[<>=;~ ]', name)[0].lower() for name in requirements}
+    depends = {element.text for element in manifest.findall('exec_depend')}
+    missing = set()
+    for path in MODULES:
+        for name in _imports(path) - sys.stdlib_module_names - {'mtv_world_ros'}:
+            if name in ROS_PACKAGES:
+                found = name in depends
+            else:
+                distribution = DISTRIBUTIONS.get(name, name)
+                found = distribution.lower() in declared or distribution in BROUGHT_ALONG
+            if not found:
+                missing.add(f'{path.relative_to(ROOT)}: {name}')
+    assert not missing
+
+
+def test_versions_of_what_is_asked_for_are_pinned(setup_arguments):
+    lines = (ROOT / 'requirements' / 'constraints.txt').read_text().splitlines()
+    pinned = {line.partition('==')[0].lower() for line in lines if '==' in line}
+    extras = [name for names in setup_arguments['extras_require'].values() for name in names]
+    for name in setup_arguments['install_requires'] + extras:
+        assert re.split(r'[\[<>=;~ ]', name)[0].lower() in pinned, name
+
+
+def _loads_a_pickle(call: ast.Call) -> bool:
+    name = ast.unparse(call.func)
+    keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
+    if name == 'torch.load':
+        return keywords.get('weights_only') != 'True'
+    if name in ('np.load', 'numpy.load'):
+        return keywords.get('allow_pickle', 'False') != 'False'
+    return name.partition('.')[0] in ('pickle', 'joblib', 'dill', 'cloudpickle', 'shelve')
+
+
+def test_no_pickle_is_loaded():
+    found = []
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and _loads_a_pickle(node):
+                found.append(f'{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node.func)}')
+    assert not found
+
+
+def test_yaml_is_read_safely():
+    unsafe = re.compile(r'yaml\.(load|full_load|unsafe_load)\(')
+    assert not [str(path) for path in MODULES if unsafe.search(path.read_text())]
+
+
+def test_no_file_names_a_path_of_one_machine():
+    home = re.compile(r'(?<![\w.$~}])/(?:home|root|Users|work)/[\w.-]+')
+    found = []
+    for path in _tracked_text_files():
+        for number, line in enumerate(path.read_text(errors='replace').splitlines(), start=1):
+            if home.search(line) and path != Path(__file__).resolve():
+                found.append(f'{path.relative_to(ROOT)}:{number}: {line.strip()[:80]}')
+    assert not found
+
+
+def test_no_large_file_is_tracked():
+    assert not [str(path) for path in _tracked_files() if path.stat().st_size > 12_000_000]
