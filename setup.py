@@ -67,7 +67,9 @@ setup(
                 'ros-rclpy[fastrtps]==7.1.6',
             )
         ],
-        'dev': ['import-linter>=2.16', 'pyright[nodejs]', 'pytest>=9', 'ruff>=0.17'],
+        # `colcon test` looks for pytest under this name
+        'test': ['pytest>=7.4'],
+        'lint': ['import-linter>=2.16', 'pyright[nodejs]', 'ruff>=0.17'],
     },
     entry_points={
         'console_scripts': [
