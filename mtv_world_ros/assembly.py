@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.geometry.robot import load_robot
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path

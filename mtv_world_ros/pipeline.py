@@ -9,7 +9,6 @@ from math import ceil
 from types import MappingProxyType
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import (
@@ -28,6 +27,7 @@ from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import RobotModel, check_positions
+from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
     TrajectoryVideoConfig,
     render_trajectory_video,
@@ -317,12 +317,3 @@ def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observati
         stamp_ns=observation.stamp_ns,
     )
 
-
-def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
-    """Returns (N, height, width, 3) frames, averaged over the area where they shrink."""
-    if frames.shape[1:3] == (height, width):
-        return frames
-    shrinks = height <= frames.shape[1] and width <= frames.shape[2]
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    size = (width, height)
-    return np.stack([cv2.resize(frame, size, interpolation=method) for frame in frames])

@@ -1,0 +1,82 @@
+"""Rigid poses (4, 4): from quaternions, from Denavit-Hartenberg rows, inverted, as YAML has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray
+
+
+def rotation(quaternion_xyzw: Sequence[float] | FloatArray) -> FloatArray:
+    """Returns the (3, 3) rotation of a quaternion (x, y, z, w) of any length but zero.
+
+    Raises:
+        ValueError: not four finite numbers, or all zero.
+    """
+    quaternion = np.array(quaternion_xyzw, dtype=float)
+    length = np.linalg.norm(quaternion)
+    if quaternion.shape != (4,) or not np.isfinite(length) or length < 1e-9:
+        raise ValueError(f'{quaternion_xyzw!r} is no quaternion: give x, y, z, w, not all zero')
+    x, y, z, w = quaternion / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def pose(
+    position: Sequence[float] | FloatArray, quaternion_xyzw: Sequence[float] | FloatArray
+) -> FloatArray:
+    """Returns the (4, 4) pose of a position [m] and a quaternion (x, y, z, w).
+
+    Raises:
+        ValueError: not three finite numbers, or no quaternion.
+    """
+    place = np.array(position, dtype=float)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise ValueError(f'{position!r} is no position: give x, y, z [m]')
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation(quaternion_xyzw), place
+    return T
+
+
+def denavit_hartenberg(a: float, alpha: float, d: float, theta: float) -> FloatArray:
+    """Returns Rz(theta) Tz(d) Tx(a) Rx(alpha), the standard convention's (4, 4) [m, rad].
+
+    Source: B. Siciliano et al., Robotics, 2.8.2.
+    """
+    (ca, ct), (sa, st) = np.cos((alpha, theta)), np.sin((alpha, theta))
+    return np.array(
+        [
+            [ct, -st * ca, st * sa, a * ct],
+            [st, ct * ca, -ct * sa, a * st],
+            [0.0, sa, ca, d],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Returns the inverses (..., 4, 4) of rigid poses (..., 4, 4)."""
+    transposed = np.swapaxes(T[..., :3, :3], -1, -2)
+    result = np.zeros_like(T)
+    result[..., :3, :3] = transposed
+    result[..., :3, 3] = -(transposed @ T[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def is_rigid(T: FloatArray) -> bool:
+    """Whether a (4, 4) matrix is a right-handed rotation (to 1e-4) and a translation."""
+    turn = T[:3, :3]
+    return bool(
+        np.isfinite(T).all()
+        and np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)
+        and np.linalg.det(turn) > 0
+        and np.allclose(T[3], (0, 0, 0, 1))
+    )

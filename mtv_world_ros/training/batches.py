@@ -1,0 +1,143 @@
+"""Batches by step number: the same step gives the same batch, so a resumed run is exact.
+
+Shape letters: B batch, V views, T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mtv_world_ros.data.clips import Clip, Recording, clip_starts, cut_clip
+from mtv_world_ros.data_types import ByteArray, WorldModelSpec
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.rendering.trajectory_video import (
+    TrajectoryVideoConfig,
+    render_trajectory_video,
+)
+from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.success.segmenter import Segmenter
+from mtv_world_ros.training.config import AugmentConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Clips with their trajectory videos.
+
+    Attributes:
+        frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model is shown it.
+        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        object_ids: (B, V, 1 + T, H, W) uint8, or None where some clip has none.
+    """
+
+    frames: Tensor
+    start_frame: Tensor
+    trajectory: Tensor
+    object_ids: Tensor | None
+
+
+class BatchSource:
+    """Cuts, draws and disturbs clips; one batch is prepared while the last one trains."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        spec: WorldModelSpec,
+        robot: RobotModel,
+        segmenter: Segmenter,
+        rendering: TrajectoryVideoConfig,
+        object_mask: bool,
+        augment: AugmentConfig,
+        batch_size: int,
+        seed: int,
+    ) -> None:
+        self._starts = [(r, clip_starts(r, spec)) for r in recordings]
+        self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
+        if not self._starts:
+            raise TrainingError(
+                f'none of {len(recordings)} episodes is long enough for a clip of '
+                f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s); '
+                'record longer ones or lower video.num_frames'
+            )
+        self._spec, self._robot, self._segmenter = spec, robot, segmenter
+        self._rendering, self._object_mask, self._augment = rendering, object_mask, augment
+        self._batch_size, self._seed = batch_size, seed
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._ahead: tuple[int, Future[Batch]] | None = None
+
+    @property
+    def num_clips(self) -> int:
+        """Clips that can be cut."""
+        return sum(len(starts) for _, starts in self._starts)
+
+    def batch(self, step: int) -> Batch:
+        """Returns the batch of a step, and starts preparing the next one."""
+        if self._ahead is not None and self._ahead[0] == step:
+            result = self._ahead[1].result()
+        else:
+            result = self._make(step)
+        self._ahead = (step + 1, self._pool.submit(self._make, step + 1))
+        return result
+
+    def close(self) -> None:
+        """Stops preparing."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _make(self, step: int) -> Batch:
+        rng = np.random.default_rng((self._seed, step))
+        samples = [self._sample(rng) for _ in range(self._batch_size)]
+        ids = [sample[3] for sample in samples]
+        return Batch(
+            frames=torch.from_numpy(np.stack([s[0] for s in samples])),
+            start_frame=torch.from_numpy(np.stack([s[1] for s in samples])),
+            trajectory=torch.from_numpy(np.stack([s[2] for s in samples])),
+            object_ids=None
+            if any(i is None for i in ids)
+            else torch.from_numpy(np.stack([i for i in ids if i is not None])),
+        )
+
+    def _sample(
+        self, rng: np.random.Generator
+    ) -> tuple[ByteArray, ByteArray, ByteArray, ByteArray | None]:
+        recording, starts = self._starts[rng.integers(len(self._starts))]
+        clip = cut_clip(recording, int(starts[rng.integers(len(starts))]), self._spec)
+        names = clip.objects or objects_from_instruction(recording.instruction)
+        trajectory = self._draw(clip, names)
+        frames = clip.frames
+        if rng.random() < self._augment.colour_permutation:
+            frames = frames[..., rng.permutation(3)]
+        start = frames[:, 0]
+        if rng.random() < self._augment.start_noise:
+            start = _disturb(start, self._augment.start_noise_std, rng)
+        return np.ascontiguousarray(frames), start.copy(), trajectory, clip.object_ids
+
+    def _draw(self, clip: Clip, names: tuple[str, ...]) -> ByteArray:
+        masks = None
+        if self._object_mask:
+            masks = self._segmenter.segment(clip.frames[:, :1], names).masks[:, :, 0]
+        return render_trajectory_video(
+            cameras=clip.cameras,
+            robot=self._robot,
+            positions=clip.positions,
+            times=clip.times,
+            object_masks=masks,
+            config=self._rendering,
+        ).frames
+
+
+def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:
+    """Blur and noise of random strength, like a frame the model predicted itself."""
+    blurred = np.stack([cv2.blur(frame, (3, 3)) for frame in frames]).astype(np.float32)
+    share = rng.random() * 0.7
+    mixed = (1 - share) * frames + share * blurred
+    mixed = mixed + rng.normal(0, 255 * noise_std * rng.random(), mixed.shape)
+    return mixed.round().clip(0, 255).astype(np.uint8)

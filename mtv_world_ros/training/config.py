@@ -1,0 +1,140 @@
+"""Training presets: YAML read into dataclasses, unknown keys refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.resources import share_path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoConfig:
+    """What the model sees and predicts: views, frame rate [Hz], T, size [px], robot."""
+
+    views: tuple[str, ...] = ('low', 'high')
+    fps: float = 5.0
+    num_frames: int = 16
+    width: int = 96
+    height: int = 72
+    robot: str = 'yam_bimanual'
+    object_mask: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectiveConfig:
+    """The loss: see `objective.py`.
+
+    Attributes:
+        sigma_shift: draws noise levels towards high noise.
+        full_noise_share: share of samples at noise level 1, where sampling starts.
+        huber_delta: in [-1, 1] pixel units.
+        change_weight: extra weight of pixels that differ from the start frame.
+        object_weight: extra weight of pixels on objects.
+        moved_weight: extra weight of pixels where objects came or went.
+    """
+
+    sigma_shift: float = 5.0
+    full_noise_share: float = 0.25
+    huber_delta: float = 0.1
+    change_weight: float = 4.0
+    object_weight: float = 6.0
+    moved_weight: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AugmentConfig:
+    """Disturbances of the start frame and of colours, as probabilities and sizes."""
+
+    start_noise: float = 0.5
+    start_noise_std: float = 0.04
+    colour_permutation: float = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimizerConfig:
+    """AdamW with warm-up, a constant stretch and a linear decay to zero."""
+
+    learning_rate: float = 6e-4
+    weight_decay: float = 0.01
+    warmup_steps: int = 200
+    decay_share: float = 0.35
+    max_grad_norm: float = 1.0
+    ema_decay: float = 0.999
+    batch_size: int = 4
+    steps: int = 5000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingConfig:
+    """A whole preset.
+
+    Attributes:
+        transformer: arguments of `MultiViewWanTransformer`.
+        autoencoder: arguments of the autoencoder.
+        scheduler: arguments of the noise schedule.
+        video: what the model sees.
+        rendering: how trajectory videos look.
+        objective: the loss.
+        augment: disturbances.
+        optimizer: steps and rates.
+    """
+
+    transformer: dict[str, Any] = field(default_factory=dict)
+    autoencoder: dict[str, Any] = field(default_factory=dict)
+    scheduler: dict[str, Any] = field(default_factory=dict)
+    video: VideoConfig = VideoConfig()
+    rendering: TrajectoryVideoConfig = TrajectoryVideoConfig()
+    objective: ObjectiveConfig = ObjectiveConfig()
+    augment: AugmentConfig = AugmentConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+
+    def as_dict(self) -> dict[str, Any]:
+        """The configuration as plain values, for the checkpoint's card."""
+        return asdict(self)
+
+
+def load_training_config(
+    preset: str | Path, overrides: Mapping[str, Any] | None = None
+) -> TrainingConfig:
+    """Reads a preset by name (`small`) or path, and lays overrides like `optimizer.steps` on it.
+
+    Raises:
+        ConfigError: no such preset, or an unknown key (names the nearest known one).
+    """
+    path = Path(preset)
+    if path.suffix not in ('.yaml', '.yml'):
+        path = share_path('config', 'models', f'{preset}.yaml')
+    if not path.is_file():
+        raise ConfigError(f"preset file '{path}' does not exist; give --preset another one")
+    values = yaml.safe_load(path.read_text()) or {}
+    for dotted, value in (overrides or {}).items():
+        section, _, key = dotted.partition('.')
+        if not key:
+            raise ConfigError(f"override '{dotted}' must look like section.key, e.g. video.fps")
+        values.setdefault(section, {})[key] = value
+    return _read(TrainingConfig, values, str(path))
+
+
+def _read(kind: Any, values: Any, where: str) -> Any:
+    if not isinstance(values, Mapping):
+        raise ConfigError(f'{where}: expected keys and values, got {values!r}')
+    known = {f.name: f for f in fields(kind)}
+    for key in values:
+        if key not in known:
+            raise ConfigError(f"{where}: unknown key '{key}'{nearest(key, known)}")
+    arguments = {}
+    for key, value in values.items():
+        default = getattr(kind(), key)
+        if hasattr(type(default), '__dataclass_fields__'):
+            value = _read(type(default), value, f'{where}: {key}')
+        elif isinstance(default, tuple):
+            value = tuple(value)
+        arguments[key] = value
+    return kind(**arguments)

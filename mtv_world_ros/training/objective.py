@@ -1,0 +1,69 @@
+"""The training loss: flow matching in clean-sample form, weighted towards what moves.
+
+Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w latent size.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+from mtv_world_ros.training.config import ObjectiveConfig
+
+#: RGB difference (of 255) from which a pixel counts as changed
+CHANGE_THRESHOLD = 24
+
+
+def draw_sigmas(count: int, config: ObjectiveConfig, generator: torch.Generator) -> Tensor:
+    """Returns (count,) noise levels in (0, 1], shifted towards high noise.
+
+    `sigma' = s * sigma / (1 + (s - 1) * sigma)` as in Wan's schedule.
+    """
+    uniform = torch.rand(count, generator=generator).clamp_min(1e-3)
+    shifted = config.sigma_shift * uniform / (1 + (config.sigma_shift - 1) * uniform)
+    full = torch.rand(count, generator=generator) < config.full_noise_share
+    return torch.where(full, torch.ones(()), shifted)
+
+
+def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveConfig) -> Tensor:
+    """Returns (B, V, T, H, W) weights of the future frames' pixels, at least 1.
+
+    Args:
+        frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        object_ids: (B, V, 1 + T, H, W) uint8 instance ids, 0 = none; None where unknown.
+        config: the weights.
+    """
+    difference = (frames[:, :, 1:].short() - frames[:, :, :1].short()).abs().amax(-1)
+    weights = 1.0 + config.change_weight * (difference > CHANGE_THRESHOLD).float()
+    if object_ids is not None:
+        now, before = object_ids[:, :, 1:], object_ids[:, :, :1]
+        weights = weights + config.object_weight * (now > 0).float()
+        weights = weights + config.moved_weight * (now != before).float()
+    return weights
+
+
+def latent_weights(weights: Tensor, block_size: int) -> Tensor:
+    """Returns (B, V, 3 * block_size**2, T, h, w) weights for space-to-depth latents."""
+    blocks = F.pixel_unshuffle(weights.flatten(0, 1).flatten(0, 1)[:, None], block_size)
+    blocks = blocks.repeat(1, 3, 1, 1)  # latent channels are colour-major
+    return blocks.unflatten(0, weights.shape[:3]).movedim(3, 2)
+
+
+def add_noise(clean: Tensor, noise: Tensor, sigmas: Tensor) -> Tensor:
+    """Returns `(1 - sigma) * clean + sigma * noise`; sigmas (B,)."""
+    sigma = sigmas.reshape(-1, *[1] * (clean.ndim - 1)).to(clean.dtype)
+    return (1 - sigma) * clean + sigma * noise
+
+
+def sample_loss(predicted: Tensor, clean: Tensor, weights: Tensor, delta: float) -> Tensor:
+    """Returns the weighted mean Huber loss between predicted and clean latents.
+
+    Args:
+        predicted: (B, V, C, T, h, w).
+        clean: the same shape.
+        weights: the same shape, positive.
+        delta: where the loss turns from square to linear.
+    """
+    error = F.huber_loss(predicted.float(), clean.float(), reduction='none', delta=delta) / delta
+    return (error * weights).sum() / weights.sum()
