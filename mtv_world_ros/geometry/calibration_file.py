@@ -11,7 +11,7 @@ import yaml
 
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError, nearest
-from mtv_world_ros.geometry.robot_file import pose
+from mtv_world_ros.geometry.transforms import pose
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
          'T_mount_camera', 'position', 'quaternion_xyzw')  # fmt: skip

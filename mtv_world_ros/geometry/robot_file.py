@@ -13,18 +13,7 @@ import yaml
 
 from mtv_world_ros.errors import ConfigError, RobotError, nearest
 from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool
-from mtv_world_ros.geometry.transforms import pose as _pose
-from mtv_world_ros.geometry.transforms import rotation_from_quaternion
-
-
-def pose(position, quaternion_xyzw):
-    return _pose(rotation_from_quaternion(np.asarray(quaternion_xyzw, float)), np.asarray(position, float))
-
-
-def denavit_hartenberg(a, alpha, d, theta):
-    ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
-    return np.array([[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]])
-
+from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
 _KEYS = ('name', 'urdf', 'dh', 'base_link', 'joints', 'tools')
 _TOOL_KEYS = ('arm', 'link', 'position', 'quaternion_xyzw', 'gripper_joint', 'gripper_closed',
