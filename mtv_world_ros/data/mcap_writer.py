@@ -26,6 +26,7 @@ from mtv_world_ros.data.episode import (
 )
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.geometry.calibration_file import save_calibration
 
 
 class EpisodeWriter(BagWriter):
@@ -67,8 +68,6 @@ class EpisodeWriter(BagWriter):
         self.metadata: dict[str, str] = dict(metadata or {})
         self._jpeg_quality = jpeg_quality
         if cameras:
-            from mtv_world_ros.geometry.camera import save_calibration
-
             save_calibration(
                 self.folder / CALIBRATION_FILE, {camera.view: camera for camera in cameras}
             )

@@ -1,0 +1,288 @@
+"""Reads the raw messages of rosbag2 MCAP bags, also of bags that were cut off."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+import io
+from pathlib import Path
+import struct
+from typing import Any, BinaryIO, NamedTuple
+import zlib
+
+import lz4.frame
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
+import yaml
+import zstandard
+
+from mtv_world_ros.errors import EpisodeError
+
+MAGIC = b'\x89MCAP0\r\n'
+_RECORD = struct.Struct('<BQ')
+_MESSAGE = struct.Struct('<HIQQ')
+_CHUNK = struct.Struct('<QQQII')
+#: read of a chunk that claims to be longer than the file
+_MAX_CHUNK_BYTES = 64 * 1024 * 1024
+_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+class BagMessage(NamedTuple):
+    """One recorded message.
+
+    Attributes:
+        topic: absolute topic name.
+        msgtype: e.g. `sensor_msgs/msg/Image`.
+        stamp_ns: log time [ns].
+        data: CDR bytes with encapsulation header.
+    """
+
+    topic: str
+    msgtype: str
+    stamp_ns: int
+    data: bytes
+
+
+class _Cut(Exception):
+    """The record ends before its end, or is damaged from here on."""
+
+
+class BagReader:
+    """A rosbag2 folder of MCAP files, or one MCAP file.
+
+    A bag that is cut off or damaged is read up to there; `truncated` then says where.
+
+    Attributes:
+        truncated: why the record ends early; empty where it does not. Known after a pass.
+        problems: other things found wrong, one line each.
+        metadata: MCAP metadata records by name. Complete after a pass.
+        custom_data: `custom_data` of metadata.yaml.
+
+    Raises:
+        EpisodeError: there is no such bag, or it is not stored as MCAP.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.truncated = ''
+        self.problems: list[str] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.custom_data: dict[str, str] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._files = self._find_files()
+
+    def topics(self) -> dict[str, str]:
+        """Message type of every topic that has messages, in order of first appearance."""
+        return {message.topic: message.msgtype for message in self.messages()}
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Yields the messages of `topics` (default: all) in the order they were recorded.
+
+        Messages that are not in CDR are left out and named in `problems`.
+
+        Raises:
+            EpisodeError: a file is not MCAP or uses an unknown compression.
+        """
+        self.truncated, self.metadata = '', {}
+        for file in self._files:
+            self._schemas, self._channels = {}, {}
+            try:
+                with file.open('rb') as stream:
+                    yield from self._file_messages(stream, file, topics)
+            except _Cut as cut:
+                self.truncated = f"'{file}' is cut off or damaged: {cut}"
+                return
+            except OSError as error:
+                raise EpisodeError(f"cannot read '{file}': {error}") from error
+
+    def _find_files(self) -> list[Path]:
+        if self.path.is_file():
+            return [_check_storage(self.path)]
+        if not self.path.is_dir():
+            raise EpisodeError(f"there is no episode '{self.path}'")
+        information = self._read_information()
+        self.custom_data = {
+            str(key): str(text) for key, text in (information.get('custom_data') or {}).items()
+        }
+        named = [self.path / Path(n).name for n in information.get('relative_file_paths') or []]
+        for file in named:
+            if not file.is_file():
+                self._problem(f"'{file}' is named in metadata.yaml but is not there")
+        files = [file for file in named if file.is_file()] or sorted(self.path.glob('*.mcap'))
+        if not files:
+            self._raise_no_files()
+        return [_check_storage(file) for file in files]
+
+    def _read_information(self) -> Mapping[str, Any]:
+        file = self.path / 'metadata.yaml'
+        if not file.is_file():
+            self._problem(f"'{self.path}' has no metadata.yaml (the recorder was killed?)")
+            return {}
+        try:
+            content = yaml.load(file.read_bytes(), Loader=_YAML_LOADER)  # noqa: S506
+            return dict(content['rosbag2_bagfile_information'])
+        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+            reason = ' '.join(str(error).split())
+            self._problem(f"'{file}' is not rosbag2 metadata and was ignored ({reason})")
+            return {}
+
+    def _raise_no_files(self) -> None:
+        for other in sorted(self.path.glob('*')):
+            if other.suffix in ('.db3', '.zstd'):
+                _check_storage(other)
+        raise EpisodeError(f"'{self.path}' is not a bag: it holds no .mcap file")
+
+    def _problem(self, text: str) -> None:
+        if text not in self.problems:
+            self.problems.append(text)
+
+    def _file_messages(
+        self, stream: BinaryIO, file: Path, topics: Collection[str] | None
+    ) -> Iterator[BagMessage]:
+        size = file.stat().st_size
+        magic = stream.read(len(MAGIC))
+        if not MAGIC.startswith(magic):
+            raise EpisodeError(f"'{file}' is not an MCAP file: it starts with {magic!r}")
+        for opcode, body in self._records(stream, file, size):
+            if opcode == Opcode.CHUNK:
+                for inner, part in _split(_decompress(body, stream.tell())):
+                    yield from self._take(inner, part, topics)
+            else:
+                yield from self._take(opcode, body, topics)
+
+    def _records(self, stream: BinaryIO, file: Path, size: int) -> Iterator[tuple[int, bytes]]:
+        """Records up to the footer; what is left of a chunk that was cut comes out as one."""
+        data_ended = False
+        while True:
+            start = stream.tell()
+            head = stream.read(_RECORD.size)
+            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+            if opcode == Opcode.FOOTER:
+                return
+            if opcode == 0 or start + _RECORD.size + length > size:
+                if data_ended:
+                    self._problem(
+                        f"'{file}' lost its index after byte {start}; no message is lost"
+                    )
+                    return
+                if opcode == Opcode.CHUNK:
+                    yield opcode, stream.read(_MAX_CHUNK_BYTES)
+                raise _Cut(f'no whole record at byte {start} of {size}')
+            data_ended = data_ended or opcode == Opcode.DATA_END
+            yield opcode, stream.read(length)
+
+    def _take(
+        self, opcode: int, body: bytes, topics: Collection[str] | None
+    ) -> Iterator[BagMessage]:
+        if opcode == Opcode.MESSAGE:
+            number, _, log_time, _ = _MESSAGE.unpack_from(body)
+            channel = self._channels.get(number)
+            if channel is None:
+                raise _Cut(f'a message of channel {number}, which is not declared')
+            if (topics is None or channel.topic in topics) and self._is_cdr(channel):
+                msgtype = self._schemas[channel.schema_id].name
+                yield BagMessage(channel.topic, msgtype, log_time, body[_MESSAGE.size :])
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            self._declare(opcode, ReadDataStream(io.BytesIO(body)))
+
+    def _declare(self, opcode: int, stream: ReadDataStream) -> None:
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self._channels[channel.id] = channel
+        else:
+            record = Metadata.read(stream)
+            self.metadata[record.name] = record.metadata
+
+    def _is_cdr(self, channel: Channel) -> bool:
+        fits = channel.message_encoding == 'cdr' and channel.schema_id in self._schemas
+        if not fits:
+            self._problem(
+                f"'{channel.topic}' was left out: it is encoded as "
+                f"'{channel.message_encoding}', not as cdr with a schema"
+            )
+        return fits
+
+
+def iter_messages(
+    path: Path | str,
+    topics: Collection[str] | None = None,
+    *,
+    problems: list[str] | None = None,
+) -> Iterator[BagMessage]:
+    """Yields the raw messages of a bag in the order they were recorded.
+
+    Args:
+        path: rosbag2 folder or .mcap file.
+        topics: topics to yield; None = all.
+        problems: gets a line for each thing found wrong, a cut included.
+
+    Raises:
+        EpisodeError: there is no such bag; or the bag is cut off and `problems` is None, once
+            the messages before the cut were yielded.
+    """
+    reader = BagReader(path)
+    yield from reader.messages(topics)
+    if problems is not None:
+        problems.extend(([reader.truncated] if reader.truncated else []) + reader.problems)
+    elif reader.truncated:
+        raise EpisodeError(reader.truncated)
+
+
+def _check_storage(file: Path) -> Path:
+    if file.suffix in ('.db3', '.zstd'):
+        kind = 'an SQLite bag' if file.suffix == '.db3' else 'a bag compressed as a whole'
+        raise EpisodeError(
+            f"'{file}' is {kind}; convert it with `ros2 bag convert` to storage_id mcap without "
+            'compression_mode'
+        )
+    return file
+
+
+def _split(records: bytes) -> Iterator[tuple[int, bytes]]:
+    """Whole records in a decompressed chunk."""
+    position = 0
+    while position + _RECORD.size <= len(records):
+        opcode, length = _RECORD.unpack_from(records, position)
+        position += _RECORD.size
+        if position + length > len(records):
+            return
+        yield opcode, records[position : position + length]
+        position += length
+
+
+def _decompress(body: bytes, end: int) -> bytes:
+    """Records of a chunk; as many as there are if the chunk was cut."""
+    if len(body) < _CHUNK.size:
+        return b''
+    _, _, size, crc, name_length = _CHUNK.unpack_from(body)
+    name_end = _CHUNK.size + name_length
+    compression = body[_CHUNK.size : name_end]
+    whole = len(body) >= name_end + 8
+    if whole:
+        (length,) = struct.unpack_from('<Q', body, name_end)
+        whole = len(body) == name_end + 8 + length
+    try:
+        records = _inflate(compression, body[name_end + 8 :])
+    except (zstandard.ZstdError, RuntimeError) as error:
+        raise _Cut(f'the chunk before byte {end} cannot be decompressed ({error})') from error
+    damaged = len(records) != size or (crc and zlib.crc32(records) != crc)
+    if whole and damaged:
+        raise _Cut(f'the chunk before byte {end} does not match its checksum')
+    return records
+
+
+def _inflate(compression: bytes, data: bytes) -> bytes:
+    if not compression:
+        return data
+    if compression == b'zstd':
+        return zstandard.ZstdDecompressor().decompressobj().decompress(data) if data else b''
+    if compression == b'lz4':
+        return lz4.frame.LZ4FrameDecompressor().decompress(data) if data else b''
+    raise EpisodeError(
+        f"the bag is compressed with '{compression.decode(errors='replace')}'; known are zstd "
+        'and lz4'
+    )

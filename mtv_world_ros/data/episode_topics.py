@@ -1,0 +1,114 @@
+"""Which topics of a bag hold an episode's images, calibration, masks, states and commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import re
+
+from mtv_world_ros.data.episode import image_topic, INSTRUCTION, JOINT_STATES, JOINT_TRAJECTORY
+from mtv_world_ros.data.messages import COMPRESSED_IMAGE, IMAGE
+from mtv_world_ros.errors import EpisodeError, nearest
+
+#: keys of a topic map that are not views, and the topics they stand for
+STREAMS = {
+    'joint_states': JOINT_STATES,
+    'joint_trajectory': JOINT_TRAJECTORY,
+    'instruction': INSTRUCTION,
+}
+_PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed)?')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewTopics:
+    """Topics of one view: images (raw or compressed), CameraInfo, masks."""
+
+    image: str
+    camera_info: str
+    mask: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeTopics:
+    """Topics of an episode."""
+
+    views: Mapping[str, ViewTopics]
+    joint_states: str
+    joint_trajectory: str
+    instruction: str
+
+    def names(self, *, with_masks: bool) -> set[str]:
+        """All of them."""
+        names = {self.joint_states, self.joint_trajectory, self.instruction}
+        for view in self.views.values():
+            names |= {view.image, view.camera_info, *([view.mask] if with_masks else [])}
+        return names
+
+
+def find_topics(
+    path: Path,
+    found: Mapping[str, str],
+    views: Sequence[str] | None,
+    named: Mapping[str, str],
+) -> EpisodeTopics:
+    """Chooses the topics of an episode.
+
+    A view's images are at `/<view>/image_raw` or `/<view>/image_raw/compressed` (raw is taken
+    where both are there) unless `named` says otherwise; CameraInfo and masks lie beside them.
+
+    Args:
+        path: the bag, for error texts.
+        found: message type of each topic in the bag.
+        views: views wanted; None = those of `named`, else all that are there.
+        named: topic by view name or by `joint_states`, `joint_trajectory`, `instruction`.
+
+    Raises:
+        EpisodeError: a view is not there, or `named` has a key that is neither.
+    """
+    images = [topic for topic, kind in found.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+    if views is None:
+        views = [key for key in named if key not in STREAMS] or _plain_views(images)
+    unknown = [key for key in named if key not in STREAMS and key not in views]
+    if unknown:
+        known = [*views, *STREAMS]
+        raise EpisodeError(
+            f"topics: '{unknown[0]}' is neither a view nor a stream; known are "
+            f'{", ".join(known)}{nearest(unknown[0], known)}'
+        )
+    if not views:
+        raise EpisodeError(
+            f"'{path}' has no topic /<view>/image_raw or /<view>/image_raw/compressed; its image "
+            f'topics are {_listed(images)}: name the views in `topics`'
+        )
+    return EpisodeTopics(
+        views={view: _view_topics(path, view, images, named) for view in views},
+        **{key: named.get(key, topic) for key, topic in STREAMS.items()},
+    )
+
+
+def _plain_views(images: Sequence[str]) -> list[str]:
+    matches = [_PLAIN_VIEW.fullmatch(topic) for topic in images]
+    return list(dict.fromkeys(match[1] for match in matches if match))
+
+
+def _view_topics(
+    path: Path, view: str, images: Sequence[str], named: Mapping[str, str]
+) -> ViewTopics:
+    wanted = named.get(view, image_topic(view))
+    image = next((t for t in (wanted, f'{wanted}/compressed') if t in images), None)
+    if image is None:
+        there = _plain_views(images)
+        raise EpisodeError(
+            f"'{path}' has no view '{view}': there are no images at '{wanted}' or "
+            f"'{wanted}/compressed'; its views are {_listed(there)}{nearest(view, there)}, its "
+            f'image topics {_listed(images)} (map a view to a topic in `topics`)'
+        )
+    camera = image.removesuffix('/compressed').rpartition('/')[0]
+    return ViewTopics(
+        image=image, camera_info=f'{camera}/camera_info', mask=f'{camera}/mask/compressed'
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ', '.join(names) or 'none'
