@@ -1,0 +1,112 @@
+"""Camera poses of the benchmark and their OpenCV calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.data_types import CameraModel, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSpec:
+    """A fixed camera on a sphere around the point it looks at.
+
+    Attributes:
+        view: name of the view.
+        target: (x, y, z) the point looked at, in the base frame [m].
+        distance: camera to target [m].
+        azimuth: 0 = opposite the robot; positive moves the camera to the robot's right [deg].
+        elevation: above the table [deg].
+        visible_width: width of the view's plane through the target [m].
+    """
+
+    view: str
+    target: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+    visible_width: float
+
+
+#: the paper's views: low (close) and high (overview)
+CAMERAS = (
+    CameraSpec(
+        view='low', target=(0.0, 0.23, 0.075), distance=1.05, azimuth=28, elevation=30,
+        visible_width=0.6,
+    ),
+    CameraSpec(
+        view='high', target=(0.0, 0.22, 0.06), distance=1.3, azimuth=-6, elevation=58,
+        visible_width=0.6,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraJitter:
+    """Half widths of the uniform camera randomisation of an episode."""
+
+    target_m: float = 0.008
+    distance_m: float = 0.03
+    angle_deg: float = 2.0
+
+
+def jittered(
+    spec: CameraSpec, jitter: CameraJitter, generator: np.random.Generator
+) -> CameraSpec:
+    """Returns the spec with target, distance and angles moved within the jitter."""
+    draw = generator.uniform(-1.0, 1.0, 6)
+    target = np.asarray(spec.target) + jitter.target_m * draw[:3]
+    distance = spec.distance + jitter.distance_m * draw[3]
+    return CameraSpec(
+        view=spec.view,
+        target=tuple(float(value) for value in target),  # type: ignore[arg-type]
+        distance=distance,
+        azimuth=spec.azimuth + jitter.angle_deg * draw[4],
+        elevation=spec.elevation + jitter.angle_deg * draw[5],
+        # the lens stays the same
+        visible_width=spec.visible_width * distance / spec.distance,
+    )
+
+
+def optical_pose(spec: CameraSpec) -> FloatArray:
+    """Returns T_base_camera (4, 4) of the optical frame: x right, y down, z ahead."""
+    azimuth, elevation = np.deg2rad(spec.azimuth), np.deg2rad(spec.elevation)
+    outward = np.array(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth),
+         np.sin(elevation)]
+    )  # fmt: skip
+    ahead = -outward
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    pose[:3, 3] = np.asarray(spec.target) + spec.distance * outward
+    return pose
+
+
+def camera_model(spec: CameraSpec, width: int, height: int) -> CameraModel:
+    """Returns the calibrated camera for images of `width` x `height` px; no distortion."""
+    focal = width * spec.distance / spec.visible_width
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return CameraModel(
+        view=spec.view, width=width, height=height, K=K, mount_link='base',
+        T_mount_camera=optical_pose(spec),
+    )  # fmt: skip
+
+
+def camera_xml(camera: CameraModel) -> str:
+    """Returns the MJCF camera of a fixed, centred, undistorted camera.
+
+    MuJoCo's camera looks along its own -z with y up; the optical frame has y down, z ahead.
+    """
+    pose = camera.T_mount_camera
+    x, y, z = pose[:3, 3]
+    right, down = pose[:3, 0], pose[:3, 1]
+    axes = ' '.join(f'{value:.12g}' for value in (*right, *-down))
+    fovy = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    return (
+        f'<camera name="{camera.view}" pos="{x:.12g} {y:.12g} {z:.12g}" xyaxes="{axes}" '
+        f'fovy="{fovy:.12g}"/>'
+    )

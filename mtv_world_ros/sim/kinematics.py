@@ -1,0 +1,97 @@
+"""Differential inverse kinematics of top-down tool poses on the robot's Pinocchio model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.geometry.robot import RobotModel, Tool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IkConfig:
+    """Damped least squares, iterated until the tool is there.
+
+    Attributes:
+        damping: added to the diagonal of J^T J.
+        tolerance_m: accepted position error.
+        tolerance_rad: accepted orientation error.
+        num_iterations: steps before a pose counts as out of reach.
+        limit_margin: distance kept from the joint limits [rad].
+    """
+
+    damping: float = 1e-5
+    tolerance_m: float = 3e-4
+    tolerance_rad: float = 2e-3
+    num_iterations: int = 60
+    limit_margin: float = 0.005
+
+
+def top_down(position: FloatArray, yaw: float) -> FloatArray:
+    """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
+
+    The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
+    along the base's x.
+    """
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
+    pose[:3, 3] = position
+    return pose
+
+
+class ArmSolver:
+    """Solves the joints of one arm for tool poses, starting from the previous solution."""
+
+    def __init__(self, robot: RobotModel, tool: Tool, config: IkConfig | None = None) -> None:
+        self._config = config or IkConfig()
+        self._model = robot.pinocchio_model
+        self._data = self._model.createData()
+        self._frame = self._model.getFrameId(tool.link)
+        self._tool = pin.SE3(np.asarray(tool.T_link_tool, dtype=float))
+        prefix = f'{tool.arm}_'
+        self.indices = [
+            index
+            for index, name in enumerate(robot.joint_names)
+            if name.startswith(prefix) and name != tool.gripper_joint
+        ]
+        joints = [self._model.joints[self._model.getJointId(robot.joint_names[i])]
+                  for i in self.indices]  # fmt: skip
+        self._q_at = np.array([joint.idx_q for joint in joints])
+        self._v_at = np.array([joint.idx_v for joint in joints])
+        margin = self._config.limit_margin
+        self._lower = np.asarray(robot.lower)[self.indices] + margin
+        self._upper = np.asarray(robot.upper)[self.indices] - margin
+        self._neutral = pin.neutral(self._model)
+
+    def solve(self, pose: FloatArray, start: FloatArray) -> FloatArray:
+        """Returns the arm's joints (6,) [rad] that bring the tool to `pose` (4, 4).
+
+        Raises:
+            SimulatorError: the pose is out of reach from `start`.
+        """
+        config, goal = self._config, pin.SE3(np.asarray(pose))
+        q, joints = self._neutral.copy(), np.clip(start, self._lower, self._upper)
+        for _ in range(config.num_iterations):
+            q[self._q_at] = joints
+            pin.computeJointJacobians(self._model, self._data, q)
+            pin.updateFramePlacement(self._model, self._data, self._frame)
+            placement = self._data.oMf[self._frame] * self._tool
+            error = pin.log6(placement.actInv(goal)).vector
+            if (
+                np.linalg.norm(error[:3]) < config.tolerance_m
+                and np.linalg.norm(error[3:]) < config.tolerance_rad
+            ):
+                return joints
+            jacobian = self._tool.actionInverse @ pin.getFrameJacobian(
+                self._model, self._data, self._frame, pin.ReferenceFrame.LOCAL
+            )[:, self._v_at]
+            normal = jacobian.T @ jacobian + config.damping * np.eye(len(joints))
+            step = np.linalg.solve(normal, jacobian.T @ error)
+            joints = np.clip(joints + np.clip(step, -0.5, 0.5), self._lower, self._upper)
+        x, y, z = pose[:3, 3]
+        raise SimulatorError(f'tool pose at ({x:.3f}, {y:.3f}, {z:.3f}) m is out of reach')
