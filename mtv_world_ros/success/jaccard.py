@@ -5,8 +5,8 @@ Frame 0 is the condition, not a prediction: pass frames 1..T.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
+import warnings
 
 import numpy as np
 

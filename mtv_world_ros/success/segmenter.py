@@ -14,7 +14,7 @@ from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.success.describer import colour_of
 from mtv_world_ros.success.palette import PALETTE
-from mtv_world_ros.success.tracking import Track, TrackingConfig, track
+from mtv_world_ros.success.tracking import Track, track, TrackingConfig
 
 Floats = NDArray[np.floating]
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.success.describer import (
-    InstructionDescriber,
     colour_of,
+    InstructionDescriber,
     objects_from_instruction,
 )
 

@@ -1,0 +1,115 @@
+"""Where objects are in space, from their masks in calibrated views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.geometry.camera import project, triangulate
+
+#: error of the centroid of a small mask [px]
+CENTROID_NOISE_PX = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Location:
+    """A triangulated centroid.
+
+    Attributes:
+        point: (3,) in the base frame [m].
+        residual_px: how far the views' rays miss each other.
+        sigma_m: what a centroid's error, or the residual if larger, amounts to at its depth [m].
+    """
+
+    point: FloatArray
+    residual_px: float
+    sigma_m: float
+
+
+def centroids(masks: BoolArray) -> FloatArray:
+    """Returns the (..., 2) mean x, y of masks (..., H, W) [px], NaN where empty."""
+    area = masks.sum((-2, -1)).astype(np.float64)
+    height, width = masks.shape[-2:]
+    x = (masks.sum(-2) * np.arange(width)).sum(-1)
+    y = (masks.sum(-1) * np.arange(height)).sum(-1)
+    known = np.where(area > 0, area, np.nan)
+    return np.stack([x / known, y / known], axis=-1)
+
+
+def locate(
+    cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
+) -> Location | None:
+    """Triangulates one point from (V, 2) pixels; views of NaN do not count.
+
+    Returns None where fewer than two views see the point, or all along one ray.
+    """
+    seen = [view for view in range(len(cameras)) if np.isfinite(pixels[view]).all()]
+    if len(seen) < 2:
+        return None
+    used = [cameras[view] for view in seen]
+    poses = [T_base_camera[view] for view in seen]
+    try:
+        point, residual = triangulate(used, poses, pixels[seen])
+    except CalibrationError:  # parallel rays: as good as one view
+        return None
+    noise = max(float(residual), CENTROID_NOISE_PX)
+    metres = [
+        noise * _depth(pose, point) / camera.K[0, 0]
+        for camera, pose in zip(used, poses, strict=True)
+    ]
+    return Location(point=point, residual_px=float(residual), sigma_m=float(np.mean(metres)))
+
+
+def block_size(
+    cameras: Sequence[CameraModel],
+    T_base_camera: Sequence[FloatArray],
+    areas: FloatArray,
+    point: FloatArray,
+) -> float:
+    """Returns the edge of an upright cube from its (V,) mask areas [px]; the median of the views.
+
+    A cube seen at elevation e shows edge^2 * (sin e + 4/pi * cos e), averaged over its yaw.
+    """
+    sizes = []
+    for camera, pose, area in zip(cameras, T_base_camera, areas, strict=True):
+        if not area > 0:
+            continue
+        ray = pose[:3, 3] - point
+        up = abs(ray[2]) / np.linalg.norm(ray)
+        shown = up + 4 / np.pi * np.sqrt(1 - up**2)
+        pixels_per_metre2 = camera.K[0, 0] * camera.K[1, 1] / _depth(pose, point) ** 2
+        sizes.append(np.sqrt(area / pixels_per_metre2 / shown))
+    return float(np.median(sizes)) if sizes else float('nan')
+
+
+def moved_mask(
+    mask: BoolArray,
+    camera: CameraModel,
+    T_base_camera: FloatArray,
+    start: FloatArray,
+    goal: FloatArray,
+) -> BoolArray:
+    """Returns the (H, W) mask of an object after it moved from `start` to `goal` [m].
+
+    The mask is shifted by the projected displacement and scaled by the ratio of depths.
+    """
+    pixels, depth = project(camera, T_base_camera, np.stack([start, goal]))
+    if not np.isfinite(pixels).all():
+        return np.zeros_like(mask)
+    zoom = depth[0] / depth[1]
+    shift = pixels[1] - zoom * pixels[0]
+    affine = np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]], np.float64)
+    moved = cv2.warpAffine(
+        mask.astype(np.float32), affine, mask.shape[::-1], flags=cv2.INTER_LINEAR
+    )
+    return np.asarray(moved >= 0.5)
+
+
+def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
+    """Distance along the optical axis [m]."""
+    return float(T_base_camera[:3, 2] @ (point - T_base_camera[:3, 3]))
