@@ -121,7 +121,7 @@ def test_persistence_of_a_still_object_is_1_and_of_a_gone_one_0():
 
 
 def test_skill_is_0_at_persistence_1_at_perfect_and_unknown_without_room():
-    assert skill([0.4, 1.0, 1.0], [0.4, 0.4, 1.0])[:2].tolist() == [0.0, 1.0]
+    assert skill(np.array([0.4, 1.0]), np.array([0.4, 0.4])).tolist() == [0.0, 1.0]
     assert np.isnan(skill(1.0, 1.0))
 
 

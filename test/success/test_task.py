@@ -24,10 +24,13 @@ def write(tmp_path, text):
 
 
 def test_bundled_tasks_are_matched_from_the_instruction(bundled):
-    task, bound = match_task(bundled, 'Place the red block to the  left of the blue block.')
+    left = match_task(bundled, 'Place the red block to the  left of the blue block.')
+    stack = match_task(bundled, 'stack the green block on the pink block')
+    assert left and stack
+    task, bound = left
     assert task.name == 'place_block_a2b_left'
     assert bound == {'a': 'red block', 'b': 'blue block'}
-    task, bound = match_task(bundled, 'stack the green block on the pink block')
+    task, bound = stack
     assert task.name == 'stack_blocks_two'
     assert bound == {'a': 'green block', 'b': 'pink block'}
     assert match_task(bundled, 'shake the bottle') is None
