@@ -1,25 +1,28 @@
 """Trajectory videos: tool points projected into each view, drawn as fading glowing trails.
 
-Paper, Trajectory Representation. A arms, V views, T frames, O objects, H W pixels.
+Paper, Trajectory Representation. A arms, V views, T frames, N trail points, O objects, H W pixels.
 """
 
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import (
     BoolArray,
+    ByteArray,
     CameraModel,
     FloatArray,
     MultiViewVideo,
 )
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.rendering.glow import FAINTEST, Box, Stamps, Trail, make_stamps, region
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +34,7 @@ class TrajectoryVideoConfig:
         point_radius_m: standard deviation of the glow, at the point's depth [m].
         min_radius_px: smallest standard deviation of the glow [px].
         object_fill: brightness of object fills, 0 .. 1.
-        show_gripper: whether a closed gripper turns the newest point white.
+        show_gripper: whether the newest point has a core, white as far as the gripper is closed.
         points_per_frame: trail points between two frames, so that trails have no gaps.
     """
 
@@ -44,20 +47,41 @@ class TrajectoryVideoConfig:
 
     def __post_init__(self) -> None:
         for name in ('half_life_s', 'point_radius_m', 'min_radius_px'):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f'rendering.{name} is {getattr(self, name)}, must be > 0')
+            if not 0 < getattr(self, name) < np.inf:
+                raise ConfigError(
+                    f'rendering.{name} is {getattr(self, name)}, must be positive and finite'
+                )
         if not 0 <= self.object_fill <= 1:
             raise ConfigError(f'rendering.object_fill is {self.object_fill}, must be in 0 .. 1')
-        if self.points_per_frame < 1:
+        if self.points_per_frame < 1 or self.points_per_frame != int(self.points_per_frame):
             raise ConfigError(
-                f'rendering.points_per_frame is {self.points_per_frame}, must be >= 1'
+                f'rendering.points_per_frame is {self.points_per_frame}, must be a whole number '
+                'of at least 1'
             )
 
 
-#: a point is dropped when it has faded below this share of its brightness
-_FAINTEST = 0.01
-#: glow is cut off at this many standard deviations
-_REACH = 3.0
+#: the core that shows a closed gripper, as a share of the glow's standard deviation
+_CORE_SHARE = 0.55
+#: points nearer than this are drawn as large as at this depth [m]
+_NEAREST_SIZE_M = 0.05
+_WHITE = np.ones(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Motion:
+    """Tool points over time, with points between the frames.
+
+    Attributes:
+        times: (N,) [s].
+        points: (A, N, 3) in the base frame [m].
+        closed: (A, T) 0 open .. 1 closed, at the frames.
+        shown_at: (T,) index of each frame's own point.
+    """
+
+    times: FloatArray
+    points: FloatArray
+    closed: FloatArray
+    shown_at: np.ndarray
 
 
 def render_trajectory_video(
@@ -81,26 +105,25 @@ def render_trajectory_video(
 
     Returns:
         (V, T, H, W, 3) frames.
+
+    Raises:
+        TrajectoryError: positions and times do not fit together.
+        ObservationError: cameras of different sizes, or masks of another size.
     """
-    fine_times, fine_positions, shown_at = _refine(positions, times, config.points_per_frame)
-    points = robot.tool_poses(fine_positions)[..., :3, 3]
-    closed = 1.0 - robot.gripper_openings(fine_positions)
-    frames = []
+    positions, times = np.asarray(positions, np.float64), np.asarray(times, np.float64)
+    _check(cameras, positions, times, object_masks)
+    motion = _motion(robot, positions, times, config)
+    shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
+    frames = np.empty(shape, np.uint8)
     for view, camera in enumerate(cameras):
-        masks = None if object_masks is None else object_masks[view]
-        canvas = _canvas(camera, masks, config)
-        poses = camera_poses(camera, robot, np.asarray(positions))
-        fixed = camera.mount_link == robot.base_link
-        draw = _draw_fixed if fixed else _draw_moving
-        glow = draw(camera, poses, points, closed, fine_times, shown_at, config)
-        frames.append(_compose(canvas, glow))
-    return MultiViewVideo(
-        views=tuple(camera.view for camera in cameras), times=times, frames=np.stack(frames)
-    )
+        masks = () if object_masks is None else object_masks[view]
+        frames[view] = _canvas(camera, masks, config)
+        _draw_view(frames[view], camera, robot, positions, motion, config)
+    return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
 def arm_colour(arm: int, num_arms: int) -> FloatArray:
-    """Returns the (3,) linear RGB of an arm: hues spread evenly from orange on."""
+    """Returns the (3,) RGB in 0 .. 1 of an arm: hues spread evenly from orange on."""
     return np.array(colorsys.hsv_to_rgb((0.08 + arm / max(num_arms, 1)) % 1.0, 0.85, 1.0))
 
 
@@ -109,132 +132,153 @@ def object_colour(index: int, fill: float) -> FloatArray:
     return np.array(colorsys.hsv_to_rgb((0.36 + index * 0.381966) % 1.0, 0.7, fill))
 
 
-def _refine(
-    positions: FloatArray, times: FloatArray, per_frame: int
-) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Times and positions with points between frames, and the index of each frame's own."""
-    num_frames = len(times)
-    fine = np.arange((num_frames - 1) * per_frame + 1) / per_frame
-    left = np.minimum(fine.astype(int), max(num_frames - 2, 0))
-    right = np.minimum(left + 1, num_frames - 1)
-    share = fine - left
-    fine_times = (1 - share) * times[left] + share * times[right]
-    fine_positions = (1 - share)[:, None] * positions[left] + share[:, None] * positions[right]
-    return fine_times, fine_positions, np.arange(num_frames) * per_frame
+def _check(
+    cameras: Sequence[CameraModel],
+    positions: FloatArray,
+    times: FloatArray,
+    masks: BoolArray | None,
+) -> None:
+    if positions.ndim != 2 or times.shape != positions.shape[:1] or len(times) == 0:
+        raise TrajectoryError(
+            f'positions {positions.shape} and times {times.shape} do not fit together; they must '
+            'be (T, J) and (T,) with T >= 1'
+        )
+    if (np.diff(times) <= 0).any():
+        raise TrajectoryError('the times of the trajectory video do not increase')
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise ObservationError(f'the cameras have sizes (H, W) {sorted(sizes)}; one is needed')
+    expected = (len(cameras), *sizes.pop())
+    if masks is not None and (masks.ndim != 4 or (len(masks), *masks.shape[2:]) != expected):
+        raise ObservationError(
+            f'object masks have shape {masks.shape}, expected (V, O, H, W) with (V, H, W) = '
+            f'{expected}'
+        )
+
+
+def _motion(
+    robot: RobotModel, positions: FloatArray, times: FloatArray, config: TrajectoryVideoConfig
+) -> _Motion:
+    """Joint positions interpolated between the frames, so that trails follow the arm's arc."""
+    frames, per_frame = len(times), config.points_per_frame
+    fine = np.arange((frames - 1) * per_frame + 1) / per_frame
+    left = np.minimum(fine.astype(int), max(frames - 2, 0))
+    right, share = np.minimum(left + 1, frames - 1), fine - left
+    dense = (1 - share)[:, None] * positions[left] + share[:, None] * positions[right]
+    return _Motion(
+        times=(1 - share) * times[left] + share * times[right],
+        points=robot.tool_poses(dense)[..., :3, 3],
+        closed=1.0 - robot.gripper_openings(positions),
+        shown_at=np.arange(frames) * per_frame,
+    )
 
 
 def _canvas(
-    camera: CameraModel, masks: BoolArray | None, config: TrajectoryVideoConfig
-) -> FloatArray:
-    canvas = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
-    if masks is not None:
-        for index, mask in enumerate(masks):
-            canvas[mask] = object_colour(index, config.object_fill)
+    camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
+) -> ByteArray:
+    """(H, W, 3) black with the objects' fills."""
+    canvas = np.zeros((camera.height, camera.width, 3), np.uint8)
+    for index, mask in enumerate(masks):
+        canvas[mask] = np.rint(255 * object_colour(index, config.object_fill))
     return canvas
 
 
-def _radii(camera: CameraModel, depth: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:
-    focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
-    near = np.maximum(depth, 0.05)
-    return np.maximum(config.point_radius_m * focal / near, config.min_radius_px)
-
-
-def _colours(closed: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:
-    """(A, N, 3) colour of every point: the arm's hue, whitened as the gripper closes."""
-    num_arms, num_points = closed.shape
-    hues = np.stack([arm_colour(arm, num_arms) for arm in range(num_arms)])[:, None]
-    white = closed[..., None] if config.show_gripper else np.zeros((num_arms, num_points, 1))
-    return (1 - white) * hues + white
-
-
-def _stamp(
-    buffer: FloatArray, pixel: FloatArray, radius: float, colour: FloatArray
+def _draw_view(
+    frames: ByteArray,
+    camera: CameraModel,
+    robot: RobotModel,
+    positions: FloatArray,
+    motion: _Motion,
+    config: TrajectoryVideoConfig,
 ) -> None:
-    """Lays the part of a Gaussian glow that is inside onto an (H, W, 3) buffer (brightest wins)."""
-    if not np.isfinite(pixel).all():
-        return
-    height, width = buffer.shape[:2]
-    reach = _REACH * radius
-    x0, x1 = max(int(np.ceil(pixel[0] - reach)), 0), min(int(pixel[0] + reach), width - 1)
-    y0, y1 = max(int(np.ceil(pixel[1] - reach)), 0), min(int(pixel[1] + reach), height - 1)
-    if x0 > x1 or y0 > y1 or pixel[0] + reach < 0 or pixel[1] + reach < 0:
-        return
-    gx = np.exp(-0.5 * ((np.arange(x0, x1 + 1) - pixel[0]) / radius) ** 2)
-    gy = np.exp(-0.5 * ((np.arange(y0, y1 + 1) - pixel[1]) / radius) ** 2)
-    glow = (gy[:, None] * gx)[..., None] * colour
-    box = buffer[y0 : y1 + 1, x0 : x1 + 1]
-    np.maximum(box, glow, out=box)
+    """Draws all arms onto the (T, H, W, 3) frames of one view."""
+    poses = camera_poses(camera, robot, positions)
+    num_arms = len(motion.points)
+    heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
+    sigmas = _sigmas(camera, depths, config)
+    cores = [
+        make_stamps(heads[arm], _CORE_SHARE * sigmas[arm], camera.width, camera.height)
+        for arm in range(num_arms)
+    ]
+    trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
+    paints = [_Paint(arm_colour(arm, num_arms)) for arm in range(num_arms)]
+    white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
+    # far arms first; one that is behind the camera cannot hide another
+    orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
+    for k, trail_images in enumerate(zip(*trails, strict=True)):
+        for arm in orders[:, k]:
+            glow, box = trail_images[arm]
+            paints[arm].lay(frames[k], glow, box)
+            if config.show_gripper:
+                box = cores[arm].draw(core, k, motion.closed[arm, k])
+                white.lay(frames[k], core, box)
+                region(core, box)[...] = 0
 
 
-def _draw_fixed(
+def _sigmas(
+    camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig
+) -> FloatArray:
+    """Standard deviation of the glow [px]: metric size over depth."""
+    focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
+    pixels = config.point_radius_m * focal / np.maximum(depths, _NEAREST_SIZE_M)
+    return np.maximum(pixels, config.min_radius_px)
+
+
+def _trail_frames(
     camera: CameraModel,
     poses: FloatArray,
-    points: FloatArray,
-    closed: FloatArray,
-    times: FloatArray,
-    shown_at: np.ndarray,
+    motion: _Motion,
+    arm: int,
     config: TrajectoryVideoConfig,
-) -> FloatArray:
-    """(A, T, H, W, 3) glow and, in the last place, depth order: one decaying buffer an arm."""
-    pixels, depth = project(camera, poses[0], points)
-    radii, colours = _radii(camera, depth, config), _colours(closed, config)
-    layers = []
-    for arm in range(len(points)):
-        buffer = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
-        frames = np.empty((len(shown_at), *buffer.shape), dtype=np.float32)
-        last = times[0]
-        for index in range(len(times)):
-            buffer *= np.float32(0.5 ** ((times[index] - last) / config.half_life_s))
-            last = times[index]
-            _stamp(buffer, pixels[arm, index], radii[arm, index], colours[arm, index])
-            if index % config.points_per_frame == 0:
-                frames[index // config.points_per_frame] = buffer
-        layers.append((depth[arm, shown_at], frames))
-    return _by_depth(layers)
+) -> Iterator[tuple[FloatArray, Box]]:
+    """Yields the arm's trail image at each frame and the box outside which it is 0.
+
+    A camera that stands still keeps what is drawn and lets it fade; for one that moves, all
+    points that are not too old are projected anew.
+    """
+    trail = Trail(camera.width, camera.height, config.half_life_s)
+    fixed = bool((poses == poses[0]).all())
+    memory_s = config.half_life_s * np.log2(1 / FAINTEST)
+    points, times = motion.points[arm], motion.times
+    stamps = _stamps(camera, poses[0], points, config) if fixed else None
+    start, last = 0, times[0]
+    for frame, newest in enumerate(motion.shown_at):
+        now = times[newest]
+        if stamps is not None:
+            trail.fade(now - last)
+            trail.add(stamps, now - times, start, newest + 1)
+            start, last = newest + 1, now
+        else:
+            trail.clear()
+            kept = slice(int(np.searchsorted(times, now - memory_s)), newest + 1)
+            anew = _stamps(camera, poses[frame], points[kept], config)
+            trail.add(anew, now - times[kept], 0, len(times[kept]))
+        yield trail.image, trail.box
 
 
-def _draw_moving(
-    camera: CameraModel,
-    poses: FloatArray,
-    points: FloatArray,
-    closed: FloatArray,
-    times: FloatArray,
-    shown_at: np.ndarray,
-    config: TrajectoryVideoConfig,
-) -> FloatArray:
-    """As `_draw_fixed`, for a camera that moves: all past points projected anew each frame."""
-    colours = _colours(closed, config)
-    memory = config.half_life_s * np.log2(1 / _FAINTEST)
-    shape = (len(shown_at), camera.height, camera.width, 3)
-    layers = []
-    for arm in range(len(points)):
-        frames = np.zeros(shape, dtype=np.float32)
-        depths = np.empty(len(shown_at))
-        for frame, newest in enumerate(shown_at):
-            past = np.flatnonzero(times[: newest + 1] >= times[newest] - memory)
-            pixels, depth = project(camera, poses[frame], points[arm, past])
-            radii = _radii(camera, depth, config)
-            fade = 0.5 ** ((times[newest] - times[past]) / config.half_life_s)
-            for k, index in enumerate(past):
-                _stamp(frames[frame], pixels[k], radii[k], fade[k] * colours[arm, index])
-            depths[frame] = depth[-1]
-        layers.append((depths, frames))
-    return _by_depth(layers)
+def _stamps(
+    camera: CameraModel, pose: FloatArray, points: FloatArray, config: TrajectoryVideoConfig
+) -> Stamps:
+    pixels, depths = project(camera, pose, points)
+    return make_stamps(pixels, _sigmas(camera, depths, config), camera.width, camera.height)
 
 
-def _by_depth(layers: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """(A, T, H, W, 3) layers sorted so that in each frame the farther arm comes first."""
-    depths = np.stack([depth for depth, _ in layers])
-    frames = np.stack([frame for _, frame in layers])
-    order = np.argsort(-depths, axis=0, kind='stable')
-    return np.take_along_axis(frames, order[..., None, None, None], axis=0)
+class _Paint:
+    """Covers an image with one colour, as far as a glow says."""
 
+    def __init__(self, colour: FloatArray) -> None:
+        levels = np.arange(256)[:, None]
+        self._colour = np.rint(levels * colour).astype(np.uint8)[:, None]
+        self._rest = np.repeat(255 - levels, 3, axis=1).astype(np.uint8)[:, None]
 
-def _compose(canvas: FloatArray, glow: FloatArray) -> np.ndarray:
-    """(T, H, W, 3) uint8: each layer covers what is behind it as far as it glows."""
-    out = np.repeat(canvas[None].astype(np.float32), glow.shape[1], axis=0)
-    for layer in glow:
-        cover = layer.max(axis=-1, keepdims=True)
-        out *= 1 - cover
-        out += layer
-    return (255 * out.clip(0, 1) + 0.5).astype(np.uint8)
+    def lay(self, image: ByteArray, glow: FloatArray, box: Box) -> None:
+        """Blends the colour into an (H, W, 3) image where the (H, W) glow is above 0."""
+        part = region(image, box)
+        if part.size == 0:
+            return
+        levels = cv2.convertScaleAbs(region(glow, box), alpha=255)
+        painted = cv2.applyColorMap(levels, self._colour)
+        if part.any():
+            rest = cv2.applyColorMap(levels, self._rest)
+            painted = cv2.add(painted, cv2.multiply(part, rest, scale=1 / 255))
+        part[...] = painted

@@ -1,0 +1,122 @@
+"""Glowing trails of points: Gaussian stamps that fade with age, kept in a live box.
+
+N points, H W pixels. A box is (top, bottom, left, right), bottom and right excluded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray
+
+#: a stamp ends where its Gaussian is below a grey level: exp(-3.4^2 / 2) < 1 / 255
+REACH_SIGMAS = 3.4
+#: a point is forgotten once it is this much fainter than when it was new (below a grey level)
+FAINTEST = 1 / 512
+#: pixels are limited to this before they become integers; far outside any image [px]
+_FAR_PX = 1e6
+
+Box = tuple[int, int, int, int]
+NO_BOX: Box = (0, 0, 0, 0)
+
+
+def union(a: Box, b: Box) -> Box:
+    """Returns the smallest box that holds both; an empty one does not count."""
+    if a[0] >= a[1] or a[2] >= a[3]:
+        return b
+    if b[0] >= b[1] or b[2] >= b[3]:
+        return a
+    return min(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), max(a[3], b[3])
+
+
+def region(image: np.ndarray, box: Box) -> np.ndarray:
+    """Returns the view of an (H, W, ...) array inside a box."""
+    return image[box[0] : box[1], box[2] : box[3]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stamps:
+    """N round Gaussians, sub-pixel exact, clipped to the image.
+
+    Attributes:
+        boxes: (N, 4) int, top, bottom, left, right inside the image; empty if not in sight.
+        across: (N, S) profile along x; column j is the pixel `origin[n, 0] + j`.
+        down: (N, S) profile along y; column j is the pixel `origin[n, 1] + j`.
+        origin: (N, 2) int x, y of the profiles' first pixel, may lie outside the image.
+    """
+
+    boxes: np.ndarray
+    across: FloatArray
+    down: FloatArray
+    origin: np.ndarray
+
+    def draw(self, image: FloatArray, n: int, brightness: float) -> Box:
+        """Lays stamp n onto an (H, W) image, brightest wins; returns the box that it touched."""
+        top, bottom, left, right = self.boxes[n]
+        if top >= bottom or left >= right:
+            return NO_BOX
+        x, y = self.origin[n]
+        glow = np.multiply.outer(
+            self.down[n, top - y : bottom - y] * np.float32(brightness),
+            self.across[n, left - x : right - x],
+        )
+        part = image[top:bottom, left:right]
+        np.maximum(part, glow, out=part)
+        return top, bottom, left, right
+
+
+def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int) -> Stamps:
+    """Returns the stamps of (N, 2) pixels with (N,) standard deviations [px].
+
+    Points with NaN pixels (behind the camera) get an empty box. A stamp whose centre is outside
+    the image keeps the part that is inside.
+    """
+    seen = np.isfinite(pixels).all(axis=-1)
+    centres = np.where(seen[:, None], pixels, 0.0).clip(-_FAR_PX, _FAR_PX)
+    sigmas = np.where(seen, sigmas, 1.0)
+    reach = REACH_SIGMAS * sigmas[:, None]
+    first = np.ceil(centres - reach).astype(np.int64)
+    after = np.floor(centres + reach).astype(np.int64) + 1
+    size = int((after - first).max(initial=0))
+    steps = first[:, :, None] + np.arange(size) - centres[:, :, None]
+    profiles = np.exp(-0.5 * (steps / sigmas[:, None, None]) ** 2).astype(np.float32)
+    left, top = first.clip(0, (width, height)).T
+    right, bottom = after.clip(0, (width, height)).T
+    bottom = np.where(seen, bottom, top)
+    return Stamps(
+        boxes=np.stack([top, bottom, left, right], axis=1),
+        across=profiles[:, 0],
+        down=profiles[:, 1],
+        origin=first,
+    )
+
+
+class Trail:
+    """The fading trail of one arm on an (H, W) float image, 1 = full brightness.
+
+    Each pixel holds its brightest point: how bright it is says how long ago the arm was there,
+    whatever the frame rate, and an arm at rest does not burn in. Everything outside `box` is 0.
+    """
+
+    def __init__(self, width: int, height: int, half_life_s: float) -> None:
+        self.image = np.zeros((height, width), np.float32)
+        self.box = NO_BOX
+        self._half_life_s = half_life_s
+
+    def fade(self, seconds: float) -> None:
+        """Lets time pass."""
+        region(self.image, self.box)[...] *= np.float32(0.5 ** (seconds / self._half_life_s))
+
+    def clear(self) -> None:
+        """Forgets all points."""
+        region(self.image, self.box)[...] = 0
+        self.box = NO_BOX
+
+    def add(self, stamps: Stamps, ages_s: FloatArray, first: int, stop: int) -> None:
+        """Adds stamps first .. stop - 1, whose ages stand at the same places of `ages_s`."""
+        brightness = 0.5 ** (ages_s / self._half_life_s)
+        for n in range(first, stop):
+            if brightness[n] >= FAINTEST:
+                self.box = union(self.box, stamps.draw(self.image, n, brightness[n]))
