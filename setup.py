@@ -5,6 +5,7 @@ installs through setup.py and two places would drift apart. Exact versions are i
 requirements/constraints.txt.
 """
 
+from collections.abc import Sequence
 import os
 
 from setuptools import find_packages, setup
@@ -14,9 +15,9 @@ SHARE = f'share/{PACKAGE}'
 MARKER = f'resource/{PACKAGE}'
 
 
-def data_files():
+def data_files() -> list[tuple[str, Sequence[str]]]:
     """Lists the files that are not code: the ament marker, package.xml and three folders."""
-    listed = [
+    listed: list[tuple[str, Sequence[str]]] = [
         ('share/ament_index/resource_index/packages', [MARKER]),
         (SHARE, ['package.xml']),
     ]

@@ -1,0 +1,4 @@
+# Pinocchio is a compiled module without stubs: everything of it is Any.
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
