@@ -43,13 +43,23 @@ def _box(center: str, half_sizes: str, rgba: str) -> str:
 #: links 1-6, wxyz quaternions as published (not normalised); the first geom carries the mass
 LINKS = (
     Link(
-        position='0 0 0.0631', quaternion='1 0 0 1', joint_range=(-2.61799, 3.05433),
-        mass=0.124, kp=40, kv=2.5, max_torque=28,
+        position='0 0 0.0631',
+        quaternion='1 0 0 1',
+        joint_range=(-2.61799, 3.05433),
+        mass=0.124,
+        kp=40,
+        kv=2.5,
+        max_torque=28,
         geoms=(_cylinder('0 0 -0.02', '0 0 0.03', 0.036, _DARK),),
     ),
     Link(
-        position='0.000025 -0.02 0.0409', quaternion='1 1 1 1', joint_range=(0, 3.66519),
-        mass=1.244, kp=40, kv=2.5, max_torque=28,
+        position='0.000025 -0.02 0.0409',
+        quaternion='1 1 1 1',
+        joint_range=(0, 3.66519),
+        mass=1.244,
+        kp=40,
+        kv=2.5,
+        max_torque=28,
         geoms=(
             _capsule('0.02 0 0', '0.24 0 0', 0.032, _LIGHT),
             _cylinder('0 0 -0.04', '0 0 0.04', 0.036, _DARK),
@@ -57,32 +67,52 @@ LINKS = (
         ),
     ),
     Link(
-        position='0.264 0 0', quaternion='0 1 0 0', joint_range=(0, 3.66519),
-        mass=0.854, kp=40, kv=2.5, max_torque=28,
+        position='0.264 0 0',
+        quaternion='0 1 0 0',
+        joint_range=(0, 3.66519),
+        mass=0.854,
+        kp=40,
+        kv=2.5,
+        max_torque=28,
         geoms=(
             _capsule('-0.26 -0.06 0', '-0.02 -0.06 0', 0.034, _LIGHT),
             _capsule('0 0 0', '-0.03 -0.06 0', 0.03, _MID),
         ),
     ),
     Link(
-        position='-0.245 -0.06 0', quaternion='1 0 0 0', joint_range=(-1.5708, 1.5708),
-        mass=0.464, kp=20, kv=1.0, max_torque=10,
+        position='-0.245 -0.06 0',
+        quaternion='1 0 0 0',
+        joint_range=(-1.5708, 1.5708),
+        mass=0.464,
+        kp=20,
+        kv=1.0,
+        max_torque=10,
         geoms=(_capsule('0 0 0', '-0.074 -0.0395 0', 0.029, _MID),),
     ),
     Link(
-        position='-0.074 -0.0395 0.000025', quaternion='1 -1 1 1', joint_range=(-1.5708, 1.5708),
-        mass=0.351, kp=20, kv=1.0, max_torque=10,
+        position='-0.074 -0.0395 0.000025',
+        quaternion='1 -1 1 1',
+        joint_range=(-1.5708, 1.5708),
+        mass=0.351,
+        kp=20,
+        kv=1.0,
+        max_torque=10,
         geoms=(_capsule('0 0 0', '0 0.0353 0.0395', 0.028, _DARK),),
     ),
     Link(
-        position='0 0.0353 0.0395', quaternion='1 -1 0 0', joint_range=(-2.0944, 2.0944),
-        mass=0.367, kp=10, kv=0.5, max_torque=10,
+        position='0 0.0353 0.0395',
+        quaternion='1 -1 0 0',
+        joint_range=(-2.0944, 2.0944),
+        mass=0.367,
+        kp=10,
+        kv=0.5,
+        max_torque=10,
         geoms=(
             _cylinder('0 0 0', '0 0 0.05', 0.03, _MID),
             _box('0 0 0.06', '0.05 0.02 0.014', _DARK),
         ),
     ),
-)  # fmt: skip
+)
 FINGER_MASS, FINGER_KP, FINGER_KV, FINGER_FORCE = 0.118, 100.0, 10.0, 20.0
 _FINGER_RANGE = (-0.00205, 0.037524)
 _FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0605)}
@@ -117,10 +147,8 @@ def arm_xml(arm: str, robot: RobotModel) -> str:
     """
     tool = next(tool for tool in robot.tools if tool.arm == arm)
     x, y, z = BASE_POSITIONS[arm]
-    opening = [
-        f'<body name="{arm}_base" pos="{x} {y} {z}" quat="1 0 0 1">'
-        f'<geom class="{arm}_arm" {_cylinder("0 0 0", "0 0 0.045", 0.05, _DARK)}/>'
-    ]
+    pedestal = f'<geom class="{arm}_arm" {_cylinder("0 0 0", "0 0 0.045", 0.05, _DARK)}/>'
+    opening = [f'<body name="{arm}_base" pos="{x} {y} {z}" quat="1 0 0 1">{pedestal}']
     for number, link in enumerate(LINKS, 1):
         low, high = link.joint_range
         geoms = ''.join(

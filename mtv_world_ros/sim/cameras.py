@@ -33,14 +33,22 @@ class CameraSpec:
 #: the paper's views: low (close) and high (overview)
 CAMERAS = (
     CameraSpec(
-        view='low', target=(0.0, 0.23, 0.075), distance=1.05, azimuth=28, elevation=30,
+        view='low',
+        target=(0.0, 0.23, 0.075),
+        distance=1.05,
+        azimuth=28,
+        elevation=30,
         visible_width=0.6,
     ),
     CameraSpec(
-        view='high', target=(0.0, 0.22, 0.06), distance=1.3, azimuth=-6, elevation=58,
+        view='high',
+        target=(0.0, 0.22, 0.06),
+        distance=1.3,
+        azimuth=-6,
+        elevation=58,
         visible_width=0.6,
     ),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +60,7 @@ class CameraJitter:
     angle_deg: float = 2.0
 
 
-def jittered(
-    spec: CameraSpec, jitter: CameraJitter, generator: np.random.Generator
-) -> CameraSpec:
+def jittered(spec: CameraSpec, jitter: CameraJitter, generator: np.random.Generator) -> CameraSpec:
     """Returns the spec with target, distance and angles moved within the jitter."""
     draw = generator.uniform(-1.0, 1.0, 6)
     target = np.asarray(spec.target) + jitter.target_m * draw[:3]
@@ -74,9 +80,12 @@ def optical_pose(spec: CameraSpec) -> FloatArray:
     """Returns T_base_camera (4, 4) of the optical frame: x right, y down, z ahead."""
     azimuth, elevation = np.deg2rad(spec.azimuth), np.deg2rad(spec.elevation)
     outward = np.array(
-        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth),
-         np.sin(elevation)]
-    )  # fmt: skip
+        [
+            np.cos(elevation) * np.sin(azimuth),
+            np.cos(elevation) * np.cos(azimuth),
+            np.sin(elevation),
+        ]
+    )
     ahead = -outward
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -91,9 +100,13 @@ def camera_model(spec: CameraSpec, width: int, height: int) -> CameraModel:
     focal = width * spec.distance / spec.visible_width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return CameraModel(
-        view=spec.view, width=width, height=height, K=K, mount_link='base',
+        view=spec.view,
+        width=width,
+        height=height,
+        K=K,
+        mount_link='base',
         T_mount_camera=optical_pose(spec),
-    )  # fmt: skip
+    )
 
 
 def camera_xml(camera: CameraModel) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+import json
 import multiprocessing
 from pathlib import Path
 import time
@@ -16,12 +17,18 @@ from tqdm import tqdm
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.dataset_card import check_same_set, EpisodeEntry, read_entry, write_card
+from mtv_world_ros.sim.dataset_card import (
+    check_same_set,
+    EpisodeEntry,
+    read_entry,
+    remove_leftovers,
+    write_card,
+)
 from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.opengl import load_mujoco
 from mtv_world_ros.sim.randomize import RandomizationConfig
-from mtv_world_ros.sim.record import RecordConfig, simulate, write_take
+from mtv_world_ros.sim.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.tasks import Task, task_named, tasks_named
 
 ROBOT_FILE = ('config', 'robots', 'yam_bimanual.yaml')
@@ -76,12 +83,15 @@ def jobs_of(tasks: Sequence[Task], num_episodes: int, seed: int, out: Path) -> l
     """Returns the episodes of a data set; tasks take turns, so a growing set stays mixed."""
     return [
         Job(
-            task=task.name, index=index, seed=seed, miss=misses(seed, task.name, index),
+            task=task.name,
+            index=index,
+            seed=seed,
+            miss=misses(seed, task.name, index),
             path=out / f'{task.name}_{index:05d}',
         )
         for index in range(num_episodes)
         for task in tasks
-    ]  # fmt: skip
+    ]
 
 
 class EpisodeMaker:
@@ -110,16 +120,25 @@ class EpisodeMaker:
             physics += take.physics_s
             rendering += take.rendering_s
             if take.is_as_wanted(miss=job.miss):
-                before = time.perf_counter()
-                extra = {'attempt': str(attempt), 'index': str(job.index)}
-                write_take(job.path, self._sim, take, seed, record, **extra)
-                writing = time.perf_counter() - before
+                writing = self._write(job, take, seed, attempt)
                 return Spent(physics_s=physics, rendering_s=rendering, writing_s=writing)
         raise SimulatorError(
             f"episode {job.index} of task '{job.task}' (seed {job.seed}) was "
             f'{"no clean miss" if job.miss else "no success"} in {record.max_attempts} attempts; '
             'see sim/expert.py'
         )
+
+    def _write(self, job: Job, take: Take, seed: int, attempt: int) -> float:
+        started = time.perf_counter()
+        extra = {'attempt': str(attempt), 'index': str(job.index)}
+        try:
+            write_take(job.path, self._sim, take, seed, self._config.record, **extra)
+        except OSError as error:
+            raise SimulatorError(
+                f"cannot write '{job.path}': {error}; finished episodes are kept, so run the same "
+                'command again once there is room'
+            ) from error
+        return time.perf_counter() - started
 
 
 _maker: EpisodeMaker | None = None
@@ -187,11 +206,13 @@ def collect(
     load_mujoco()
     out, config = Path(out), config or CollectConfig()
     out.mkdir(parents=True, exist_ok=True)
-    check_same_set(out, seed)
+    described = json.loads(json.dumps(asdict(config)))
+    check_same_set(out, seed, described)
+    remove_leftovers(out)
     jobs = jobs_of(chosen, num_episodes, seed, out)
     entries = {job.path.name: read_entry(job.path) for job in jobs if job.path.exists()}
     missing = [job for job in jobs if job.path.name not in entries]
-    write_card(out, seed, entries.values())
+    write_card(out, seed, described, entries.values())
     with (
         tqdm(total=len(jobs), initial=len(entries), unit='ep', disable=not progress) as bar,
         _made(missing, min(workers, max(1, len(missing))), config) as made,
@@ -200,6 +221,6 @@ def collect(
             entries[job.path.name] = read_entry(job.path)
             bar.update()
             if len(entries) % 20 == 0:
-                write_card(out, seed, entries.values())
-    write_card(out, seed, entries.values())
+                write_card(out, seed, described, entries.values())
+    write_card(out, seed, described, entries.values())
     return [entries[job.path.name] for job in jobs]

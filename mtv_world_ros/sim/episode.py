@@ -13,8 +13,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.sim.arm import ARMS, velocity_gains
 from mtv_world_ros.sim.opengl import load_mujoco
 from mtv_world_ros.sim.predicates import History
-from mtv_world_ros.sim.randomize import RandomizationConfig, draw_scene, instruction_of
-from mtv_world_ros.sim.scene import TIMESTEP_S, Scene, scene_xml
+from mtv_world_ros.sim.randomize import draw_scene, instruction_of, RandomizationConfig
+from mtv_world_ros.sim.scene import Scene, scene_xml, TIMESTEP_S
 from mtv_world_ros.sim.tasks import Task, task_named
 
 CONTROL_PERIOD_S = 0.02
@@ -88,7 +88,9 @@ class SimEpisode:
         try:
             self._model = mujoco.MjModel.from_xml_string(scene_xml(scene, self.robot))
         except ValueError as error:
-            raise SimulatorError(f"the scene of task '{task.name}' does not build: {error}") from error
+            raise SimulatorError(
+                f"the scene of task '{task.name}' does not build: {error}"
+            ) from error
         self._data = mujoco.MjData(self._model)
         self._index_model()
         if self._rendering:
@@ -120,9 +122,10 @@ class SimEpisode:
 
     def step(self, targets: FloatArray, seconds: float = 0.1) -> SimObservation:
         """Drives the joints to `targets` (J,) over one camera period and observes."""
+        targets = self._checked(targets)
         start, num = self._target, max(1, round(seconds / CONTROL_PERIOD_S))
         for k in range(1, num + 1):
-            self.advance(start + (np.asarray(targets) - start) * k / num)
+            self.advance(start + (targets - start) * k / num)
         return self.observe()
 
     def advance(self, targets: FloatArray) -> None:
@@ -131,17 +134,21 @@ class SimEpisode:
         Raises:
             TrajectoryError: wrong number of joints, or not finite.
         """
-        targets = np.asarray(targets, dtype=np.float64)
-        if targets.shape != self.home.shape or not np.isfinite(targets).all():
-            raise TrajectoryError(
-                f'joint targets must be {len(self.home)} finite values, got shape {targets.shape}: '
-                f'{targets.tolist()}'
-            )
+        targets = self._checked(targets)
         velocity = (self._spread(targets) - self._spread(self._target)) / CONTROL_PERIOD_S
         self._data.ctrl[:] = self._spread(targets) + self._lead * velocity
         num_steps = round(CONTROL_PERIOD_S / TIMESTEP_S)
         self._mujoco.mj_step(self._model, self._data, nstep=num_steps)
         self._target = targets
+
+    def _checked(self, targets: FloatArray) -> FloatArray:
+        targets = np.asarray(targets, dtype=np.float64)
+        if targets.shape != self.home.shape or not np.isfinite(targets).all():
+            raise TrajectoryError(
+                f'joint targets must be {len(self.home)} finite values, got shape '
+                f'{targets.shape}: {targets.tolist()}'
+            )
+        return targets
 
     def positions(self) -> FloatArray:
         """Returns the measured joint positions (J,) in the robot's order [rad or m]."""
@@ -167,9 +174,12 @@ class SimEpisode:
         images, masks = self._render() if self._rendering else ({}, {})
         history = self.history(self.object_positions()[None], positions[None])
         return SimObservation(
-            time_s=self.time_s, images=images, masks=masks, positions=positions,
+            time_s=self.time_s,
+            images=images,
+            masks=masks,
+            positions=positions,
             success=bool(self.task.succeeds(history)[0]),
-        )  # fmt: skip
+        )
 
     def _render(self) -> tuple[dict[str, ByteArray], dict[str, ByteArray]]:
         images, masks = {}, {}

@@ -153,7 +153,9 @@ class Expert:
             grasp = grasp + miss_offset(subject, others, yaw, margin)
         goal = np.asarray(goal_position(move, subject, reference)) + np.array([0, 0, 0.002])
         home = np.asarray(HOME_TOOL[arm])
-        above, lift = (np.array([0, 0, rng.uniform(*r)]) for r in (config.above_grasp, config.lift))
+        above, lift = (
+            np.array([0, 0, rng.uniform(*r)]) for r in (config.above_grasp, config.lift)
+        )
         pre_place = goal + np.array([0, 0, config.above_place])
         lifted = np.array([*grasp[:2], max(grasp[2] + lift[2], pre_place[2])])
         stops = [
@@ -179,9 +181,7 @@ class Expert:
             points.append(_WayPoint(position, yaw, opening, seconds or moving))
         return points
 
-    def _follow(
-        self, arm: str, points: list[_WayPoint], rng: np.random.Generator
-    ) -> FloatArray:
+    def _follow(self, arm: str, points: list[_WayPoint], rng: np.random.Generator) -> FloatArray:
         """Minimum-jerk blends between way points, scaled to the drawn motion time."""
         config = self._config
         scale = rng.uniform(*config.motion_s) / sum(point.seconds for point in points)

@@ -59,8 +59,9 @@ class ArmSolver:
             for index, name in enumerate(robot.joint_names)
             if name.startswith(prefix) and name != tool.gripper_joint
         ]
-        joints = [self._model.joints[self._model.getJointId(robot.joint_names[i])]
-                  for i in self.indices]  # fmt: skip
+        joints = [
+            self._model.joints[self._model.getJointId(robot.joint_names[i])] for i in self.indices
+        ]
         self._q_at = np.array([joint.idx_q for joint in joints])
         self._v_at = np.array([joint.idx_v for joint in joints])
         margin = self._config.limit_margin
@@ -87,9 +88,12 @@ class ArmSolver:
                 and np.linalg.norm(error[3:]) < config.tolerance_rad
             ):
                 return joints
-            jacobian = self._tool.actionInverse @ pin.getFrameJacobian(
-                self._model, self._data, self._frame, pin.ReferenceFrame.LOCAL
-            )[:, self._v_at]
+            jacobian = (
+                self._tool.actionInverse
+                @ pin.getFrameJacobian(
+                    self._model, self._data, self._frame, pin.ReferenceFrame.LOCAL
+                )[:, self._v_at]
+            )
             normal = jacobian.T @ jacobian + config.damping * np.eye(len(joints))
             step = np.linalg.solve(normal, jacobian.T @ error)
             joints = np.clip(joints + np.clip(step, -0.5, 0.5), self._lower, self._upper)

@@ -34,7 +34,7 @@ class History:
 
 def grippers_open(openings: FloatArray) -> BoolArray:
     """Returns (T,) where every gripper of (A, T) `openings` is open."""
-    return (np.asarray(openings) > OPEN_SHARE).all(axis=0)
+    return np.all(np.asarray(openings) > OPEN_SHARE, axis=0)
 
 
 def left_of(a: FloatArray, b: FloatArray) -> BoolArray:
@@ -54,7 +54,7 @@ def stacked(upper: FloatArray, lower: FloatArray, rise: float) -> BoolArray:
         rise: height of the upper centre over the lower one when it rests there [m].
     """
     error = np.abs(np.asarray(upper) - np.asarray(lower) - np.array([0.0, 0.0, rise]))
-    return (error < np.asarray(STACK_TOLERANCE_M)).all(axis=1)
+    return np.all(error < np.asarray(STACK_TOLERANCE_M), axis=1)
 
 
 def a_left_of_b(history: History) -> BoolArray:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.arm import BASE_POSITIONS
-from mtv_world_ros.sim.cameras import CAMERAS, CameraJitter, CameraSpec, camera_model, jittered
+from mtv_world_ros.sim.cameras import camera_model, CameraJitter, CAMERAS, CameraSpec, jittered
 from mtv_world_ros.sim.predicates import History
-from mtv_world_ros.sim.scene import Scene, SceneLook, SceneObject, check_cameras
+from mtv_world_ros.sim.scene import check_cameras, Scene, SceneLook, SceneObject
 from mtv_world_ros.sim.tasks import ObjectRole, PickPlace, Task
 from mtv_world_ros.success.palette import PALETTE
 
@@ -65,9 +65,14 @@ def _draw_object(role: ObjectRole, word: str, yaw: float, rng: np.random.Generat
     x, y = float(rng.uniform(*role.x_range)), float(rng.uniform(*role.y_range))
     red, green, blue = (channel / 255 for channel in PALETTE[word])
     return SceneObject(
-        role=role.role, name=f'{word} {role.shape}', shape=role.shape, size=(size, size, size),
-        rgb=(red, green, blue), position=(x, y, size / 2), yaw=float(rng.uniform(-yaw, yaw)),
-    )  # fmt: skip
+        role=role.role,
+        name=f'{word} {role.shape}',
+        shape=role.shape,
+        size=(size, size, size),
+        rgb=(red, green, blue),
+        position=(x, y, size / 2),
+        yaw=float(rng.uniform(-yaw, yaw)),
+    )
 
 
 def _draw_look(rng: np.random.Generator) -> SceneLook:
@@ -85,9 +90,7 @@ def _distance(p: ArrayLike, q: ArrayLike) -> float:
 
 
 def _apart(points: list[FloatArray], clearance: float) -> bool:
-    return all(
-        _distance(p, q) >= clearance for i, p in enumerate(points) for q in points[:i]
-    )
+    return all(_distance(p, q) >= clearance for i, p in enumerate(points) for q in points[:i])
 
 
 def _feasible(task: Task, items: dict[str, SceneObject], config: RandomizationConfig) -> bool:

@@ -114,11 +114,15 @@ def simulate(
     history = sim.history(track, np.array([seen.positions for seen in observations]))
     ever, final = ever_and_final(task.succeeds(history))
     return Take(
-        observations=tuple(observations), control_positions=np.asarray(measured),
-        commands=commands, ever=ever, final=final,
+        observations=tuple(observations),
+        control_positions=np.asarray(measured),
+        commands=commands,
+        ever=ever,
+        final=final,
         moved=np.linalg.norm(track[-1] - track[0], axis=1),
-        physics_s=time.perf_counter() - started - rendering, rendering_s=rendering,
-    )  # fmt: skip
+        physics_s=time.perf_counter() - started - rendering,
+        rendering_s=rendering,
+    )
 
 
 def chunk(commands: JointTrajectory, start_s: float, config: RecordConfig) -> JointTrajectory:
@@ -131,7 +135,7 @@ def chunk(commands: JointTrajectory, start_s: float, config: RecordConfig) -> Jo
     velocities = np.where((at <= last)[:, None], commands.velocities[np.minimum(at, last)], 0.0)
     return JointTrajectory(
         joint_names=commands.joint_names,
-        times=config.point_period_s * np.arange(1, num + 1),
+        times=np.linspace(config.point_period_s, num * config.point_period_s, num),
         positions=commands.positions[np.minimum(at, last)],
         velocities=velocities,
     )
@@ -157,10 +161,16 @@ def write_take(
     objects = tuple(item.name for item in sim.scene.objects)
     metadata = {'ever': str(take.ever).lower(), 'final': str(take.final).lower(), **extra}
     with EpisodeWriter(
-        path, task=sim.task.name, instruction=sim.instruction, robot=sim.robot.name,
-        cameras=sim.scene.cameras, seed=seed, objects=objects, metadata=metadata,
+        path,
+        task=sim.task.name,
+        instruction=sim.instruction,
+        robot=sim.robot.name,
+        cameras=sim.scene.cameras,
+        seed=seed,
+        objects=objects,
+        metadata=metadata,
         jpeg_quality=config.jpeg_quality,
-    ) as writer:  # fmt: skip
+    ) as writer:
         writer.outcome = 'success' if take.ever and take.final else 'failure'
         writer.write_instruction(START_NS)
         frame_every = round(config.frame_period_s / CONTROL_PERIOD_S)
@@ -178,9 +188,7 @@ def write_take(
                 writer.write_trajectory(stamp, commands)
 
 
-def _write_frame(
-    writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int
-) -> None:
+def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:
     for camera in sim.scene.cameras:
         writer.write_camera_info(camera.view, stamp, camera)
         writer.write_image(camera.view, stamp, seen.images[camera.view])

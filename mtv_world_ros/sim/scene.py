@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.errors import SimulatorError, nearest
+from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.sim.arm import ARMS, actuators_xml, arm_xml
+from mtv_world_ros.sim.arm import actuators_xml, arm_xml, ARMS
 from mtv_world_ros.sim.cameras import camera_xml
 
 TIMESTEP_S = 0.002

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mtv_world_ros.data_types import BoolArray
-from mtv_world_ros.errors import SimulatorError, nearest
+from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.sim import predicates
 from mtv_world_ros.sim.predicates import History
 

@@ -1,0 +1,23 @@
+import pytest
+
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.sim.expert import Expert
+from mtv_world_ros.sim.opengl import missing_opengl
+
+
+@pytest.fixture(scope='session')
+def robot():
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='session')
+def expert(robot):
+    return Expert(robot)
+
+
+@pytest.fixture
+def opengl():
+    reason = missing_opengl()
+    if reason:
+        pytest.skip(reason)
