@@ -26,7 +26,8 @@ class TrackingConfig:
         join_gap: pieces this near to the main one belong to it, as a share of its diameter (a
             finger in front of a block splits it).
         max_step: largest motion between frames, as a share of the image's diagonal.
-        max_growth: largest area, relative to the median of the areas before.
+        max_growth: largest area, relative to that of the frame before; areas below a few
+            `min_area_share` count as that, for an object may come out from behind a gripper.
         max_missing: share of frames without the object above which it is absent.
     """
 
@@ -63,10 +64,10 @@ class Track:
 
 @dataclass(slots=True)
 class _State:
-    """Where the object was last seen, and how large it has been."""
+    """Where the object was last seen, and how large."""
 
     centre: FloatArray | None
-    areas: list[float]
+    area: float = 0.0
     gap: int = 0
     status: str = 'ok'
 
@@ -93,9 +94,9 @@ def track(
     if taken is not None:
         pixels = pixels & ~taken
     masks = np.zeros(pixels.shape, np.bool_)
-    state = _State(centre=None, areas=[])
+    state = _State(centre=None)
     if first is not None:
-        state = _State(centre=_centroid(first), areas=[float(np.count_nonzero(first))])
+        state = _State(centre=_centroid(first), area=float(np.count_nonzero(first)))
     for index, frame in enumerate(pixels):
         found = _find(frame, state, config)
         if found is None:
@@ -161,10 +162,10 @@ def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: flo
         step = hypot(*(centre - state.centre))
         if step > config.max_step * diagonal * (1 + state.gap):
             state.doubt('teleport')
-    if state.areas and area > config.max_growth * max(np.median(state.areas), 4):
+    if state.area and area > config.max_growth * max(state.area, 5 * config.min_area(mask.shape)):
         state.doubt('area_jump')
     state.centre, state.gap = centre, 0
-    state.areas.append(area)
+    state.area = area
 
 
 def _centroid(mask: BoolArray) -> FloatArray:
