@@ -58,7 +58,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spent:
-    """Where the time of one episode went, dropped attempts included [s]."""
+    """CPU time that one episode took, dropped attempts included [s]."""
 
     physics_s: float
     rendering_s: float
@@ -129,7 +129,7 @@ class EpisodeMaker:
         )
 
     def _write(self, job: Job, take: Take, seed: int, attempt: int) -> float:
-        started = time.perf_counter()
+        started = time.process_time()
         extra = {'attempt': str(attempt), 'index': str(job.index)}
         try:
             write_take(job.path, self._sim, take, seed, self._config.record, **extra)
@@ -138,7 +138,7 @@ class EpisodeMaker:
                 f"cannot write '{job.path}': {error}; finished episodes are kept, so run the same "
                 'command again once there is room'
             ) from error
-        return time.perf_counter() - started
+        return time.process_time() - started
 
 
 _maker: EpisodeMaker | None = None
