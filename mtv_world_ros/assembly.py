@@ -10,7 +10,7 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
-from mtv_world_ros.success.estimator import SuccessEstimator, load_tasks
+from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.segmenter import ColourSegmenter
 
 BUNDLED = 'bundled'

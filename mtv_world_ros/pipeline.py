@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from math import ceil
+import time
 from types import MappingProxyType
 from typing import Protocol
 
@@ -26,11 +26,11 @@ from mtv_world_ros.data_types import (
 from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot import RobotModel, check_positions
+from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
-    TrajectoryVideoConfig,
     render_trajectory_video,
+    TrajectoryVideoConfig,
 )
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.estimator import SuccessEstimator

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
+import sys
 
 from mtv_world_ros.errors import ConfigError
 
@@ -17,7 +17,7 @@ def _candidates() -> list[Path]:
         from ament_index_python.packages import get_package_share_directory
 
         roots.append(Path(get_package_share_directory(PACKAGE)))
-    except (ImportError, LookupError):
+    except (ImportError, LookupError, OSError):
         pass
     return [*roots, Path(sys.prefix) / 'share' / PACKAGE]
 

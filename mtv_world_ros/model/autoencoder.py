@@ -7,11 +7,11 @@ diffusers' autoencoders as far as the world model uses it.
 
 from __future__ import annotations
 
-import torch
-import torch.nn.functional as F  # noqa: N812
 from diffusers import ConfigMixin, ModelMixin
 from diffusers.configuration_utils import register_to_config
+import torch
 from torch import Tensor
+import torch.nn.functional as F
 
 
 class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import torch
 from diffusers.models.transformers.transformer_wan import WanRotaryPosEmbed
+import torch
 from torch import Tensor
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
+import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import RolloutPreempted

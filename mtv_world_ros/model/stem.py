@@ -10,8 +10,8 @@ h4 w4 = a quarter of it, D = width of the transformer, G = frames merged into on
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812
-from torch import Tensor, nn
+from torch import nn, Tensor
+import torch.nn.functional as F
 
 #: what every output pixel chooses from: hold the reference, two copies of it, or draw anew
 NUM_SOURCES = 4

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from diffusers import WanTransformer3DModel
 from diffusers.configuration_utils import register_to_config
-from torch import Tensor, nn
+import torch
+from torch import nn, Tensor
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
@@ -61,6 +61,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         view_offset: see `MultiViewRotaryPosEmbed`.
         prediction: `flow` (noise - clean, Wan) or `sample` (the clean latents).
     """
+
+    # number formats are chosen by whoever loads the model, in one place for all modules
+    _keep_in_fp32_modules = None
 
     @register_to_config
     def __init__(

@@ -5,8 +5,8 @@ Paper, Trajectory Representation. A arms, V views, T frames, N trail points, O o
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Iterator, Sequence
+import colorsys
 from dataclasses import dataclass
 
 import cv2
@@ -22,7 +22,7 @@ from mtv_world_ros.data_types import (
 from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.rendering.glow import FAINTEST, Box, Stamps, Trail, make_stamps, region
+from mtv_world_ros.rendering.glow import Box, FAINTEST, make_stamps, region, Stamps, Trail
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

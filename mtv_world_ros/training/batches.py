@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data.clips import Clip, Recording, clip_starts, cut_clip
+from mtv_world_ros.data.clips import Clip, clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.trajectory_video import (
-    TrajectoryVideoConfig,
     render_trajectory_video,
+    TrajectoryVideoConfig,
 )
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.segmenter import Segmenter

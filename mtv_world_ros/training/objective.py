@@ -6,8 +6,8 @@ Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w la
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
+import torch.nn.functional as F
 
 from mtv_world_ros.training.config import ObjectiveConfig
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import json
+import math
 from pathlib import Path
 
-import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 from diffusers.training_utils import EMAModel
 from safetensors.torch import load_file, save_file
+import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
