@@ -1,0 +1,57 @@
+"""What the node subscribes to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.matched_subscription import MatchedSubscription
+from mtv_world_ros.ros.observation_buffer import ObservationBuffer
+
+Handler = Callable[[Any], None]
+
+
+def subscribe(
+    node: Node,
+    views: Sequence[str],
+    *,
+    compressed: bool,
+    buffer: ObservationBuffer,
+    on_instruction: Handler,
+    on_trajectory: Handler,
+    guarded: Callable[[Handler], Handler],
+) -> list[MatchedSubscription]:
+    """Subscribes to the cameras, joint states, instruction and trajectories.
+
+    Args:
+        node: owner of the subscriptions.
+        views: names of the views; parameters give each its camera topic.
+        compressed: whether images come as JPEG or PNG.
+        buffer: gets images, camera infos and joint states.
+        on_instruction: gets the instruction.
+        on_trajectory: gets the trajectories.
+        guarded: wraps a handler so that it never raises.
+    """
+    kind, suffix = (CompressedImage, '/compressed') if compressed else (Image, '')
+    wanted: list[tuple[Any, str, Handler, int]] = []
+    for view, topic in parameters.declare_camera_topics(node, views).items():
+        wanted += [
+            (CameraInfo, f'{topic}/camera_info', partial(buffer.add_camera_info, view), 1),
+            (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
+        ]
+    wanted += [
+        (JointState, 'joint_states', buffer.add_joint_state, 10),
+        (String, 'instruction', on_instruction, 1),
+        (JointTrajectory, 'joint_trajectory', on_trajectory, 10),
+    ]
+    return [
+        MatchedSubscription(node, kind, topic, guarded(handle), depth)
+        for kind, topic, handle, depth in wanted
+    ]

@@ -1,0 +1,56 @@
+"""Why a message or a rollout was refused: the reasons that are counted, and the error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+
+from mtv_world_ros.errors import MtvWorldError
+
+
+class Reason(StrEnum):
+    """What `/diagnostics` and `~/report` count rejections under."""
+
+    IMAGE_ENCODING = 'image_encoding'
+    IMAGE_DATA = 'image_data'
+    IMAGE_MISSING = 'image_missing'
+    IMAGE_STALE = 'image_stale'
+    VIEWS_OUT_OF_SYNC = 'views_out_of_sync'
+    CAMERA_INFO_MISSING = 'camera_info_missing'
+    CAMERA_INFO_CHANGED = 'camera_info_changed'
+    CAMERA_INFO_INVALID = 'camera_info_invalid'
+    JOINT_STATE_INVALID = 'joint_state_invalid'
+    JOINT_STATE_MISSING = 'joint_state_missing'
+    JOINT_STATE_STALE = 'joint_state_stale'
+    TRAJECTORY_EMPTY = 'trajectory_empty'
+    TRAJECTORY_MALFORMED = 'trajectory_malformed'
+    TRAJECTORY_NOT_FINITE = 'trajectory_not_finite'
+    TRAJECTORY_TIMES = 'trajectory_times'
+    TRAJECTORY_STALE = 'trajectory_stale'
+    TRAJECTORY_TOO_LONG = 'trajectory_too_long'
+    JOINT_NAMES = 'joint_names'
+    JOINT_LIMITS = 'joint_limits'
+    NO_CLOCK = 'no_clock'
+    ROLLOUT_INVALID = 'rollout_invalid'
+    OUT_OF_MEMORY = 'out_of_memory'
+    INTERNAL_ERROR = 'internal_error'
+
+
+class Rejection(MtvWorldError):
+    """A message or a rollout is refused; `reason` is what it counts under."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+@contextmanager
+def rejected_as(reason: Reason) -> Iterator[None]:
+    """Turns a user error raised inside into a `Rejection` for `reason`."""
+    try:
+        yield
+    except Rejection:
+        raise
+    except MtvWorldError as error:
+        raise Rejection(reason, str(error)) from error
