@@ -34,7 +34,7 @@ class EstimatorConfig:
     Attributes:
         margin_weight: logit per softness length of the smallest margin.
         max_margin: the smallest margin is clipped to this many softness lengths.
-        jaccard_weight: logit of (J with the goal mask - J with the start mask).
+        jaccard_weight: logit of (2 J with the goal mask - 1).
         evidence: when masks are not enough.
     """
 
@@ -144,10 +144,10 @@ class SuccessEstimator:
         worst = min(evidence.margins, key=lambda name: evidence.margins[name])
         margin = evidence.margins[worst]
         goal, start = view_mean(evidence.goal_jaccard), view_mean(evidence.start_jaccard)
-        progress = goal - start if isfinite(goal) and isfinite(start) else 0.0
+        reached = 2 * goal - 1 if isfinite(goal) else 0.0
         spread = 1.96 * evidence.sigma_m
         low, middle, high = (
-            self._probability(value / task.softness_m, progress)
+            self._probability(value / task.softness_m, reached)
             for value in (margin - spread, margin, margin + spread)
         )
         reasons = [
@@ -165,11 +165,11 @@ class SuccessEstimator:
             probability=middle, interval=(low, high), jaccard=scores, reasons=tuple(reasons)
         )
 
-    def _probability(self, margin: float, progress: float) -> float:
-        """The logistic of the smallest margin, in softness lengths, and of the progress in J."""
+    def _probability(self, margin: float, reached: float) -> float:
+        """The logistic of the smallest margin, in softness lengths, and of J with the goal."""
         limit = self.config.max_margin
         clipped = min(max(margin, -limit), limit)
-        logit = self.config.margin_weight * clipped + self.config.jaccard_weight * progress
+        logit = self.config.margin_weight * clipped + self.config.jaccard_weight * reached
         return 1.0 / (1.0 + exp(-logit))
 
 
