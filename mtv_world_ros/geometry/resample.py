@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import TrajectoryError, nearest
+from mtv_world_ros.errors import nearest, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import RobotError, TrajectoryError, nearest
+from mtv_world_ros.errors import nearest, RobotError, TrajectoryError
+from mtv_world_ros.geometry.transforms import inverse, is_rigid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +33,19 @@ class Tool:
     gripper_closed: float = 0.0
     gripper_open: float = 1.0
 
+    def __post_init__(self) -> None:
+        offset = np.array(self.T_link_tool, dtype=float)
+        if offset.shape != (4, 4) or not is_rigid(offset):
+            raise RobotError(
+                f"arm '{self.arm}': {offset.tolist()} is not a rigid tool pose (4, 4)"
+            )
+        offset.flags.writeable = False
+        object.__setattr__(self, 'T_link_tool', offset)
+        if self.gripper_open == self.gripper_closed:
+            raise RobotError(
+                f"arm '{self.arm}': gripper_open and gripper_closed are both {self.gripper_open}"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mimic:
@@ -44,15 +58,23 @@ class Mimic:
 
 
 class RobotModel:
-    """A robot of any number of arms.
+    """A robot of any number of arms. Immutable in use, so threads may share it.
 
     Args:
         name: of the robot.
-        model: its Pinocchio model; every joint is in `joint_names` or in `mimics`, others rest.
+        model: its Pinocchio model; joints that are neither commanded nor mimics rest at zero.
         joint_names: J commanded joints, in the order of all position vectors.
         tools: one per arm.
-        base_link: link (frame) in which all poses are given.
-        mimics: joints that follow others.
+        base_link: link in which all poses are given.
+        mimics: joints that follow commanded ones.
+
+    Attributes:
+        joint_names: J names.
+        lower: (J,) smallest positions [rad or m]; -inf for joints that turn without end.
+        upper: (J,) largest positions [rad or m].
+        velocity_limits: (J,) largest speeds [rad/s or m/s]; inf where not given.
+        tools: one per arm, in the order of all A axes.
+        pinocchio_model: the model, with every joint of the description.
 
     Raises:
         RobotError: a joint or link is not in the model.
@@ -73,121 +95,168 @@ class RobotModel:
         self.joint_names = tuple(joint_names)
         self.tools = tuple(tools)
         self.base_link = base_link
-        self._data = model.createData()
-        self._q_index = [self._configuration_index(joint) for joint in self.joint_names]
-        self.lower = np.array([model.lowerPositionLimit[i] for i in self._q_index])
-        self.upper = np.array([model.upperPositionLimit[i] for i in self._q_index])
-        self._mimics = [self._mimic_row(mimic) for mimic in mimics]
-        self._frames = {frame.name: index for index, frame in enumerate(model.frames)}
+        self._frames = _link_frames(model)
+        self._setters = [
+            (self._joint(joint), column, 1.0, 0.0) for column, joint in enumerate(self.joint_names)
+        ]
+        self.lower, self.upper, self.velocity_limits = self._limits()
+        self._check_names(mimics)
+        self._setters += [
+            (self._joint(m.joint), self.joint_names.index(m.source), m.multiplier, m.offset)
+            for m in mimics
+        ]
         for link in (base_link, *(tool.link for tool in self.tools)):
             self._frame(link)
-        self._gripper_columns = [self._gripper_column(tool) for tool in self.tools]
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of all links."""
+        return tuple(self._frames)
 
     def forward_kinematics(self, positions: FloatArray) -> dict[str, FloatArray]:
         """Returns base_T_link (T, 4, 4) of every link for positions (T, J)."""
-        links = [f.name for f in self.pinocchio_model.frames if f.type == pin.FrameType.BODY]
-        poses = self._poses(positions, [self._frame(link) for link in links])
-        return dict(zip(links, poses, strict=True))
+        return dict(zip(self._frames, self._poses(positions, self.link_names), strict=True))
 
     def link_poses(self, link: str, positions: FloatArray) -> FloatArray:
         """Returns base_T_link (T, 4, 4) of one link for positions (T, J)."""
-        return self._poses(positions, [self._frame(link)])[0]
+        return self._poses(positions, (link,))[0]
 
     def tool_poses(self, positions: FloatArray) -> FloatArray:
         """Returns base_T_tool (A, T, 4, 4) of the tool centre points for positions (T, J)."""
-        links = self._poses(positions, [self._frame(tool.link) for tool in self.tools])
         offsets = np.stack([tool.T_link_tool for tool in self.tools])
-        return links @ offsets[:, None]
+        return self._poses(positions, [tool.link for tool in self.tools]) @ offsets[:, None]
 
     def gripper_openings(self, positions: FloatArray) -> FloatArray:
         """Returns (A, T) openings in [0, 1] for positions (T, J); 1 where there is no gripper."""
         openings = np.ones((len(self.tools), len(positions)))
-        for arm, (tool, column) in enumerate(
-            zip(self.tools, self._gripper_columns, strict=True)
-        ):
-            if column is not None:
+        for arm, tool in enumerate(self.tools):
+            if tool.gripper_joint is not None:
+                values = positions[:, self.joint_names.index(tool.gripper_joint)]
                 travel = tool.gripper_open - tool.gripper_closed
-                openings[arm] = (positions[:, column] - tool.gripper_closed) / travel
+                openings[arm] = (values - tool.gripper_closed) / travel
         return openings.clip(0.0, 1.0)
 
-    def _poses(self, positions: FloatArray, frames: Sequence[int]) -> FloatArray:
-        """(len(frames), T, 4, 4)."""
+    def _poses(self, positions: FloatArray, links: Sequence[str]) -> FloatArray:
+        """(len(links), T, 4, 4)."""
+        model, data = self.pinocchio_model, self.pinocchio_model.createData()
+        frames = [self._frame(link) for link in (*links, self.base_link)]
+        configurations = self._configurations(positions)
+        poses = np.empty((len(frames), len(configurations), 4, 4))
+        for t, configuration in enumerate(configurations):
+            pin.forwardKinematics(model, data, configuration)
+            for f, frame in enumerate(frames):
+                # .homogeneous is a copy; .translation would alias Pinocchio's buffer
+                poses[f, t] = pin.updateFramePlacement(model, data, frame).homogeneous
+        return inverse(poses[-1]) @ poses[:-1]
+
+    def _configurations(self, positions: FloatArray) -> FloatArray:
+        """Pinocchio's (T, nq) for positions (T, J): mimics follow, endless joints as cos, sin."""
         positions = np.asarray(positions, dtype=float)
         if positions.ndim != 2 or positions.shape[1] != len(self.joint_names):
             raise RobotError(
                 f"positions have shape {positions.shape}, robot '{self.name}' needs "
                 f'(T, {len(self.joint_names)})'
             )
-        model, data = self.pinocchio_model, self._data
-        base = self._frame(self.base_link)
-        q = pin.neutral(model)
-        out = np.empty((len(frames), len(positions), 4, 4))
-        for t, row in enumerate(positions):
-            q[self._q_index] = row
-            for target, source, multiplier, offset in self._mimics:
-                q[target] = multiplier * q[source] + offset
-            pin.framesForwardKinematics(model, data, q)
-            base_T_world = data.oMf[base].inverse()
-            for f, frame in enumerate(frames):
-                out[f, t] = (base_T_world * data.oMf[frame]).homogeneous
-        return out
+        configurations = np.repeat(pin.neutral(self.pinocchio_model)[None], len(positions), axis=0)
+        for joint, column, multiplier, offset in self._setters:
+            values = multiplier * positions[:, column] + offset
+            if joint.nq == 1:
+                configurations[:, joint.idx_q] = values
+            else:
+                configurations[:, joint.idx_q] = np.cos(values)
+                configurations[:, joint.idx_q + 1] = np.sin(values)
+        return configurations
 
-    def _configuration_index(self, joint: str) -> int:
+    def _limits(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        model, joints = self.pinocchio_model, [setter[0] for setter in self._setters]
+        rows = [
+            (model.lowerPositionLimit[j.idx_q], model.upperPositionLimit[j.idx_q])
+            if j.nq == 1
+            else (-np.inf, np.inf)
+            for j in joints
+        ]
+        lower, upper = np.array(rows, dtype=float).reshape(-1, 2).T.copy()
+        if (lower > upper).any():
+            joint = int(np.argmax(lower > upper))
+            raise RobotError(
+                f"joint '{self.joint_names[joint]}' of robot '{self.name}' has its lower limit "
+                f'{lower[joint]} above the upper one {upper[joint]}'
+            )
+        speeds = np.array([model.velocityLimit[j.idx_v] for j in joints])
+        for array in (lower, upper, speeds):
+            array.flags.writeable = False
+        return lower, upper, speeds
+
+    def _joint(self, name: str) -> pin.JointModel:
         model = self.pinocchio_model
-        if not model.existJointName(joint):
+        if not model.existJointName(name):
             known = list(model.names)[1:]
             raise RobotError(
-                f"robot '{self.name}' has no joint '{joint}'{nearest(joint, known)}; it has {known}"
+                f"robot '{self.name}' has no joint '{name}'{nearest(name, known)}; it has {known}"
             )
-        joint_model = model.joints[model.getJointId(joint)]
-        if joint_model.nq != 1:
+        joint = model.joints[model.getJointId(name)]
+        if joint.nv != 1:
             raise RobotError(
-                f"joint '{joint}' of robot '{self.name}' is of type {joint_model.shortname()}; "
-                'only joints of one number (revolute with limits, prismatic) can be commanded'
+                f"joint '{name}' of robot '{self.name}' is of type {joint.shortname()}; only "
+                'joints of one number (revolute, continuous, prismatic) can be commanded'
             )
-        return joint_model.idx_q
-
-    def _mimic_row(self, mimic: Mimic) -> tuple[int, int, float, float]:
-        target = self._configuration_index(mimic.joint)
-        source = self._configuration_index(mimic.source)
-        return target, source, mimic.multiplier, mimic.offset
+        return joint
 
     def _frame(self, link: str) -> int:
         if link not in self._frames:
             raise RobotError(
-                f"robot '{self.name}' has no link '{link}'{nearest(link, self._frames)}"
+                f"robot '{self.name}' has no link '{link}'{nearest(link, self._frames)}; "
+                f'it has {list(self._frames)}'
             )
         return self._frames[link]
 
-    def _gripper_column(self, tool: Tool) -> int | None:
-        if tool.gripper_joint is None:
-            return None
-        if tool.gripper_joint not in self.joint_names:
+    def _check_names(self, mimics: Sequence[Mimic]) -> None:
+        names = self.joint_names
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise RobotError(f"robot '{self.name}' lists joints {doubled} more than once")
+        for mimic in mimics:
+            if mimic.joint in names:
+                raise RobotError(
+                    f"joint '{mimic.joint}' of robot '{self.name}' follows '{mimic.source}'; "
+                    "take it out of 'joints'"
+                )
+            self._check_commanded(mimic.source, f"joint '{mimic.joint}' follows")
+        for tool in self.tools:
+            if tool.gripper_joint is not None:
+                self._check_commanded(tool.gripper_joint, f"arm '{tool.arm}' opens by")
+
+    def _check_commanded(self, joint: str, why: str) -> None:
+        if joint not in self.joint_names:
             raise RobotError(
-                f"gripper joint '{tool.gripper_joint}' of arm '{tool.arm}' is not among the "
-                f'joints{nearest(tool.gripper_joint, self.joint_names)}'
+                f"robot '{self.name}': {why} '{joint}', which is not among the joints "
+                f'{list(self.joint_names)}{nearest(joint, self.joint_names)}'
             )
-        if tool.gripper_open == tool.gripper_closed:
-            raise RobotError(
-                f"arm '{tool.arm}': gripper_open and gripper_closed are both {tool.gripper_open}"
-            )
-        return self.joint_names.index(tool.gripper_joint)
 
 
-def check_positions(
-    robot: RobotModel, positions: FloatArray, *, tolerance: float = 1e-3
-) -> None:
+def _link_frames(model: pin.Model) -> dict[str, int]:
+    """Links by name; joints have frames too, maybe of the same name."""
+    kind = pin.FrameType.BODY
+    return {frame.name: i for i, frame in enumerate(model.frames) if frame.type == kind}
+
+
+def check_positions(robot: RobotModel, positions: FloatArray, *, tolerance: float = 1e-3) -> None:
     """Checks positions (T, J) against the joint limits.
 
+    Args:
+        robot: the robot.
+        positions: (T, J) in its joint order [rad or m].
+        tolerance: how far outside is still accepted, since recorded states overshoot [rad or m].
+
     Raises:
-        TrajectoryError: names the first joint outside, its value and the limits.
+        TrajectoryError: names the first joint outside or not finite, its value and the limits.
     """
-    low, high = robot.lower - tolerance, robot.upper + tolerance
-    outside = (positions < low) | (positions > high)
-    if outside.any():
-        point, joint = np.argwhere(outside)[0]
+    inside = (positions >= robot.lower - tolerance) & (positions <= robot.upper + tolerance)
+    bad = ~(inside & np.isfinite(positions))
+    if bad.any():
+        point, joint = np.argwhere(bad)[0]
         raise TrajectoryError(
-            f"joint '{robot.joint_names[joint]}' is {positions[point, joint]:.4f} at point "
-            f'{point}, its limits are {robot.lower[joint]:.4f} .. {robot.upper[joint]:.4f} '
-            f"(from the description of robot '{robot.name}')"
+            f"joint '{robot.joint_names[joint]}' is {positions[point, joint]:.5g} at point "
+            f'{point}, its limits are {robot.lower[joint]:.5g} .. {robot.upper[joint]:.5g} '
+            f"(set in the description of robot '{robot.name}')"
         )

@@ -1,4 +1,4 @@
-"""Rigid poses (4, 4): from quaternions, from Denavit-Hartenberg rows, inverted, as YAML has them."""
+"""Rigid poses (4, 4): from quaternions, from Denavit-Hartenberg rows, inverted."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import FloatArray
 
@@ -18,6 +19,7 @@ FAINTEST = 1 / 512
 #: pixels are limited to this before they become integers; far outside any image [px]
 _FAR_PX = 1e6
 
+GlowArray = NDArray[np.float32]
 Box = tuple[int, int, int, int]
 NO_BOX: Box = (0, 0, 0, 0)
 
@@ -48,11 +50,11 @@ class Stamps:
     """
 
     boxes: np.ndarray
-    across: FloatArray
-    down: FloatArray
+    across: GlowArray
+    down: GlowArray
     origin: np.ndarray
 
-    def draw(self, image: FloatArray, n: int, brightness: float) -> Box:
+    def draw(self, image: GlowArray, n: int, brightness: float) -> Box:
         """Lays stamp n onto an (H, W) image, brightest wins; returns the box that it touched."""
         top, bottom, left, right = self.boxes[n]
         if top >= bottom or left >= right:
@@ -73,7 +75,7 @@ def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int)
     Points with NaN pixels (behind the camera) get an empty box. A stamp whose centre is outside
     the image keeps the part that is inside.
     """
-    seen = np.isfinite(pixels).all(axis=-1)
+    seen = np.isfinite(pixels[:, 0] + pixels[:, 1])
     centres = np.where(seen[:, None], pixels, 0.0).clip(-_FAR_PX, _FAR_PX)
     sigmas = np.where(seen, sigmas, 1.0)
     reach = REACH_SIGMAS * sigmas[:, None]
@@ -101,7 +103,7 @@ class Trail:
     """
 
     def __init__(self, width: int, height: int, half_life_s: float) -> None:
-        self.image = np.zeros((height, width), np.float32)
+        self.image: GlowArray = np.zeros((height, width), np.float32)
         self.box = NO_BOX
         self._half_life_s = half_life_s
 

@@ -22,7 +22,15 @@ from mtv_world_ros.data_types import (
 from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.rendering.glow import Box, FAINTEST, make_stamps, region, Stamps, Trail
+from mtv_world_ros.rendering.glow import (
+    Box,
+    FAINTEST,
+    GlowArray,
+    make_stamps,
+    region,
+    Stamps,
+    Trail,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,9 +223,7 @@ def _draw_view(
                 region(core, box)[...] = 0
 
 
-def _sigmas(
-    camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig
-) -> FloatArray:
+def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:
     """Standard deviation of the glow [px]: metric size over depth."""
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     pixels = config.point_radius_m * focal / np.maximum(depths, _NEAREST_SIZE_M)
@@ -230,7 +236,7 @@ def _trail_frames(
     motion: _Motion,
     arm: int,
     config: TrajectoryVideoConfig,
-) -> Iterator[tuple[FloatArray, Box]]:
+) -> Iterator[tuple[GlowArray, Box]]:
     """Yields the arm's trail image at each frame and the box outside which it is 0.
 
     A camera that stands still keeps what is drawn and lets it fade; for one that moves, all
@@ -245,7 +251,7 @@ def _trail_frames(
     for frame, newest in enumerate(motion.shown_at):
         now = times[newest]
         if stamps is not None:
-            trail.fade(now - last)
+            trail.fade(float(now - last))
             trail.add(stamps, now - times, start, newest + 1)
             start, last = newest + 1, now
         else:
@@ -271,7 +277,7 @@ class _Paint:
         self._colour = np.rint(levels * colour).astype(np.uint8)[:, None]
         self._rest = np.repeat(255 - levels, 3, axis=1).astype(np.uint8)[:, None]
 
-    def lay(self, image: ByteArray, glow: FloatArray, box: Box) -> None:
+    def lay(self, image: ByteArray, glow: GlowArray, box: Box) -> None:
         """Blends the colour into an (H, W, 3) image where the (H, W) glow is above 0."""
         part = region(image, box)
         if part.size == 0:

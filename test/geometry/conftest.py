@@ -1,0 +1,13 @@
+from pathlib import Path
+
+import pytest
+
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+
+ROBOTS = Path(__file__).resolve().parents[2] / 'config' / 'robots'
+
+
+@pytest.fixture(scope='session')
+def yam() -> RobotModel:
+    return load_robot(ROBOTS / 'yam_bimanual.yaml')
