@@ -66,9 +66,7 @@ def load_pipeline(
     set_num_threads(num_threads)
     loaded = load_checkpoint(checkpoint_path(checkpoint))
     world_model = DiffusionWorldModel(loaded, device=device, dtype=choose_dtype(dtype, device))
-    return assemble(
-        loaded.card, world_model, robot=robot, objects=objects, task=task
-    )
+    return assemble(loaded.card, world_model, robot=robot, objects=objects, task=task)
 
 
 def assemble(

@@ -138,9 +138,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect import collect
 
     tasks = [name.strip() for name in arguments.task.split(',')]
-    collect(
-        tasks, arguments.episodes, arguments.seed, arguments.out, workers=arguments.workers
-    )
+    collect(tasks, arguments.episodes, arguments.seed, arguments.out, workers=arguments.workers)
     return 0
 
 
@@ -195,7 +193,7 @@ def _train(arguments: argparse.Namespace) -> int:
         save_every=arguments.save_every,
         num_episodes=arguments.episodes,
     )
-    print(f"checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET")
+    print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
     return 0
 
 

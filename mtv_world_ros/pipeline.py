@@ -41,7 +41,9 @@ class WorldModel(Protocol):
     """Predicts one chunk of frames."""
 
     @property
-    def spec(self) -> WorldModelSpec: ...
+    def spec(self) -> WorldModelSpec:
+        """What it takes and gives."""
+        ...
 
     def predict(
         self,
@@ -235,9 +237,7 @@ class Pipeline:
         masks = self.segmenter.segment(frames, names, first_masks=start_masks.masks[:, :, 0])
         clock.lap('masks')
         rollout = Rollout(
-            video=MultiViewVideo(
-                views=start.views, times=times[1 : num_kept + 1], frames=frames
-            ),
+            video=MultiViewVideo(views=start.views, times=times[1 : num_kept + 1], frames=frames),
             seed=seed,
             start_frame=start.frames,
             positions=positions[1 : num_kept + 1],
@@ -316,4 +316,3 @@ def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observati
         positions=observation.positions,
         stamp_ns=observation.stamp_ns,
     )
-

@@ -36,4 +36,5 @@ def share_path(*parts: str) -> Path:
         if path.exists():
             return path
     searched = ', '.join(str(root) for root in roots)
-    raise ConfigError(f"'{'/'.join(parts)}' is not among the installed files; looked in {searched}")
+    wanted = '/'.join(parts)
+    raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")

@@ -103,7 +103,8 @@ def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) 
         last = index + 1 == len(ordered)
         ends = np.inf if last else (ordered[index + 1][0] - origin_ns) * 1e-9
         absolute = trajectory.times + starts
-        kept = (absolute <= ends + 1e-9) & (absolute > (times[-1][-1] if times else -np.inf) + 1e-6)
+        begins = times[-1][-1] if times else -np.inf
+        kept = (absolute <= ends + 1e-9) & (absolute > begins + 1e-6)
         if not kept.any():
             continue
         times.append(absolute[kept])
@@ -161,9 +162,7 @@ def _nearest(have_ns: np.ndarray, want_ns: np.ndarray) -> np.ndarray:
     return np.where(want_ns - have_ns[left] <= have_ns[right] - want_ns, left, right)
 
 
-def _on_clock(
-    episode: Episode, view: str, stamps: np.ndarray, spec: WorldModelSpec
-) -> ByteArray:
+def _on_clock(episode: Episode, view: str, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray:
     own_stamps, frames = episode.images[view]
     if len(own_stamps) == 0:
         raise EpisodeError(f"episode '{episode.info.path}' has no frames of view '{view}'")
@@ -171,9 +170,7 @@ def _on_clock(
     return resize_frames(np.asarray(frames), spec.width, spec.height)[index]
 
 
-def _object_ids(
-    episode: Episode, stamps: np.ndarray, spec: WorldModelSpec
-) -> ByteArray | None:
+def _object_ids(episode: Episode, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray | None:
     if not episode.masks or any(view not in episode.masks for view in spec.views):
         return None
     rows = []

@@ -149,7 +149,8 @@ class ReferenceDecoder(nn.Module):
         self.block1 = ResBlock(2 * c1, c1, dim)
         # 4 latent channels share one pixel position of a space-to-depth block of 2 x 2
         self.num_positions = out_channels // 3
-        self.conv_out = nn.Conv2d(c1, out_channels + NUM_SOURCES * self.num_positions, 3, padding=1)
+        num_out = out_channels + NUM_SOURCES * self.num_positions
+        self.conv_out = nn.Conv2d(c1, num_out, 3, padding=1)
         nn.init.zeros_(self.conv_out.weight)
         with torch.no_grad():
             bias = self.conv_out.bias

@@ -236,4 +236,3 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         out = self.proj_out(kept)
         out = out.unflatten(-1, (p_t, p_h, p_w, -1)).permute(0, 1, 8, 2, 5, 3, 6, 4, 7)
         return out.reshape(batch, views, -1, num_frames, height, width)
-

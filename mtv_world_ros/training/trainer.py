@@ -143,9 +143,7 @@ class Trainer:
                 f"'{self.folder / 'state'}'; lower optimizer.learning_rate"
             )
         loss.backward()
-        for master, worker in zip(
-            self.master.parameters(), self.worker.parameters(), strict=True
-        ):
+        for master, worker in zip(self.master.parameters(), self.worker.parameters(), strict=True):
             master.grad = None if worker.grad is None else worker.grad.float()
             worker.grad = None
         settings = self.config.optimizer
@@ -162,9 +160,7 @@ class Trainer:
 
     @torch.no_grad()
     def _share_weights(self) -> None:
-        for worker, master in zip(
-            self.worker.parameters(), self.master.parameters(), strict=True
-        ):
+        for worker, master in zip(self.worker.parameters(), self.master.parameters(), strict=True):
             worker.copy_(master)
 
     def save_state(self) -> None:

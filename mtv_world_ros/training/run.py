@@ -1,0 +1,174 @@
+"""`mtv-world train`: from a folder of episodes to a checkpoint."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+import json
+from pathlib import Path
+import time
+
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.recording_cache import cached_recording
+from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.success.segmenter import Segmenter
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.trainer import mean_loss, Trainer
+
+#: losses averaged for the progress bar and the log
+_WINDOW = 50
+
+
+def find_episodes(dataset: Path) -> list[Path]:
+    """Returns the episode folders (those with a `metadata.yaml`) below a folder, sorted.
+
+    Raises:
+        TrainingError: there is none.
+    """
+    found = sorted(path.parent for path in Path(dataset).rglob('metadata.yaml'))
+    if not found:
+        raise TrainingError(
+            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
+            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
+        )
+    return found
+
+
+def load_recordings(
+    paths: Sequence[Path], spec: WorldModelSpec, robot: RobotModel, cache: Path
+) -> tuple[list[Recording], dict[str, str]]:
+    """Returns the usable recordings, and the reason for each one left out, by path.
+
+    Raises:
+        TrainingError: none is usable.
+    """
+    recordings, skipped = [], {}
+    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+        try:
+            recordings.append(cached_recording(path, spec, robot, cache))
+        except MtvWorldError as error:
+            skipped[str(path)] = str(error)
+    if not recordings:
+        first = next(iter(skipped.items()), ('', 'no episode given'))
+        raise TrainingError(f'no usable episode; the first one: {first[0]}: {first[1]}')
+    return recordings, skipped
+
+
+def spec_of(config: TrainingConfig) -> WorldModelSpec:
+    """What a model of this configuration takes and gives."""
+    video = config.video
+    return WorldModelSpec(
+        views=video.views,
+        fps=video.fps,
+        num_frames=video.num_frames,
+        width=video.width,
+        height=video.height,
+        robot=video.robot,
+    )
+
+
+def train(
+    config: TrainingConfig,
+    dataset: Path,
+    out: Path,
+    *,
+    robot: RobotModel,
+    segmenter: Segmenter,
+    seed: int = 0,
+    device: str = 'cpu',
+    dtype: torch.dtype = torch.float32,
+    save_every: int = 250,
+    num_episodes: int | None = None,
+) -> Path:
+    """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
+
+    Args:
+        config: the preset.
+        dataset: folder with episode folders in it.
+        out: gets `state/` (to resume), `log.jsonl`, TensorBoard events and `checkpoint/`.
+        robot: of the episodes.
+        segmenter: finds the objects of the first frames.
+        seed: of weights, noise and batches.
+        device: e.g. `cpu`, `cuda`.
+        dtype: of forward and backward.
+        save_every: steps between saved states.
+        num_episodes: use only the first so many.
+
+    Raises:
+        TrainingError: no usable episode, or the loss is not finite.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths = find_episodes(dataset)[:num_episodes]
+    recordings, skipped = load_recordings(paths, spec_of(config), robot, out / 'cache')
+    (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
+    source = BatchSource(
+        recordings,
+        spec=spec_of(config),
+        robot=robot,
+        segmenter=segmenter,
+        rendering=config.rendering,
+        object_mask=config.video.object_mask,
+        augment=config.augment,
+        batch_size=config.optimizer.batch_size,
+        seed=seed,
+    )
+    trained_on = {
+        'episodes': len(recordings),
+        'skipped': len(skipped),
+        'clips': source.num_clips,
+        'tasks': sorted({recording.task for recording in recordings}),
+    }
+    trainer = Trainer(config, out, seed=seed, device=device, dtype=dtype, trained_on=trained_on)
+    resumed = trainer.load_state()
+    tqdm.write(
+        f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
+        f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '
+        f'{trainer.step}'
+    )
+    try:
+        _loop(trainer, source, out, save_every)
+    finally:
+        source.close()
+    return out / 'checkpoint'
+
+
+def _loop(trainer: Trainer, source: BatchSource, out: Path, save_every: int) -> None:
+    total = trainer.config.optimizer.steps
+    recent: deque[float] = deque(maxlen=_WINDOW)
+    started = time.time()
+    with (
+        tqdm(total=total, initial=trainer.step, desc='training', unit='step') as bar,
+        SummaryWriter(str(out / 'tensorboard')) as board,
+        (out / 'log.jsonl').open('a') as log,
+    ):
+        reports = trainer.run(
+            source,
+            save_every=save_every,
+            on_save=lambda _: trainer.export(out / 'checkpoint'),
+        )
+        for report in reports:
+            recent.append(report.loss)
+            bar.update()
+            if report.step % 10 and report.step != total:
+                continue
+            average = mean_loss(list(recent))
+            bar.set_postfix(loss=f'{average:.4f}')
+            board.add_scalar('loss', average, report.step)
+            board.add_scalar('learning_rate', report.learning_rate, report.step)
+            board.add_scalar('grad_norm', report.grad_norm, report.step)
+            row = {
+                'step': report.step,
+                'loss': round(average, 6),
+                'learning_rate': report.learning_rate,
+                'grad_norm': round(report.grad_norm, 4),
+                'seconds': round(time.time() - started, 1),
+            }
+            log.write(json.dumps(row) + '\n')
+            log.flush()
