@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+import json
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -74,6 +75,51 @@ class EpisodeInfo:
     instruction: str = ''
     robot: str = ''
     metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+def dump_info(info: EpisodeInfo) -> dict[str, str]:
+    """Text of the episode's metadata record, by key.
+
+    Raises:
+        EpisodeError: a key of `info.metadata` is one that the episode sets.
+    """
+    described = {
+        'task': info.task,
+        'outcome': info.outcome,
+        'seed': '' if info.seed is None else str(info.seed),
+        'objects': json.dumps(info.objects),
+        'instruction': info.instruction,
+        'robot': info.robot,
+    }
+    clash = sorted(described.keys() & info.metadata.keys())
+    if clash:
+        raise EpisodeError(f'metadata must not have the keys {clash}: the episode sets them')
+    return {**described, **info.metadata}
+
+
+def parse_info(
+    path: Path, values: Mapping[str, str], *, default_instruction: str = ''
+) -> EpisodeInfo:
+    """What the metadata record of the episode at `path` says; inverse of `dump_info`.
+
+    Raises:
+        EpisodeError: a value cannot be used.
+    """
+    rest = dict(values)
+    try:
+        seed = rest.pop('seed', '')
+        return EpisodeInfo(
+            path=path,
+            task=rest.pop('task', ''),
+            outcome=check_outcome(rest.pop('outcome', 'unknown')),
+            seed=int(seed) if seed else None,
+            objects=tuple(str(name) for name in json.loads(rest.pop('objects', '[]'))),
+            instruction=rest.pop('instruction', '') or default_instruction,
+            robot=rest.pop('robot', ''),
+            metadata=rest,
+        )
+    except (ValueError, TypeError, EpisodeError) as error:
+        raise EpisodeError(f"'{path}' has metadata that cannot be used: {error}") from error
 
 
 class Frames(Protocol):

@@ -61,7 +61,7 @@ def raw_to_rgb(
     rows = np.lib.stride_tricks.as_strided(
         data, (height, width * channels), (step, 1), writeable=False
     )
-    image = np.ascontiguousarray(rows).reshape(height, width, channels)
+    image = np.array(rows).reshape(height, width, channels)
     return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,10 @@ from mtv_world_ros.data import messages
 from mtv_world_ros.data.bag_reader import BagReader, iter_messages
 from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
-    check_outcome,
     Episode,
     EpisodeInfo,
     METADATA_NAME,
+    parse_info,
     Track,
 )
 from mtv_world_ros.data.episode_topics import EpisodeTopics, find_topics, ViewTopics
@@ -255,25 +254,13 @@ class _EpisodeReader:
 
 
 def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInfo:
-    values = dict(bag.custom_data, **bag.metadata.get(METADATA_NAME, {}))
-    try:
-        seed = values.pop('seed', '')
-        return EpisodeInfo(
-            path=bag.path,
-            task=values.pop('task', ''),
-            outcome=check_outcome(values.pop('outcome', 'unknown')),
-            seed=int(seed) if seed else None,
-            objects=tuple(str(name) for name in json.loads(values.pop('objects', '[]'))),
-            instruction=values.pop('instruction', '') or next((t for _, t in instructions), ''),
-            robot=values.pop('robot', ''),
-            metadata=values,
-        )
-    except (ValueError, TypeError, EpisodeError) as error:
-        raise EpisodeError(f"'{bag.path}' has metadata that cannot be used: {error}") from error
+    values = {**bag.custom_data, **bag.metadata.get(METADATA_NAME, {})}
+    return parse_info(bag.path, values, default_instruction=next((t for _, t in instructions), ''))
 
 
 def _intrinsics(info: Any) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...]]:
-    return info.width, info.height, tuple(info.k), info.distortion_model, tuple(info.d)
+    k, d = tuple(info.k.tolist()), tuple(info.d.tolist())
+    return info.width, info.height, k, info.distortion_model, d
 
 
 def _is_raw(message: Any) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,8 @@ from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
     camera_info_topic,
     check_outcome,
+    dump_info,
+    EpisodeInfo,
     image_topic,
     INSTRUCTION,
     JOINT_STATES,
@@ -151,18 +152,17 @@ class EpisodeWriter(BagWriter):
         super().close()
 
     def _describe(self) -> None:
-        described = {
-            'task': self.task,
-            'outcome': check_outcome(self.outcome),
-            'seed': '' if self.seed is None else str(self.seed),
-            'objects': json.dumps(self.objects),
-            'instruction': self.instruction,
-            'robot': self.robot,
-        }
-        clash = sorted(described.keys() & self.metadata.keys())
-        if clash:
-            raise EpisodeError(f'metadata must not have the keys {clash}: the episode sets them')
-        self.set_metadata(METADATA_NAME, {**self.metadata, **described})
+        info = EpisodeInfo(
+            path=self.path,
+            task=self.task,
+            outcome=check_outcome(self.outcome),
+            seed=self.seed,
+            objects=self.objects,
+            instruction=self.instruction,
+            robot=self.robot,
+            metadata=self.metadata,
+        )
+        self.set_metadata(METADATA_NAME, dump_info(info))
 
     def _write_compressed(
         self, topic: str, view: str, stamp_ns: int, layout: str, data: bytes
