@@ -45,6 +45,7 @@ setup(
         'PyYAML>=6',
         'av>=18',
         'diffusers>=0.42,<0.43',
+        'lz4>=4.3',
         'mcap>=1.6',
         'mcap-ros2-support>=0.6',
         'numpy>=1.26',
@@ -54,6 +55,7 @@ setup(
         'safetensors>=0.8',
         'torch>=2.6',
         'tqdm>=4.66',
+        'zstandard>=0.22',
     ],
     extras_require={
         'train': ['accelerate>=1.15', 'peft>=0.21', 'tensorboard>=2.21'],
