@@ -17,7 +17,8 @@ import torch
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError, nearest
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 
 CARD = 'world_model.json'
 WEIGHTS = 'diffusion_pytorch_model.safetensors'
@@ -62,9 +63,8 @@ def save_checkpoint(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     _check_card(checkpoint.card, partial)
-    stored = MultiViewWanTransformer.from_config(checkpoint.transformer.config)
-    stored.load_state_dict(checkpoint.transformer.state_dict())
-    stored.to(dtype).save_pretrained(partial / 'transformer', safe_serialization=True)
+    stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
+    stored.save_pretrained(partial / 'transformer', safe_serialization=True)
     checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
     checkpoint.scheduler.save_pretrained(partial / 'scheduler')
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
@@ -160,4 +160,4 @@ def _load_part(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
         part.load_state_dict(tensors)
     except RuntimeError as error:
         raise CheckpointError(f"'{folder}' does not fit its config: {error}") from error
-    return part.to(dtype).eval()
+    return place(part, torch.device('cpu'), dtype).eval()

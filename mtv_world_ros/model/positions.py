@@ -36,8 +36,8 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
         """
         _, num_views, num_frames, height, width, _ = hidden_states.shape
         return (
-            self._table(self.freqs_cos, num_views, num_frames, height, width),
-            self._table(self.freqs_sin, num_views, num_frames, height, width),
+            self._table(self.get_buffer('freqs_cos'), num_views, num_frames, height, width),
+            self._table(self.get_buffer('freqs_sin'), num_views, num_frames, height, width),
         )
 
     def _table(self, freqs: Tensor, v: int, f: int, h: int, w: int) -> Tensor:

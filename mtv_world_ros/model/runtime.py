@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+from torch import nn
 
 from mtv_world_ros.errors import ConfigError
+
+Module = TypeVar('Module', bound=nn.Module)
 
 _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
@@ -35,3 +39,10 @@ def choose_dtype(name: str, device: str) -> torch.dtype:
 def _cpu_has_bfloat16() -> bool:
     info = Path('/proc/cpuinfo')
     return info.is_file() and 'avx512_bf16' in info.read_text()
+
+
+def place(module: Module, device: torch.device, dtype: torch.dtype) -> Module:
+    """Returns the module on a device, in a number format, images channels-last."""
+    nn.Module.to(module, device=device, dtype=dtype)
+    nn.Module.to(module, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return module

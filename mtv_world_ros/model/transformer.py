@@ -12,6 +12,7 @@ from diffusers import WanTransformer3DModel
 from diffusers.configuration_utils import register_to_config
 import torch
 from torch import nn, Tensor
+from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
@@ -111,6 +112,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             rope_max_seq_len=rope_max_seq_len,
             pos_embed_seq_len=pos_embed_seq_len,
         )
+        self.stem, self.prediction = stem, prediction
+        self.patch_size = tuple(patch_size)
         dim = num_attention_heads * attention_head_dim
         self.rope = MultiViewRotaryPosEmbed(
             attention_head_dim, patch_size, rope_max_seq_len, view_offset
@@ -119,7 +122,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         if context == 'none':
             self._drop_context()
         if stem == 'conv':
-            self._build_conv_stem(latent_channels, tuple(stem_widths), dim, frames_per_token)
+            self._build_conv_stem(in_channels, latent_channels, stem_widths, dim, frames_per_token)
         else:
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
 
@@ -130,9 +133,14 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             block.norm2 = nn.Identity()
 
     def _build_conv_stem(
-        self, channels: int, widths: tuple[int, int, int], dim: int, merge: int
+        self,
+        in_channels: int,
+        channels: int,
+        widths: tuple[int, int, int],
+        dim: int,
+        merge: int,
     ) -> None:
-        self.patch_embedding = ConvStem(self.config.in_channels, widths, dim, merge)  # type: ignore[assignment]
+        self.patch_embedding = ConvStem(in_channels, widths, dim, merge)  # type: ignore[assignment]
         self.ref_conv = _ReferenceStem(2 * channels, widths, dim)
         self.proj_out = ReferenceDecoder(channels, widths, dim, merge, widths[1])  # type: ignore[assignment]
 
@@ -185,8 +193,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         time_proj = time_proj.unflatten(1, (6, -1))
         for block in self.blocks:
             if torch.is_grad_enabled() and self.gradient_checkpointing:
-                sequence = self._gradient_checkpointing_func(
-                    block, sequence, context, time_proj, rotary
+                sequence = checkpoint(
+                    block, sequence, context, time_proj, rotary, use_reentrant=False
                 )
             else:
                 sequence = block(sequence, context, time_proj, rotary)
@@ -198,7 +206,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
     def _embed(self, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W)."""
         batch, views = x.shape[:2]
-        if self.config.stem == 'conv':
+        if self.stem == 'conv':
             frames = x.transpose(2, 3).flatten(0, 2).contiguous(memory_format=torch.channels_last)
             return self.patch_embedding(frames, temb, views)
         tokens = self.patch_embedding(x.flatten(0, 1)).unflatten(0, (batch, views))
@@ -210,7 +218,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         """Tokens (B, V, 1, h, w, D) of the reference latents, and keys for copying."""
         batch, views = reference.shape[:2]
         flat = reference.flatten(0, 1)
-        if self.config.stem == 'conv':
+        if self.stem == 'conv':
             assert start_control is not None
             flat = torch.cat([flat, start_control.flatten(0, 1)], dim=1)
             tokens, keys = self.ref_conv(flat.contiguous(memory_format=torch.channels_last), temb)
@@ -229,10 +237,17 @@ class MultiViewWanTransformer(WanTransformer3DModel):
     ) -> Tensor:
         """(B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D)."""
         batch, views, _, num_frames, height, width = like.shape
-        if self.config.stem == 'conv':
+        if self.stem == 'conv':
             frames = self.proj_out(kept, skips, temb, keys, reference.flatten(0, 1))
             return frames.unflatten(0, (batch, views, num_frames)).transpose(2, 3)
-        p_t, p_h, p_w = self.config.patch_size
+        p_t, p_h, p_w = self.patch_size
         out = self.proj_out(kept)
         out = out.unflatten(-1, (p_t, p_h, p_w, -1)).permute(0, 1, 8, 2, 5, 3, 6, 4, 7)
         return out.reshape(batch, views, -1, num_frames, height, width)
+
+
+def copy_of(transformer: MultiViewWanTransformer) -> MultiViewWanTransformer:
+    """Returns another transformer of the same configuration and weights."""
+    other: Any = MultiViewWanTransformer.from_config(transformer.config)
+    other.load_state_dict(transformer.state_dict())
+    return other

@@ -11,6 +11,7 @@ from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ModelMemoryError
 from mtv_world_ros.model.checkpoint import Checkpoint, spec_of
 from mtv_world_ros.model.conditioning import condition, decode_frames
+from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
 
 
@@ -27,10 +28,8 @@ class DiffusionWorldModel:
         self, checkpoint: Checkpoint, *, device: str = 'cpu', dtype: torch.dtype = torch.float32
     ) -> None:
         self.device = torch.device(device)
-        self.transformer = checkpoint.transformer.to(self.device, dtype).eval()
-        if self.transformer.config.stem == 'conv':
-            self.transformer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.autoencoder = checkpoint.autoencoder.to(self.device, dtype).eval()
+        self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
+        self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self.scheduler = checkpoint.scheduler
         self.spec = spec_of(checkpoint.card)
 

@@ -18,7 +18,8 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import condition, encode_frames
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.training.objective import (
@@ -74,10 +75,11 @@ class Trainer:
         self.config, self.folder, self.seed = config, Path(folder), seed
         self.device = torch.device(device)
         self.trained_on = trained_on
-        self.autoencoder = SpaceToDepthAutoencoder(**config.autoencoder).to(self.device)
-        self.master = MultiViewWanTransformer(**config.transformer).to(self.device)
-        self.worker = MultiViewWanTransformer.from_config(self.master.config)
-        self.worker.to(self.device, dtype).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        autoencoder = SpaceToDepthAutoencoder(**config.autoencoder)
+        self.autoencoder = place(autoencoder, self.device, torch.float32)
+        transformer = MultiViewWanTransformer(**config.transformer)
+        self.master = place(transformer, self.device, torch.float32)
+        self.worker = place(copy_of(self.master), self.device, dtype)
         self.ema = EMAModel(
             self.master.parameters(),
             decay=config.optimizer.ema_decay,
@@ -132,7 +134,7 @@ class Trainer:
         )
         ids = None if batch.object_ids is None else batch.object_ids.to(self.device)
         weights = latent_weights(pixel_weights(frames, ids, config), self.autoencoder.block_size)
-        target = clean if self.worker.config.prediction == 'sample' else noise - clean
+        target = clean if self.worker.prediction == 'sample' else noise - clean
         return sample_loss(predicted, target, weights, config.huber_delta)
 
     def _train_step(self, batch: Batch) -> StepReport:
@@ -209,8 +211,7 @@ class Trainer:
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
         """Writes the averaged weights as a checkpoint."""
-        averaged = MultiViewWanTransformer.from_config(self.master.config)
-        averaged.load_state_dict(self.master.state_dict())
+        averaged = copy_of(self.master)
         self.ema.copy_to(averaged.parameters())
         video = self.config.video
         card = {
