@@ -131,7 +131,7 @@ class ColourSegmenter:
         floor = self.config.min_saturation * self._saturations[self._words.index(word)]
         inside = np.flatnonzero(gate)
         saturation = _saturation(_centred(lab.reshape(-1, 3)[inside]))
-        num_core = max(1, len(gate) * self.config.tracking.min_area(gate.shape) // 2)
+        num_core = len(gate) * max(1, self.config.tracking.min_area(gate.shape) // 2)
         pixels = np.zeros(gate.shape, np.bool_)
         if np.count_nonzero(saturation > floor) > num_core:
             core = np.partition(saturation, -num_core)[-num_core]

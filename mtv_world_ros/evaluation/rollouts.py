@@ -1,0 +1,137 @@
+"""Stretches of a recorded episode, imagined again from their first frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor
+
+import numpy as np
+
+from mtv_world_ros.data.clips import commanded, frame_indices, Recording
+from mtv_world_ros.data_types import (
+    ByteArray,
+    JointTrajectory,
+    Observation,
+    WorldModelSpec,
+)
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.pipeline import Pipeline, Prediction
+
+#: observe: every chunk from real frames; imagine: chunks chained from the episode's first frame
+MODES = ('observe', 'imagine')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stretch:
+    """What one rollout is compared with.
+
+    Attributes:
+        index: its number in the episode.
+        start: recorded frame it starts from.
+        frames: (V, 1 + T, H, W, 3) recorded frames on the model's clock, frame 0 the start.
+        object_ids: (V, 1 + T, H, W) true masks as identities, None where not recorded.
+    """
+
+    index: int
+    start: int
+    frames: ByteArray
+    object_ids: ByteArray | None
+
+    @property
+    def num_frames(self) -> int:
+        """T, frames to predict."""
+        return self.frames.shape[1] - 1
+
+
+def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Stretch]:
+    """Cuts an episode into what is imagined at once.
+
+    In mode `observe` each stretch is a chunk; a last one shorter than half a chunk is left out
+    unless it is the only one. In mode `imagine` the whole episode is one stretch.
+
+    Raises:
+        ConfigError: unknown mode.
+        EpisodeError: the episode is shorter than a frame, or has gaps everywhere.
+    """
+    if mode not in MODES:
+        raise ConfigError(f"mode is '{mode}'; it must be one of {', '.join(MODES)}")
+    total = floor(float(recording.times[-1] - recording.times[0]) * spec.fps + 1e-3)
+    length = spec.num_frames if mode == 'observe' else max(total, 1)
+    found: list[Stretch] = []
+    for first in range(0, max(total, 1), length):
+        count = min(length, total - first)
+        if count < 1 or (found and 2 * count < length):
+            continue
+        start = int(np.argmin(np.abs(recording.times - recording.times[0] - first / spec.fps)))
+        cut = _cut(recording, start, count, spec, len(found))
+        if cut is not None:
+            found.append(cut)
+    if not found:
+        raise EpisodeError(
+            f"'{recording.path}': its {len(recording.times)} frames hold no stretch without gaps "
+            f'at {spec.fps:g} Hz'
+        )
+    return found
+
+
+def _cut(
+    recording: Recording, start: int, count: int, spec: WorldModelSpec, index: int
+) -> Stretch | None:
+    frames = frame_indices(recording, start, spec, count)
+    if frames is None:
+        return None
+    ids = recording.object_ids
+    return Stretch(
+        index=index,
+        start=start,
+        frames=recording.frames[:, frames],
+        object_ids=None if ids is None else ids[:, frames],
+    )
+
+
+def imagine_stretch(
+    pipeline: Pipeline,
+    recording: Recording,
+    stretch: Stretch,
+    *,
+    actions: Recording,
+    seed: int,
+    num_inference_steps: int,
+) -> list[Prediction]:
+    """Imagines a stretch from its recorded first frame; returns its chunks.
+
+    Args:
+        pipeline: imagines.
+        recording: the episode that the stretch was cut from.
+        stretch: what to imagine.
+        actions: the episode whose commands are executed: the same one, or another for a control.
+        seed: of the noise.
+        num_inference_steps: denoising steps.
+    """
+    spec = pipeline.spec
+    times = np.arange(stretch.num_frames + 1) / spec.fps
+    start = min(stretch.start, len(actions.times) - 1)
+    positions = commanded(actions, start, times)
+    trajectory = JointTrajectory(
+        joint_names=pipeline.robot.joint_names, times=times[1:], positions=positions[1:]
+    )
+    observation = Observation(
+        cameras=recording.cameras,
+        frames=stretch.frames[:, 0],
+        positions=recording.positions[stretch.start],
+        stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
+    )
+    return list(
+        pipeline.imagine(
+            observation,
+            trajectory,
+            instruction=recording.instruction,
+            seed=seed,
+            num_inference_steps=num_inference_steps,
+        )
+    )
+
+
+def predicted_frames(chunks: list[Prediction]) -> ByteArray:
+    """Returns the (V, T, H, W, 3) frames of a rollout's chunks in a row."""
+    return np.concatenate([chunk.rollout.video.frames for chunk in chunks], axis=1)

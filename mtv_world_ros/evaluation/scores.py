@@ -1,0 +1,201 @@
+"""Jaccard indices of imagined against recorded frames, as rows."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import ByteArray, ObjectMasks
+from mtv_world_ros.evaluation.rollouts import Stretch
+from mtv_world_ros.success.jaccard import (
+    moves,
+    object_scores,
+    ObjectScores,
+    persistence_scores,
+)
+from mtv_world_ros.success.segmenter import masks_from_ids, Segmenter
+
+#: what `moving` means, for whoever reads the numbers
+MOVING_RULE = (
+    'an object moves in a stretch if in some recorded frame its mask and its first mask share '
+    'less than half of the smaller of the two; {source} masks; frames that show less than a '
+    'quarter of its largest area do not count'
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreRow:
+    """J of one object in one view over one stretch; NaN = not scored.
+
+    Attributes:
+        stretch: its number in the episode.
+        num_frames: T, frames that were predicted.
+        view: name.
+        name: of the object; empty for the union of the scored objects.
+        status: `ok`, or why it is not scored, or why to doubt it.
+        moving: whether it really moves (see `MOVING_RULE`).
+        j: mean over frames.
+        j_visible: mean over the frames that really show it.
+        j_copy: of the first frame held.
+        j_shuffled: with the actions of another episode.
+        j_ceiling: of recorded frames that went through the autoencoder.
+        j_frames: (T,) J per frame.
+    """
+
+    stretch: int
+    num_frames: int
+    view: str
+    name: str
+    status: str
+    moving: bool
+    j: float
+    j_visible: float
+    j_copy: float
+    j_shuffled: float
+    j_ceiling: float
+    j_frames: tuple[float, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values, None for NaN."""
+        values = asdict(self)
+        values['j_frames'] = [_known(value) for value in self.j_frames]
+        return {
+            key: _known(value) if isinstance(value, float) else value
+            for key, value in values.items()
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> ScoreRow:
+        """The inverse of `as_json`."""
+        read: dict[str, Any] = {
+            key: np.nan if value is None else value for key, value in values.items()
+        }
+        read['j_frames'] = tuple(np.nan if v is None else v for v in values['j_frames'])
+        return ScoreRow(**read)
+
+
+def _known(value: float) -> float | None:
+    return round(float(value), 5) if np.isfinite(value) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Masks of a recorded stretch.
+
+    Attributes:
+        first: (V, O, H, W) masks of frame 0.
+        masks: of the frames 1..T.
+        moving: (V, O) whether each object really moves.
+    """
+
+    first: ObjectMasks
+    masks: ObjectMasks
+    moving: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """O names."""
+        return self.masks.names
+
+
+def true_masks(
+    stretch: Stretch,
+    segmenter: Segmenter,
+    names: tuple[str, ...],
+    objects: tuple[str, ...],
+    *,
+    use_ids: bool,
+) -> Truth:
+    """Returns the masks that predictions are scored against.
+
+    Args:
+        stretch: recorded frames.
+        segmenter: finds the masks, as it will in the predicted frames.
+        names: O objects to score.
+        objects: what the recorded identities stand for.
+        use_ids: score against the recorded identities instead, where there are any. Which
+            objects move is read from them in any case.
+    """
+    first = segmenter.segment(stretch.frames[:, :1], names)
+    masks = segmenter.segment(stretch.frames[:, 1:], names, first_masks=first.masks[:, :, 0])
+    ids = stretch.object_ids
+    if ids is None:
+        return Truth(first=first, masks=masks, moving=moves(masks.masks, first.masks[:, :, 0]))
+    true_first = masks_from_ids(ids[:, :1], objects, names)
+    true = masks_from_ids(ids[:, 1:], objects, names)
+    moving = moves(true.masks, true_first.masks[:, :, 0])
+    if use_ids:
+        return Truth(first=true_first, masks=true, moving=moving)
+    return Truth(first=first, masks=masks, moving=moving)
+
+
+def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectScores:
+    """Scores (V, T, H, W, 3) frames; the segmenter starts from the recorded first masks."""
+    found = segmenter.segment(frames, truth.names, first_masks=truth.first.masks[:, :, 0])
+    return object_scores(found, truth.masks)
+
+
+def score_rows(
+    stretch: Stretch,
+    views: tuple[str, ...],
+    truth: Truth,
+    predicted: ObjectScores,
+    shuffled: ObjectScores | None,
+    ceiling: ObjectScores | None,
+) -> list[ScoreRow]:
+    """Returns a row per view and object, and one per view for the union of objects."""
+    copy = persistence_scores(truth.first.masks[:, :, 0], truth.masks)
+    rows = []
+    for v, view in enumerate(views):
+        for o, name in enumerate(truth.names):
+            frames = predicted.frames[v, o]
+            rows.append(
+                ScoreRow(
+                    stretch=stretch.index,
+                    num_frames=stretch.num_frames,
+                    view=view,
+                    name=name,
+                    status=predicted.status[v][o],
+                    moving=bool(truth.moving[v, o]),
+                    j=float(predicted.objects[v, o]),
+                    j_visible=float(predicted.visible[v, o]),
+                    j_copy=float(copy.objects[v, o]),
+                    j_shuffled=_value(shuffled, v, o),
+                    j_ceiling=_value(ceiling, v, o),
+                    j_frames=tuple(frames.tolist()),
+                )
+            )
+        rows.append(_union_row(stretch, view, v, predicted, copy, shuffled, ceiling))
+    return rows
+
+
+def _value(scores: ObjectScores | None, view: int, item: int) -> float:
+    return float('nan') if scores is None else float(scores.objects[view, item])
+
+
+def _union_row(
+    stretch: Stretch,
+    view: str,
+    v: int,
+    predicted: ObjectScores,
+    copy: ObjectScores,
+    shuffled: ObjectScores | None,
+    ceiling: ObjectScores | None,
+) -> ScoreRow:
+    nan = float('nan')
+    return ScoreRow(
+        stretch=stretch.index,
+        num_frames=stretch.num_frames,
+        view=view,
+        name='',
+        status='ok' if np.isfinite(predicted.union[v]) else 'no object is scored',
+        moving=False,
+        j=float(predicted.union[v]),
+        j_visible=nan,
+        j_copy=float(copy.union[v]),
+        j_shuffled=nan if shuffled is None else float(shuffled.union[v]),
+        j_ceiling=nan if ceiling is None else float(ceiling.union[v]),
+        j_frames=(),
+    )
