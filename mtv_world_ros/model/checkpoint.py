@@ -95,10 +95,11 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
             f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
             'loaded: convert them and remove these'
         )
+    scheduler: Any = FlowMatchEulerDiscreteScheduler.from_pretrained(folder / 'scheduler')
     return Checkpoint(
         transformer=_load_part(MultiViewWanTransformer, folder / 'transformer', dtype),
         autoencoder=_load_part(SpaceToDepthAutoencoder, folder / 'autoencoder', dtype),
-        scheduler=FlowMatchEulerDiscreteScheduler.from_pretrained(folder / 'scheduler'),
+        scheduler=scheduler,
         card=card,
     )
 

@@ -39,7 +39,8 @@ def sample_latents(
 ) -> Tensor:
     """Returns (B, V, C, F, h, w) float32 denoised latents.
 
-    `scheduler` is a diffusers `FlowMatchEulerDiscreteScheduler`. The noise is drawn on the CPU, so a seed gives the same rollout on every device.
+    `scheduler` is a diffusers `FlowMatchEulerDiscreteScheduler`. The noise is drawn on the CPU, so
+    a seed gives the same rollout on every device.
 
     Raises:
         RolloutPreempted: `should_stop` said so between two steps.
