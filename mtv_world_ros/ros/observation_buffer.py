@@ -22,6 +22,10 @@ from mtv_world_ros.ros.stamps import NANO, to_ns
 _NUM_IMAGES = 3
 #: joint samples kept a joint; at 1 kHz this reaches back a quarter of a second
 _NUM_SAMPLES = 256
+_AGE_LIMITS = {
+    Reason.IMAGE_STALE: 'max_image_age_s',
+    Reason.JOINT_STATE_STALE: 'max_joint_state_age_s',
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,12 +176,10 @@ class ObservationBuffer:
                     f"no image of view '{view}' was received; is its camera running, and does "
                     f"the parameter 'camera_topics.{view}' name it?",
                 )
-        newest = {view: max(s for s, _ in images) for view, images in self._images.items()}
+        newest = {view: images[-1][0] for view, images in self._images.items()}
         for view, stamp in newest.items():
             what = f"the newest image of view '{view}'"
-            _check_age(
-                Reason.IMAGE_STALE, what, stamp, now_ns, limits.image_age, 'max_image_age_s'
-            )
+            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.image_age)
         common = min(newest.values())
         picked = [min(i, key=lambda image: abs(image[0] - common)) for i in self._images.values()]
         stamps = [stamp for stamp, _ in picked]
@@ -203,10 +205,7 @@ class ObservationBuffer:
             )
         for name, samples in self._joints.items():
             what, limit = f"the newest state of joint '{name}'", limits.joint_state_age
-            newest = max(stamp for stamp, _ in samples)
-            _check_age(
-                Reason.JOINT_STATE_STALE, what, newest, now_ns, limit, 'max_joint_state_age_s'
-            )
+            _check_age(Reason.JOINT_STATE_STALE, what, samples[-1][0], now_ns, limit)
         return np.array(
             [
                 min(samples, key=lambda sample: abs(sample[0] - stamp_ns))[1]
@@ -219,15 +218,13 @@ def _age(samples: Sequence[tuple[int, object]], now_ns: int) -> float:
     return (now_ns - samples[-1][0]) / NANO if samples else float('nan')
 
 
-def _check_age(
-    reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float, parameter: str
-) -> None:
+def _check_age(reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float) -> None:
     age = (now_ns - stamp_ns) / NANO
     if abs(age) <= limit:
         return
     when = f'{age:.3f} s old' if age > 0 else f'stamped {-age:.3f} s in the future'
     raise Rejection(
         reason,
-        f"{what} is {when}; '{parameter}' allows {limit:g} s (for recorded data at its own time "
-        "set 'use_sim_time' and play with a clock)",
+        f"{what} is {when}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for recorded data at its "
+        "own time set 'use_sim_time' and play with a clock)",
     )

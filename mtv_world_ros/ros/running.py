@@ -5,31 +5,48 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import signal
 import sys
+from typing import TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.errors import MtvWorldError
 
+AnyNode = TypeVar('AnyNode', bound=Node)
 
-def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
-    """Makes a node and spins it until SIGINT, SIGTERM or its own shutdown of ROS.
+
+def spin_forever(node: Node) -> None:
+    """Handles callbacks one after the other until ROS shuts down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+def run(
+    make: Callable[[], AnyNode],
+    args: Sequence[str] | None = None,
+    *,
+    spin: Callable[[AnyNode], None] = spin_forever,
+    signals: SignalHandlerOptions = SignalHandlerOptions.ALL,
+) -> int:
+    """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
 
     Args:
-        make: makes the node; if it has `close()`, that ends it.
-        args: command line; default: the process' own.
+        make: makes the node; where it has `close()`, that ends it.
+        args: command line with the program's name; default: the process' own.
+        spin: what the node does.
+        signals: which signals end it; NO = it has its own handlers.
 
     Returns:
         The exit status: 1 after a user error, whose text goes to stderr, else 0.
     """
-    rclpy.init(args=None if args is None else list(args))
-    node: Node | None = None
+    rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
+    node: AnyNode | None = None
     try:
         node = make()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin()
+        spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except MtvWorldError as error:

@@ -1,0 +1,173 @@
+"""Records ROS topics, byte for byte, as a rosbag2 MCAP folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import signal
+import sys
+import time
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from mtv_world_ros.data.bag_metadata import Qos
+from mtv_world_ros.data.bag_writer import BagWriter
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.ros.raw_headers import has_header, message_class, read_stamp
+from mtv_world_ros.ros.running import run
+
+#: messages kept while the disk is busy
+_DEPTH = 2000
+#: after a stop signal, silence for this long means that everything arrived [s]
+_SILENCE_S = 0.5
+_LONGEST_DRAIN_S = 10.0
+
+
+class Recorder(Node):
+    """Subscribes to topics as their publishers offer them and writes what comes.
+
+    Args:
+        options: of the command line, see `_parse`.
+
+    Raises:
+        EpisodeError: the folder exists already or cannot be written.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__('recorder')
+        self._options = options
+        self._pending = [self.resolve_topic_name(topic) for topic in options.topics]
+        self._counts: Counter[str] = Counter()
+        self._last_stamp_ns = 0
+        self._last_message_s = 0.0
+        self._stopping = False
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._writer = BagWriter(options.out, overwrite=options.overwrite)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def record(self) -> None:
+        """Records until a signal comes and what is on its way has arrived.
+
+        Raises:
+            ConfigError: a topic has no publisher in time.
+        """
+        begin_s = time.monotonic()
+        with self._writer:
+            while not self._stopping:
+                self._subscribe_to_known()
+                self._check_patience(time.monotonic() - begin_s)
+                self._executor.spin_once(timeout_sec=0.05)
+            self._drain()
+        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
+        self.get_logger().info(f"recorded '{self._options.out}': {counted or 'nothing'}")
+
+    def close(self) -> None:
+        """Drops a record that was not finished, and ends the node."""
+        self._writer.abort()
+        self.destroy_node()
+
+    def _on_signal(self, *_: object) -> None:
+        self._stopping = True
+
+    def _subscribe_to_known(self) -> None:
+        if not self._pending:
+            return
+        types = dict(self.get_topic_names_and_types())
+        for topic in [topic for topic in self._pending if types.get(topic)]:
+            self._subscribe(topic, types[topic][0])
+            self._pending.remove(topic)
+            if not self._pending:
+                self.get_logger().info('recording')
+
+    def _check_patience(self, waited_s: float) -> None:
+        if self._pending and waited_s > self._options.wait_timeout:
+            raise ConfigError(
+                f'nobody publishes {self._pending} after {self._options.wait_timeout:g} s; '
+                'nothing was recorded'
+            )
+
+    def _subscribe(self, topic: str, msgtype: str) -> None:
+        offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        self._writer.declare(
+            topic,
+            msgtype,
+            Qos(
+                reliability=reliability.name.lower(),
+                durability=durability.name.lower(),
+                depth=offers[0].depth or 10 if offers else 10,
+            ),
+        )
+        self.create_subscription(
+            message_class(msgtype),
+            topic,
+            self._handler(topic, msgtype),
+            QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
+            raw=True,
+        )
+
+    def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:
+        by_header = self._options.stamp == 'header'
+
+        def write(data: bytes) -> None:
+            now_ns = self.get_clock().now().nanoseconds
+            stamp_ns = now_ns
+            if by_header:
+                if has_header(msgtype):
+                    self._last_stamp_ns = read_stamp(data) or now_ns
+                stamp_ns = self._last_stamp_ns or now_ns
+            self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
+            self._counts[topic] += 1
+            self._last_message_s = time.monotonic()
+
+        return write
+
+    def _drain(self) -> None:
+        end_s = time.monotonic() + _LONGEST_DRAIN_S
+        self._last_message_s = time.monotonic()
+        while time.monotonic() < min(self._last_message_s + _SILENCE_S, end_s):
+            self._executor.spin_once(timeout_sec=0.05)
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='recorder', description=__doc__)
+    add = parser.add_argument
+    add('out', type=Path, help='folder to make; it appears when the record is complete')
+    add('topics', nargs='+', metavar='TOPIC')
+    add('--overwrite', action='store_true', help='replace an existing folder')
+    add(
+        '--stamp',
+        choices=('receive', 'header'),
+        default='receive',
+        help="log time of a message: when it came, or its header's stamp (predictions then lie "
+        'at the time they are about); messages without a header take the last header seen',
+    )
+    add('--wait-timeout', type=float, default=60.0, help='wait for publishers this long [s]')
+    return parser.parse_args(arguments)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Records until SIGINT or SIGTERM; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('recorder', *args))
+    options = _parse(remove_ros_args(arguments)[1:])
+    return run(
+        lambda: Recorder(options),
+        arguments,
+        spin=Recorder.record,
+        signals=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == '__main__':
+    sys.exit(main())

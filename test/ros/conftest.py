@@ -1,0 +1,363 @@
+"""A running node in its own process and a client that talks to it over the middleware."""
+
+from collections import Counter, defaultdict
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState  # noqa: E402
+from std_msgs.msg import Header, String  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
+
+from mtv_world_ros.data_types import CameraModel  # noqa: E402
+from mtv_world_ros.geometry.calibration_file import save_calibration  # noqa: E402
+from mtv_world_ros.ros.conversions import values_of  # noqa: E402
+from mtv_world_ros.ros.image_conversions import to_compressed, to_image  # noqa: E402
+from mtv_world_ros.ros.stamps import NANO, to_stamp  # noqa: E402
+
+os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2]), 'OMP_NUM_THREADS': '1'}
+FAKE = Path(__file__).with_name('fake_world_model.py')
+VIEWS = ('low', 'high')
+JOINTS = tuple(
+    f'{arm}_{joint}'
+    for arm in ('left', 'right')
+    for joint in (*(f'joint{n}' for n in range(1, 7)), 'gripper')
+)
+HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
+SIZE = (96, 72)
+NUM_FRAMES = 4
+CHUNK_S = 0.8
+TIMEOUT_S = 20.0
+
+
+def make_calibration(path):
+    """Two cameras that look at the table from the front and from above."""
+    looks = {'low': ((0, 1.1, 0.6), 30.0), 'high': ((0, 0.9, 1.2), 55.0)}
+    cameras = {}
+    for view, (position, down) in looks.items():
+        a = np.radians(down)
+        T = np.eye(4)
+        T[:3, :3] = np.array(
+            [[-1, 0, 0], [0, -np.sin(a), -np.cos(a)], [0, -np.cos(a), np.sin(a)]]
+        ).T @ np.diag([1.0, 1.0, 1.0])
+        x, z = np.array([-1.0, 0, 0]), np.array([0, -np.cos(a), -np.sin(a)])
+        T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+        T[:3, 3] = position
+        cameras[view] = CameraModel(
+            view=view,
+            width=SIZE[0],
+            height=SIZE[1],
+            K=np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]]),
+            mount_link='base',
+            T_mount_camera=T,
+        )
+    save_calibration(path, cameras)
+    return path
+
+
+class Client:
+    """Plays cameras, arms and policy, and keeps what the node publishes."""
+
+    def __init__(self, *, sim_time=False):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node(
+            'client',
+            context=self.context,
+            parameter_overrides=[Parameter('use_sim_time', value=sim_time)],
+        )
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.received, self.totals = defaultdict(list), Counter()
+        self.publishers, self.services = {}, {}
+        self.subscribe(DiagnosticArray, '/world_model/report', 100)
+        self.subscribe(DiagnosticArray, '/diagnostics', 10)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def subscribe(self, kind, topic, depth=NUM_FRAMES, reliability=ReliabilityPolicy.RELIABLE):
+        def keep(message):
+            self.received[topic].append(message)
+            self.totals[topic] += 1
+
+        profile = QoSProfile(depth=depth, reliability=reliability)
+        self.node.create_subscription(kind, topic, keep, profile)
+
+    def publish(self, topic, message, *, latched=False):
+        """Publishes reliably; the first time on a topic waits until the node is connected."""
+        if topic not in self.publishers:
+            self.connect_inputs({topic: type(message)}, latched=latched)
+        self.publishers[topic].publish(message)
+
+    def connect_inputs(self, topics, *, latched=False):
+        """Creates publishers for `{topic: type}` and waits until the node is connected."""
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        profile = QoSProfile(depth=10, durability=durability)
+        for topic, kind in topics.items():
+            self.publishers[topic] = self.node.create_publisher(kind, topic, profile)
+        for topic in topics:
+            publisher = self.publishers[topic]
+            self.wait(lambda p=publisher: self._is_settled(p), f'a subscriber of {topic}')
+
+    def _is_settled(self, publisher):
+        """The node's subscription asks for what is offered, and no other is left."""
+        infos = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
+        reliable = [i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos]
+        return all(reliable) and publisher.get_subscription_count() == len(infos) > 0
+
+    def wait(self, condition, what='it', timeout_s=TIMEOUT_S):
+        """Spins until the condition holds."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end, f'waited {timeout_s} s for {what}'
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def spin_for(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def connect_outputs(self, topics, timeout_s=TIMEOUT_S):
+        """Subscribes to `{topic: type}` and waits for their publishers."""
+        for topic, kind in topics.items():
+            self.subscribe(kind, topic)
+        for topic in topics:
+            self.wait(
+                lambda topic=topic: self.node.count_publishers(topic), f'a publisher of {topic}'
+            )
+        self.wait(lambda: all(self._is_matched(topic) for topic in topics), 'matching', timeout_s)
+
+    def _is_matched(self, topic):
+        subscriptions = [s for s in self.node.subscriptions if s.topic_name == topic]
+        return all(s.get_publisher_count() for s in subscriptions)
+
+    def call(self, kind, name, request):
+        if name not in self.services:
+            self.services[name] = self.node.create_client(kind, name)
+        client = self.services[name]
+        self.wait(client.service_is_ready, f'service {name}')
+        future = client.call_async(request)
+        self.wait(future.done, f'an answer of {name}')
+        return future.result()
+
+    def reset(self):
+        return self.call(Trigger, '/world_model/reset', Trigger.Request())
+
+    def imagine(self, on):
+        return self.call(SetBool, '/world_model/imagine', SetBool.Request(data=on))
+
+    def set(self, **values):
+        """Sets parameters of the node; returns the first refusal's reason, or ''."""
+        parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
+        request = SetParameters.Request(parameters=parameters)
+        results = self.call(SetParameters, '/world_model/set_parameters', request).results
+        return next((r.reason for r in results if not r.successful), '')
+
+    def now_ns(self):
+        return self.node.get_clock().now().nanoseconds
+
+    # what the robot's drivers publish
+
+    def send_scene(self, stamp_ns=None, **changes):
+        """Publishes both images, their infos and the joint state, all stamped alike.
+
+        `changes`: image_<view>, info_<view>, joints = a message instead, or None = not at all.
+        """
+        stamp_ns = self.now_ns() if stamp_ns is None else stamp_ns
+        for view in VIEWS:
+            self._send(f'/{view}/camera_info', changes, f'info_{view}', make_info(view, stamp_ns))
+            self._send(f'/{view}/image_raw', changes, f'image_{view}', make_image(view, stamp_ns))
+        self._send('/joint_states', changes, 'joints', make_joint_state(stamp_ns))
+        return stamp_ns
+
+    def _send(self, topic, changes, key, default):
+        message = changes.get(key, default)
+        if message is not None:
+            self.publish(topic, message)
+
+    def send_trajectory(self, message=None, **fields):
+        self.publish('/joint_trajectory', message or make_trajectory(**fields))
+
+    # what the node said
+
+    def statuses(self, topic):
+        return [status for array in self.received[topic] for status in array.status]
+
+    def report_values(self, state=None):
+        values = [values_of(s) for s in self.statuses('/world_model/report')]
+        return [v for v in values if state is None or v['state'] == state]
+
+    def diagnostic_values(self):
+        found = [s for s in self.statuses('/diagnostics') if s.name == 'world_model']
+        return values_of(found[-1]) if found else {}
+
+    def wait_for_all(self, topics):
+        """Waits until every frame that was reported as published is here, on all topics."""
+
+        def all_here():
+            chunks = self.report_values('chunk')
+            total = int(chunks[-1]['frames_published_total']) if chunks else 0
+            return all(self.totals[topic] == total for topic in topics)
+
+        self.wait(all_here, 'frames that were reported as published')
+
+    def next_end(self, since):
+        """Waits for the next report after the first `since` that ends a rollout."""
+        ends = ('done', 'preempted', 'rejected', 'failed', 'reset')
+        self.wait(
+            lambda: any(v['state'] in ends for v in self.report_values()[since:]),
+            'the end of a rollout',
+        )
+        return next(v for v in self.report_values()[since:] if v['state'] in ends)
+
+    def imagine_one(self, *, scene=None, **fields):
+        """Sends a scene and a trajectory; returns the report of how it ended."""
+        since = len(self.report_values())
+        if scene is None:
+            self.send_scene()
+        self.send_trajectory(**fields)
+        return self.next_end(since)
+
+
+def make_header(view, stamp_ns):
+    return Header(stamp=to_stamp(stamp_ns), frame_id=f'{view}_optical_frame')
+
+
+def make_pixels(view, size=SIZE):
+    """A picture of a red and a blue block on grey, different for each view."""
+    pixels = np.full((size[1], size[0], 3), 128, np.uint8)
+    shift = 5 if view == 'low' else 15
+    pixels[40:52, 20 + shift : 32 + shift] = (215, 40, 40)
+    pixels[40:52, 50 + shift : 62 + shift] = (40, 70, 215)
+    return pixels
+
+
+def make_image(view, stamp_ns, **changes):
+    message = to_image(make_pixels(view), make_header(view, stamp_ns))
+    for field, value in changes.items():
+        setattr(message, field, value)
+    return message
+
+
+def make_jpeg(view, stamp_ns):
+    return to_compressed(make_pixels(view), make_header(view, stamp_ns), 95)
+
+
+def make_info(view, stamp_ns=0, fx=90.0, size=SIZE):
+    return CameraInfo(
+        header=make_header(view, stamp_ns),
+        width=size[0],
+        height=size[1],
+        distortion_model='plumb_bob',
+        d=[0.0] * 5,
+        k=[fx, 0.0, 47.5, 0.0, 90.0, 35.5, 0.0, 0.0, 1.0],
+        r=[1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0],
+        p=[fx, 0.0, 47.5, 0.0, 0.0, 90.0, 35.5, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def make_joint_state(stamp_ns, names=JOINTS, positions=HOME):
+    return JointState(
+        header=Header(stamp=to_stamp(stamp_ns)), name=list(names), position=list(positions)
+    )
+
+
+def make_trajectory(*, stamp_ns=0, names=JOINTS, seconds=CHUNK_S, times=None, positions=None):
+    """The left arm turns by 0.2 rad in `seconds`."""
+    if times is None:
+        times = np.linspace(0, seconds, 5)[1:]
+    if positions is None:
+        positions = np.repeat(HOME[None, : len(names)], len(times), axis=0)
+        positions[:, 0] += np.linspace(0, 0.2, len(times))
+    message = JointTrajectory(header=Header(stamp=to_stamp(stamp_ns)), joint_names=list(names))
+    for time_s, row in zip(times, positions, strict=True):
+        point = JointTrajectoryPoint(positions=[float(x) for x in row])
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(
+            round(time_s * NANO), NANO
+        )
+        message.points.append(point)
+    return message
+
+
+class NodeProcess:
+    """The node as its own process."""
+
+    def __init__(self, command, log):
+        self._log = log.open('w+')
+        self.process = subprocess.Popen(
+            command, stdout=self._log, stderr=subprocess.STDOUT, env=ENVIRONMENT
+        )
+
+    def stop(self, number=signal.SIGTERM):
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        self.process.wait(timeout=20)
+        return self.process.returncode
+
+    def output(self):
+        self._log.seek(0)
+        return self._log.read()
+
+
+def start_node(folder, *parameters, script=FAKE, remaps=()):
+    """Starts the node with `name:=value` parameters and remappings."""
+    calibration = make_calibration(folder / 'calibration.yaml')
+    values = (
+        f'calibration_file:={calibration}',
+        'diagnostics_period_s:=0.2',
+        # this machine may be busy; tests of staleness set their own limits
+        'max_image_age_s:=10.0',
+        'max_joint_state_age_s:=10.0',
+        *parameters,
+    )
+    options = [part for value in values for part in ('-p', value)]
+    options += [part for rule in remaps for part in ('-r', rule)]
+    command = [sys.executable, str(script), '--ros-args', *options]
+    return NodeProcess(command, folder / 'node.log')
+
+
+INPUTS = {
+    **{f'/{view}/image_raw': Image for view in VIEWS},
+    **{f'/{view}/camera_info': CameraInfo for view in VIEWS},
+    '/joint_states': JointState,
+    '/joint_trajectory': JointTrajectory,
+}
+
+
+@pytest.fixture(scope='module')
+def client():
+    client = Client()
+    yield client
+    client.close()
+
+
+@pytest.fixture(scope='module')
+def ros():
+    """The names of this module, for tests (which cannot import it)."""
+    return sys.modules[__name__]
+
+
+COMPRESSED = CompressedImage
+IMAGE = Image
+INFO = CameraInfo
+STRING = String

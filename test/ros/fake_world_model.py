@@ -1,0 +1,65 @@
+"""A node whose world model only moves the picture: for tests of what is around the model.
+
+Some seeds make it misbehave: see `FakeWorldModel`. Frame k of a chunk carries its seed and k in
+its first pixel, so that a subscriber can tell frames apart.
+"""
+
+import sys
+
+import numpy as np
+
+from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.errors import ModelMemoryError, RolloutPreempted
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.ros.node import main
+from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
+from mtv_world_ros.success.segmenter import ColourSegmenter
+
+VIEWS = ('low', 'high')
+WIDTH, HEIGHT, FPS, NUM_FRAMES = 48, 36, 5.0, 4
+OUT_OF_MEMORY, BLOCKS, CRASHES = 1001, 1002, 1003
+
+
+class FakeWorldModel:
+    """Moves the start frame to the right by one pixel a frame."""
+
+    spec = WorldModelSpec(
+        views=VIEWS,
+        fps=FPS,
+        num_frames=NUM_FRAMES,
+        width=WIDTH,
+        height=HEIGHT,
+        robot='yam_bimanual',
+    )
+
+    def predict(self, start_frame, trajectory_frames, *, seed, num_inference_steps, should_stop):
+        assert trajectory_frames.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
+        if seed == OUT_OF_MEMORY:
+            raise ModelMemoryError('the device ran out of memory (fake)')
+        if seed == CRASHES:
+            raise RuntimeError('a fault of the fake model')
+        while seed == BLOCKS:
+            if should_stop():
+                raise RolloutPreempted('stopped')
+        frames = np.stack([np.roll(start_frame, k + 1, axis=2) for k in range(NUM_FRAMES)], axis=1)
+        frames[:, :, 0, 0, 0] = seed % 256
+        frames[:, :, 0, 0, 1] = np.arange(NUM_FRAMES)
+        return frames
+
+
+def load(settings):
+    return Pipeline(
+        robot=load_robot(robot_path('yam_bimanual')),
+        world_model=FakeWorldModel(),
+        segmenter=ColourSegmenter(),
+        estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
+        rendering=TrajectoryVideoConfig(),
+        objects=settings.objects,
+    )
+
+
+if __name__ == '__main__':
+    sys.exit(main(load=load))

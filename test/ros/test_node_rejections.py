@@ -1,0 +1,267 @@
+"""Everything that "can go wrong" is sent to the running node: refused, counted, and it goes on."""
+
+import numpy as np
+import pytest
+
+OUT_OF_MEMORY, CRASHES = 1001, 1003
+
+
+@pytest.fixture(scope='module')
+def node(tmp_path_factory, ros, client):
+    process = ros.start_node(tmp_path_factory.mktemp('node'), 'pace:=burst')
+    client.connect_inputs(ros.INPUTS)
+    yield process
+    code = process.stop()
+    assert code == 0, process.output()
+
+
+def rejections(client, reason):
+    return int(client.diagnostic_values().get(f'rejected.{reason}', 0))
+
+
+def expect_counted(client, reason, before):
+    """The count in /diagnostics goes up and the last rejection names the reason."""
+    client.wait(lambda: rejections(client, reason) > before, f'{reason} in /diagnostics')
+    assert client.diagnostic_values()['last_rejection'].startswith(f'{reason}: ')
+
+
+def expect_goes_on(client):
+    assert client.imagine_one()['state'] == 'done'
+
+
+def test_refuses_until_everything_was_received_and_says_what_is_missing(node, client, ros):
+    assert client.imagine_one(scene='none')['reason'] == 'image_missing'
+    client.send_scene(info_low=None, info_high=None, joints=None)
+    assert client.imagine_one(scene='none')['reason'] == 'camera_info_missing'
+    client.send_scene(joints=None)
+    assert client.imagine_one(scene='none')['reason'] == 'joint_state_missing'
+    partial = ros.make_joint_state(client.now_ns(), ros.JOINTS[:7], ros.HOME[:7])
+    client.send_scene(joints=partial)
+    ended = client.imagine_one(scene='none')
+    assert ended['reason'] == 'joint_state_missing'
+    assert 'right_joint1' in ended['text'] and 'left_joint1' not in ended['text']
+    expect_counted(client, 'joint_state_missing', 1)
+    expect_goes_on(client)
+
+
+HOME_ROWS = np.tile([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2, (4, 1))
+
+
+def changed(point, joint, value):
+    rows = HOME_ROWS.copy()
+    rows[point, joint] = value
+    return rows
+
+
+BAD_TRAJECTORIES = {
+    'missing joint': ('joint_names', 'right_gripper', lambda ros: {'names': ros.JOINTS[:-1]}),
+    'unknown joint': (
+        'joint_names',
+        "did you mean 'right_gripperr'",
+        lambda ros: {'names': (*ros.JOINTS[:-1], 'right_gripperr')},
+    ),
+    'joint named twice': (
+        'joint_names',
+        'more than once',
+        lambda ros: {'names': (*ros.JOINTS[:-1], 'left_joint1')},
+    ),
+    'nan': (
+        'trajectory_not_finite',
+        "'left_joint2' has positions nan at point 1",
+        lambda ros: {'positions': changed(1, 1, np.nan)},
+    ),
+    'infinite': (
+        'trajectory_not_finite',
+        'inf',
+        lambda ros: {'positions': changed(3, 0, np.inf)},
+    ),
+    'outside the limits': (
+        'joint_limits',
+        "'left_joint2' is -0.5",
+        lambda ros: {'positions': changed(2, 1, -0.5)},
+    ),
+    'times equal': (
+        'trajectory_times',
+        'not increasing at point 2',
+        lambda ros: {'times': (0.2, 0.4, 0.4, 0.8)},
+    ),
+    'times falling': (
+        'trajectory_times',
+        'not increasing at point 3',
+        lambda ros: {'times': (0.2, 0.4, 0.6, 0.5)},
+    ),
+    'no points': ('trajectory_empty', '0 points', lambda ros: {'times': (), 'positions': ()}),
+    'no joints': (
+        'trajectory_empty',
+        '0 joint names',
+        lambda ros: {'names': (), 'positions': np.zeros((4, 0))},
+    ),
+    'short point': (
+        'trajectory_malformed',
+        'point 0 has 13 positions for 14 joints',
+        lambda ros: {'positions': HOME_ROWS[:, :13]},
+    ),
+    'too long': (
+        'trajectory_too_long',
+        "'max_horizon_s' allows 60",
+        lambda ros: {'times': (1, 2, 3, 1000)},
+    ),
+}
+
+
+@pytest.mark.parametrize('case', BAD_TRAJECTORIES)
+def test_refuses_the_trajectory_and_imagines_the_next(node, client, ros, case):
+    reason, text, fields = BAD_TRAJECTORIES[case]
+    before = rejections(client, reason)
+    ended = client.imagine_one(**fields(ros))
+    assert (ended['state'], ended['reason']) == ('rejected', reason)
+    assert text in ended['text']
+    expect_counted(client, reason, before)
+    expect_goes_on(client)
+
+
+def test_refuses_a_trajectory_stamped_long_before_its_observation(node, client):
+    ended = client.imagine_one(stamp_ns=client.now_ns() - 3_000_000_000)
+    assert ended['reason'] == 'trajectory_stale'
+    assert "'max_trajectory_age_s' allows 1 s" in ended['text']
+    expect_goes_on(client)
+
+
+def test_refuses_a_trajectory_from_another_clock(node, client):
+    ended = client.imagine_one(stamp_ns=client.now_ns() + 10**15)
+    assert ended['reason'] == 'trajectory_too_long'
+    assert 'same clock' in ended['text']
+    expect_goes_on(client)
+
+
+BAD_IMAGES = {
+    'encoding': ('image_encoding', {'encoding': 'yuv422'}),
+    'depth': ('image_encoding', {'encoding': '16UC1'}),
+    'step too small': ('image_data', {'step': 3 * 96 - 1}),
+    'step of another image': ('image_data', {'step': 4 * 96}),
+    'short data': ('image_data', {'data': bytes(100)}),
+    'no data': ('image_data', {'data': b''}),
+    'no pixels': ('image_data', {'width': 0, 'height': 0, 'step': 0, 'data': b''}),
+}
+
+
+@pytest.mark.parametrize('case', BAD_IMAGES)
+def test_refuses_the_image_and_keeps_the_one_before(node, client, ros, case):
+    reason, fields = BAD_IMAGES[case]
+    before = rejections(client, reason)
+    client.send_scene()
+    client.publish('/low/image_raw', ros.make_image('low', client.now_ns(), **fields))
+    expect_counted(client, reason, before)
+    expect_goes_on(client)
+
+
+def test_refuses_images_of_another_size_than_their_camera_info(node, client, ros):
+    stamp_ns = client.now_ns()
+    pixels = ros.make_pixels('low')[::2, ::2]
+    small = ros.to_image(pixels, ros.make_header('low', stamp_ns))
+    client.send_scene(stamp_ns, image_low=small)
+    ended = client.imagine_one(scene='sent')
+    assert ended['reason'] == 'camera_info_invalid'
+    assert '48x36' in ended['text'] and '96x72' in ended['text']
+    expect_goes_on(client)
+
+
+def test_refuses_changed_camera_info_until_reset_or_restored(node, client, ros):
+    before = rejections(client, 'camera_info_changed')
+    client.send_scene(info_low=ros.make_info('low', fx=100.0))
+    ended = client.imagine_one(scene='sent')
+    assert ended['reason'] == 'camera_info_changed'
+    assert 'from [90' in ended['text'] and 'to [100' in ended['text']
+    expect_counted(client, 'camera_info_changed', before)
+    expect_goes_on(client)  # the first info came back
+
+    client.send_scene(info_low=ros.make_info('low', fx=100.0))
+    client.wait(lambda: rejections(client, 'camera_info_changed') >= before + 3, 'the change')
+    assert client.reset().success
+    client.send_scene(info_low=ros.make_info('low', fx=100.0))
+    assert client.imagine_one(scene='sent')['state'] == 'done'
+    client.send_scene()
+    assert client.imagine_one(scene='sent')['reason'] == 'camera_info_changed'
+    assert client.reset().success
+    expect_goes_on(client)
+
+
+def test_reset_refuses_camera_info_without_calibration(node, client, ros):
+    client.send_scene(info_low=ros.make_info('low', fx=0.0))
+    assert client.imagine_one(scene='sent')['reason'] == 'camera_info_changed'
+    answer = client.reset()
+    assert not answer.success
+    assert 'not calibrated' in answer.message
+    expect_goes_on(client)
+
+
+def test_refuses_stale_images(node, client):
+    assert client.set(max_image_age_s=0.02) == ''
+    client.send_scene(client.now_ns() - 200_000_000)
+    ended = client.imagine_one(scene='sent')
+    assert client.set(max_image_age_s=10.0) == ''
+    assert ended['reason'] == 'image_stale'
+    assert "'max_image_age_s' allows 0.02 s" in ended['text']
+    expect_goes_on(client)
+
+
+def test_refuses_images_from_the_future(node, client):
+    client.send_scene(client.now_ns() + 20_000_000_000)
+    ended = client.imagine_one(scene='sent')
+    assert ended['reason'] == 'image_stale'
+    assert 'in the future' in ended['text']
+    expect_goes_on(client)
+
+
+def test_refuses_stale_joint_states(node, client):
+    assert client.set(max_joint_state_age_s=0.02) == ''
+    client.send_scene(joints=None)
+    ended = client.imagine_one(scene='sent')
+    assert client.set(max_joint_state_age_s=10.0) == ''
+    assert ended['reason'] == 'joint_state_stale'
+    expect_goes_on(client)
+
+
+@pytest.mark.parametrize(
+    'positions', [(float('nan'),) * 14, (0.0,) * 13, ()], ids=['nan', 'too few', 'none']
+)
+def test_refuses_joint_states_that_are_not_a_position_a_joint(node, client, ros, positions):
+    before = rejections(client, 'joint_state_invalid')
+    client.send_scene()
+    client.publish('/joint_states', ros.make_joint_state(client.now_ns(), positions=positions))
+    expect_counted(client, 'joint_state_invalid', before)
+    expect_goes_on(client)
+
+
+def test_refuses_views_that_are_out_of_sync(node, client, ros):
+    assert client.set(max_view_skew_s=0.001) == ''
+    stamp_ns = client.now_ns()
+    for offset_ns in (-4_000_000, -2_000_000, 0):
+        client.publish('/low/image_raw', ros.make_image('low', stamp_ns + offset_ns))
+    client.send_scene(
+        stamp_ns, image_low=None, image_high=ros.make_image('high', stamp_ns - 100_000_000)
+    )
+    ended = client.imagine_one(scene='sent')
+    assert client.set(max_view_skew_s=0.05) == ''
+    assert ended['reason'] == 'views_out_of_sync'
+    assert "'max_view_skew_s' allows 0.001 s" in ended['text']
+    expect_goes_on(client)
+
+
+def test_drops_the_rollout_when_the_model_runs_out_of_memory(node, client):
+    before = rejections(client, 'out_of_memory')
+    assert client.set(seed=OUT_OF_MEMORY) == ''
+    ended = client.imagine_one()
+    assert client.set(seed=0) == ''
+    assert (ended['state'], ended['reason']) == ('failed', 'out_of_memory')
+    expect_counted(client, 'out_of_memory', before)
+    expect_goes_on(client)
+
+
+def test_outlives_whatever_the_model_raises(node, client):
+    assert client.set(seed=CRASHES) == ''
+    ended = client.imagine_one()
+    assert client.set(seed=0) == ''
+    assert (ended['state'], ended['reason']) == ('failed', 'internal_error')
+    assert ended['text'] == 'RuntimeError: a fault of the fake model'
+    expect_goes_on(client)
