@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import yaml
 
-from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, nearest
-from mtv_world_ros.geometry.transforms import pose
+from mtv_world_ros.geometry.transforms import is_rigid, pose
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
          'T_mount_camera', 'position', 'quaternion_xyzw')  # fmt: skip
+_REQUIRED = ('width', 'height', 'K', 'mount_link')
 
 
-def load_calibration(path: Path) -> dict[str, CameraModel]:
+def load_calibration(path: Path | str) -> dict[str, CameraModel]:
     """Reads `views: {<view>: {...}}`.
 
     Each view has `width`, `height`, `K` (3 x 3 or fx, fy, cx, cy), optional
@@ -33,47 +34,17 @@ def load_calibration(path: Path) -> dict[str, CameraModel]:
             f"calibration file '{path}' does not exist; set 'calibration_file' to one"
         )
     try:
-        values = yaml.safe_load(path.read_text())
+        values = yaml.safe_load(path.read_text(encoding='utf-8'))
     except yaml.YAMLError as error:
         raise CalibrationError(f"'{path}' is not valid YAML: {error}") from error
-    if not isinstance(values, dict) or not isinstance(values.get('views'), dict):
-        raise CalibrationError(f"'{path}' must hold 'views: {{<view>: {{...}}}}'")
-    return {view: _camera(view, row, f"'{path}' view '{view}'") for view, row in
-            values['views'].items()}  # fmt: skip
+    views = values.get('views') if isinstance(values, dict) else None
+    if not isinstance(views, dict) or list(values) != ['views']:
+        raise CalibrationError(f"'{path}' must hold 'views: {{<view>: {{...}}}}' and nothing else")
+    return {str(view): _camera(str(view), row, f"'{path}' view '{view}'")
+            for view, row in views.items()}  # fmt: skip
 
 
-def _camera(view: str, row: Any, where: str) -> CameraModel:
-    if not isinstance(row, Mapping):
-        raise CalibrationError(f'{where}: expected keys and values, got {row!r}')
-    for key in row:
-        if key not in _KEYS:
-            raise CalibrationError(f"{where}: unknown key '{key}'{nearest(str(key), _KEYS)}")
-    for key in ('width', 'height', 'K', 'mount_link'):
-        if key not in row:
-            raise CalibrationError(f"{where}: key '{key}' is missing")
-    if 'T_mount_camera' in row:
-        T = np.asarray(row['T_mount_camera'], dtype=float)
-    elif 'position' in row and 'quaternion_xyzw' in row:
-        T = pose(row['position'], row['quaternion_xyzw'])
-    else:
-        raise CalibrationError(f"{where}: give 'T_mount_camera', or 'position' and "
-                               "'quaternion_xyzw'")  # fmt: skip
-    K = np.asarray(row['K'], dtype=float)
-    if K.shape == (4,):
-        K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
-    return CameraModel(
-        view=view,
-        width=int(row['width']),
-        height=int(row['height']),
-        K=K,
-        distortion_model=row.get('distortion_model', 'none'),
-        distortion=np.asarray(row.get('distortion', ()), dtype=float),
-        mount_link=row['mount_link'],
-        T_mount_camera=T,
-    )
-
-
-def save_calibration(path: Path, cameras: Mapping[str, CameraModel]) -> None:
+def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> None:
     """Writes cameras so that `load_calibration` gives them back to the last bit."""
     views = {
         view: {
@@ -87,4 +58,62 @@ def save_calibration(path: Path, cameras: Mapping[str, CameraModel]) -> None:
         }
         for view, camera in cameras.items()
     }
-    Path(path).write_text(yaml.safe_dump({'views': views}, sort_keys=False))
+    path = Path(path)
+    beside = path.with_name(f'.{path.name}.part')
+    beside.write_text(
+        yaml.safe_dump({'views': views}, sort_keys=False, default_flow_style=None),
+        encoding='utf-8',
+    )
+    beside.replace(path)
+
+
+def _camera(view: str, row: Any, where: str) -> CameraModel:
+    _check_keys(row, where)
+    try:
+        return CameraModel(
+            view=view,
+            width=int(row['width']),
+            height=int(row['height']),
+            K=_intrinsics(row['K']),
+            distortion_model=str(row.get('distortion_model', 'none')),
+            distortion=np.array(row.get('distortion', ()), dtype=float),
+            mount_link=str(row['mount_link']),
+            T_mount_camera=_pose(row),
+        )
+    except (ValueError, TypeError, CalibrationError) as error:
+        raise CalibrationError(f'{where}: {error}') from error
+
+
+def _check_keys(row: Any, where: str) -> None:
+    if not isinstance(row, Mapping):
+        raise CalibrationError(f'{where}: expected keys and values, got {row!r}')
+    for key in row:
+        if key not in _KEYS:
+            raise CalibrationError(f"{where}: unknown key '{key}'{nearest(str(key), _KEYS)}")
+    for key in _REQUIRED:
+        if key not in row:
+            raise CalibrationError(f"{where}: key '{key}' is missing")
+
+
+def _intrinsics(value: Any) -> FloatArray:
+    K = np.array(value, dtype=float)
+    if K.shape == (4,):
+        return np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
+    if K.shape != (3, 3):
+        raise ValueError(f'K is {value!r}, must be 3 x 3 or fx, fy, cx, cy [px]')
+    return K
+
+
+def _pose(row: Mapping[str, Any]) -> FloatArray:
+    given = {'T_mount_camera', 'position', 'quaternion_xyzw'} & set(row)
+    if given == {'position', 'quaternion_xyzw'}:
+        return pose(row['position'], row['quaternion_xyzw'])
+    if given != {'T_mount_camera'}:
+        raise ValueError("give either 'T_mount_camera', or 'position' and 'quaternion_xyzw'")
+    T = np.array(row['T_mount_camera'], dtype=float)
+    if T.shape != (4, 4) or not is_rigid(T):
+        raise ValueError(
+            f'T_mount_camera is {row["T_mount_camera"]!r}, must be a rigid pose: 4 x 4, its 3 x 3 '
+            'part a rotation, its last row 0 0 0 1'
+        )
+    return T
