@@ -2,6 +2,13 @@
 .DEFAULT_GOAL := install
 .PHONY: install demo test lint format clean distclean
 
+# .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
+# in its place.
+ifdef AMENT_PREFIX_PATH
+unexport LD_LIBRARY_PATH
+endif
+unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
 BIN := .venv/bin
 STAMP := .venv/.installed
 

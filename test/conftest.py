@@ -27,7 +27,9 @@ def _no_weights() -> str:
 
 
 def _no_native_ros() -> str:
-    return '' if shutil.which('ros2') else 'no `ros2` command: no native ROS 2 is sourced'
+    if shutil.which('ros2') and find_spec('launch_ros') is not None:
+        return ''
+    return 'no `ros2` command with launch_ros: no native ROS 2 is sourced'
 
 
 #: marker -> why its tests cannot run here; an empty text where they can
