@@ -8,6 +8,9 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
 
+#: a first point this early stands for the start itself [s]
+_NOW = 1e-9
+
 
 def match_joints(
     trajectory: JointTrajectory,
@@ -25,9 +28,15 @@ def match_joints(
         allow_missing: whether missing joints are filled instead of refused.
 
     Raises:
-        TrajectoryError: joints named twice or missing.
+        TrajectoryError: joints named twice or missing, velocities that are not finite.
     """
     given = trajectory.joint_names
+    if trajectory.velocities is not None and not np.isfinite(trajectory.velocities).all():
+        point, joint = np.argwhere(~np.isfinite(trajectory.velocities))[0]
+        raise TrajectoryError(
+            f"the velocity of joint '{given[joint]}' is not finite at point {point}; give numbers "
+            'or leave all velocities out'
+        )
     doubled = sorted({name for name in given if given.count(name) > 1})
     if doubled:
         raise TrajectoryError(f'joints {doubled} are named more than once')
@@ -65,28 +74,27 @@ def _pick(
 def resample(
     trajectory: JointTrajectory, start_positions: FloatArray, times: FloatArray
 ) -> FloatArray:
-    """Returns (len(times), J) positions at the wanted times.
+    """Returns (N, J) positions at the wanted times.
 
     Cubic Hermite between points where velocities are given, else linear. Before the first point
-    it runs linearly from the start positions at time 0; after the last point it holds.
+    it starts from the start positions at time 0; after the last point it holds. A point at time
+    0 or before counts instead of the start positions.
 
     Args:
         trajectory: joints in the order of `start_positions`.
         start_positions: (J,) positions at time 0.
-        times: (N,) wanted times [s], from 0 on.
+        times: (N,) wanted times [s]; before 0 as at 0.
     """
-    if trajectory.times[0] > 1e-9:
-        knots = np.concatenate([[0.0], trajectory.times])
-        values = np.concatenate([start_positions[None], trajectory.positions])
-        slopes = trajectory.velocities
+    knots, values, slopes = trajectory.times, trajectory.positions, trajectory.velocities
+    if knots[0] > _NOW:
+        knots = np.concatenate([[0.0], knots])
+        values = np.concatenate([start_positions[None], values])
         if slopes is not None:
-            lead = (values[1] - values[0]) / knots[1]
-            slopes = np.concatenate([lead[None], slopes])
-    else:
-        knots, values, slopes = trajectory.times, trajectory.positions, trajectory.velocities
-    wanted = np.clip(times, knots[0], knots[-1])
+            # the speed at the start is not known: the mean one up to the first point
+            slopes = np.concatenate([(values[1:2] - values[:1]) / knots[1], slopes])
     if len(knots) == 1:
-        return np.repeat(values, len(wanted), axis=0)
+        return np.repeat(values, len(times), axis=0)
+    wanted = np.clip(times, max(knots[0], 0.0), knots[-1])
     right = np.clip(np.searchsorted(knots, wanted, side='right'), 1, len(knots) - 1)
     left = right - 1
     width = (knots[right] - knots[left])[:, None]
@@ -94,8 +102,7 @@ def resample(
     if slopes is None:
         return (1 - s) * values[left] + s * values[right]
     return (
-        (2 * s**3 - 3 * s**2 + 1) * values[left]
-        + (s**3 - 2 * s**2 + s) * width * slopes[left]
-        + (-2 * s**3 + 3 * s**2) * values[right]
-        + (s**3 - s**2) * width * slopes[right]
+        (1 + 2 * s) * (1 - s) ** 2 * values[left]
+        + s**2 * (3 - 2 * s) * values[right]
+        + s * (1 - s) * ((1 - s) * slopes[left] - s * slopes[right]) * width
     )
