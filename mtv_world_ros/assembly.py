@@ -11,7 +11,7 @@ from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.success.segmenter import ColourSegmenter, Segmenter
 
 BUNDLED = 'bundled'
 
@@ -91,9 +91,14 @@ def assemble(
     return Pipeline(
         robot=model,
         world_model=world_model,
-        segmenter=ColourSegmenter(),
+        segmenter=assemble_segmenter(),
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task),
         rendering=TrajectoryVideoConfig(**card['rendering']),
         object_mask=card['object_mask'],
         objects=objects,
     )
+
+
+def assemble_segmenter() -> Segmenter:
+    """The segmenter used where no weights of a larger one are at hand."""
+    return ColourSegmenter()

@@ -58,20 +58,21 @@ def _add_demo(commands: argparse._SubParsersAction) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.demo import run_demo
+    from mtv_world_ros.demo.run import run_demo
     from mtv_world_ros.resources import share_path
 
-    return run_demo(
+    text = run_demo(
         arguments.episode or share_path('resource', 'demo_episode'),
         arguments.out,
         checkpoint=arguments.checkpoint,
         robot=arguments.robot,
         device=arguments.device,
-        dtype=arguments.dtype,
         num_threads=arguments.threads,
         num_inference_steps=arguments.steps,
         seed=arguments.seed,
     )
+    print(text)
+    return 0
 
 
 def _add_replay(commands: argparse._SubParsersAction) -> None:
@@ -165,11 +166,10 @@ def _train(arguments: argparse.Namespace) -> int:
     import torch
     import yaml
 
-    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.assembly import assemble_segmenter, robot_path
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
-    from mtv_world_ros.success.segmenter import ColourSegmenter
     from mtv_world_ros.training.config import load_training_config
     from mtv_world_ros.training.run import train
 
@@ -186,7 +186,7 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.dataset,
         arguments.out,
         robot=load_robot(robot_path(config.video.robot)),
-        segmenter=ColourSegmenter(),
+        segmenter=assemble_segmenter(),
         seed=arguments.seed,
         device=arguments.device,
         dtype=choose_dtype(arguments.dtype, arguments.device),

@@ -14,27 +14,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 import torch
 
-from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.card import CARD, check_card, read_card
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 
-CARD = 'world_model.json'
 WEIGHTS = 'diffusion_pytorch_model.safetensors'
 PARTS = ('transformer', 'autoencoder', 'scheduler')
-_CARD_KEYS = {
-    'views': list,
-    'fps': (int, float),
-    'num_frames': int,
-    'width': int,
-    'height': int,
-    'robot': str,
-    'control': str,
-    'object_mask': bool,
-    'rendering': dict,
-    'trained_on': dict,
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +49,7 @@ def save_checkpoint(
     partial = folder.with_name(folder.name + '.partial')
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    _check_card(checkpoint.card, partial)
+    check_card(checkpoint.card, partial)
     stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
     stored.save_pretrained(partial / 'transformer', safe_serialization=True)
     checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
@@ -102,49 +89,6 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
         scheduler=scheduler,
         card=card,
     )
-
-
-def read_card(folder: Path) -> dict[str, Any]:
-    """Returns the checked contents of `world_model.json`.
-
-    Raises:
-        CheckpointError: missing, not JSON, or with missing, unknown or ill-typed keys.
-    """
-    path = Path(folder) / CARD
-    if not path.is_file():
-        raise CheckpointError(
-            f"'{folder}' is not a checkpoint: it has no {CARD}; train one with 'mtv-world train' "
-            "or set 'checkpoint' to a folder that has it"
-        )
-    try:
-        card = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
-    _check_card(card, path)
-    return card
-
-
-def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
-    """Returns what a card says of the model's input and output."""
-    return WorldModelSpec(
-        views=tuple(card['views']),
-        fps=float(card['fps']),
-        num_frames=card['num_frames'],
-        width=card['width'],
-        height=card['height'],
-        robot=card['robot'],
-    )
-
-
-def _check_card(card: Mapping[str, Any], path: Path) -> None:
-    for key in card:
-        if key not in _CARD_KEYS:
-            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, _CARD_KEYS)}")
-    for key, kind in _CARD_KEYS.items():
-        if key not in card:
-            raise CheckpointError(f"'{path}': key '{key}' is missing")
-        if not isinstance(card[key], kind):
-            raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
 
 
 def _load_part(kind: Any, folder: Path, dtype: torch.dtype) -> Any:

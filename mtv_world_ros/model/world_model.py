@@ -9,7 +9,8 @@ import torch
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ModelMemoryError
-from mtv_world_ros.model.checkpoint import Checkpoint, spec_of
+from mtv_world_ros.model.card import spec_of
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents

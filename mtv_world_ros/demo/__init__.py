@@ -1,0 +1,1 @@
+"""The demo: an episode through the real node over the middleware, scored and shown."""

@@ -1,0 +1,208 @@
+"""Runs the demo and writes its table, pictures and report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.demo.predictions import Predictions, read_predictions, RecordedChunk
+from mtv_world_ros.demo.processes import DemoOptions, record_through_node
+from mtv_world_ros.evaluation.report import (
+    Comparison,
+    contact_sheet,
+    side_by_side,
+    write_png,
+    write_video,
+)
+from mtv_world_ros.evaluation.rollouts import Stretch
+from mtv_world_ros.evaluation.scores import score_frames, score_rows, ScoreRow, true_masks
+from mtv_world_ros.evaluation.statistics import episode_means
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card, spec_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scored:
+    """Chunks beside the recording.
+
+    Attributes:
+        comparison: frames that are both recorded and imagined.
+        rows: their J.
+    """
+
+    comparison: Comparison
+    rows: tuple[ScoreRow, ...]
+
+
+def run_demo(
+    episode: Path,
+    out: Path,
+    *,
+    checkpoint: str,
+    robot: str | None,
+    device: str,
+    num_threads: int,
+    num_inference_steps: int,
+    seed: int,
+) -> str:
+    """Replays an episode through the node and returns the printed table.
+
+    Writes `contact_sheet.png`, `comparison.mp4`, `predictions/` and `report.json` into `out`.
+
+    Raises:
+        EpisodeError: the episode cannot be used or a process failed.
+    """
+    card = read_card(checkpoint_path(checkpoint))
+    spec = spec_of(card)
+    recording = load_recording(episode, spec, load_robot(robot_path(robot or card['robot'])))
+    options = DemoOptions(
+        checkpoint=checkpoint,
+        calibration=episode / 'calibration.yaml',
+        robot=robot,
+        device=device,
+        num_threads=num_threads,
+        num_inference_steps=num_inference_steps,
+        seed=seed,
+    )
+    record_through_node(episode, spec.views, out, options)
+    predictions = read_predictions(out / 'predictions', spec.views)
+    scored = _score(recording, predictions.chunks, spec.views)
+    report = _report(recording, predictions, scored, spec.views)
+    (out / 'report.json').write_text(json.dumps(report, indent=2) + '\n')
+    text = _table(report, spec.views)
+    sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=text.split('\n'))
+    write_png(out / 'contact_sheet.png', sheet)
+    write_video(out / 'comparison.mp4', side_by_side(scored.comparison), spec.fps)
+    return f'{text}\n\nwritten to {out}: contact_sheet.png comparison.mp4 predictions/ report.json'
+
+
+def _score(
+    recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
+) -> Scored:
+    segmenter = assemble_segmenter()
+    rows: list[ScoreRow] = []
+    shown: list[tuple[np.ndarray, ...]] = []
+    for index, chunk in enumerate(chunks):
+        start_ns = int(chunk.report['observation_stamp_ns'])
+        indices = _frames_at(recording, np.concatenate([[start_ns], chunk.stamps_ns]))
+        kept = len(indices) - 1
+        if kept < 1:
+            continue
+        ids = recording.object_ids
+        stretch = Stretch(
+            index=index,
+            start=int(indices[0]),
+            frames=recording.frames[:, indices],
+            object_ids=None if ids is None else ids[:, indices],
+        )
+        truth = true_masks(stretch, segmenter, recording.objects, recording.objects, use_ids=False)
+        predicted = chunk.predicted[:, :kept]
+        scores = score_frames(predicted, truth, segmenter)
+        rows += score_rows(stretch, views, truth, scores, None, None)
+        times = (chunk.stamps_ns[:kept] - recording.stamp_ns) * 1e-9
+        shown.append((times, stretch.frames[:, 1:], chunk.trajectory[:, :kept], predicted))
+    times, real, trajectory, imagined = (
+        np.concatenate(column, axis=min(part, 1))
+        for part, column in enumerate(zip(*shown, strict=True))
+    )
+    comparison = Comparison(
+        views=views, times=times, real=real, trajectory=trajectory, imagined=imagined
+    )
+    return Scored(comparison=comparison, rows=tuple(rows))
+
+
+def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
+    """Recorded frames at the stamps, up to the recording's end."""
+    seconds = (stamps_ns - recording.stamp_ns) * 1e-9
+    inside = seconds <= recording.times[-1] + 0.05
+    return np.abs(recording.times[None] - seconds[inside, None]).argmin(axis=1)
+
+
+def _report(
+    recording: Recording, predictions: Predictions, scored: Scored, views: tuple[str, ...]
+) -> dict[str, Any]:
+    reports = [chunk.report for chunk in predictions.chunks]
+    published = sum(int(report['frames_published']) for report in reports) * len(views)
+    keys = {'j_object_mean': 'j_object_mean', 'j_moving': 'j_moving',
+            'j_copy_moving': 'j_copy_moving', 'j_copy_mean': 'j_copy_mean'}  # fmt: skip
+    means = {view: episode_means(scored.rows, view) for view in views}
+    judged = _whole_chunks(recording, predictions.chunks)
+    success = float(judged[-1].report['success'])
+    return {
+        'episode': recording.path.name,
+        'instruction': recording.instruction,
+        'outcome': recording.outcome,
+        'chunks': len(reports),
+        'frames_published': published,
+        'frames_received': predictions.num_frames,
+        'camera_infos_received': predictions.num_infos,
+        'latency_s': [float(report['latency_s']) for report in reports],
+        'real_time_factor': float(np.median([float(r['real_time_factor']) for r in reports])),
+        'success': _known(success),
+        'success_reasons': judged[-1].report['success_reasons'],
+        'views': {
+            view: {key: _known(means[view][name]) for key, name in keys.items()} for view in views
+        },
+        'objects': [
+            {
+                'view': row.view,
+                'object': row.name,
+                'chunk': row.stretch,
+                'moving': row.moving,
+                'status': row.status,
+                'j': _known(row.j),
+                'j_copy': _known(row.j_copy),
+            }
+            for row in scored.rows
+            if row.name
+        ],
+    }
+
+
+def _whole_chunks(
+    recording: Recording, chunks: Sequence[RecordedChunk]
+) -> Sequence[RecordedChunk]:
+    """Chunks that start before the recording ends."""
+    end_ns = recording.stamp_ns + round(float(recording.times[-1]) * 1e9)
+    return [c for c in chunks if int(c.report['observation_stamp_ns']) < end_ns] or chunks
+
+
+def _known(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
+def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
+    lines = [f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"J copy":>6}']
+    for row in report['objects']:
+        lines.append(
+            f'{row["view"]:8} {row["object"]:16} {row["chunk"]:5d} '
+            f'{"yes" if row["moving"] else "no":>5} {_number(row["j"])} {_number(row["j_copy"])}'
+            f'{"" if row["status"] == "ok" else "  " + row["status"]}'
+        )
+    for view in views:
+        means = report['views'][view]
+        lines.append(
+            f'{view:8} moving objects: J {_number(means["j_moving"])}, first frame held '
+            f'{_number(means["j_copy_moving"])}; all objects: J {_number(means["j_object_mean"])}'
+        )
+    success = report['success']
+    told = 'abstains' if success is None else f'{success:.2f}'
+    lines.append(f'success estimate: {told} (recorded outcome: {report["outcome"]})')
+    latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
+    lines.append(
+        f'{report["chunks"]} chunks, {report["frames_received"]} of '
+        f'{report["frames_published"]} frames received; latency {latencies} s; '
+        f'real-time factor {report["real_time_factor"]:.1f}'
+    )
+    return '\n'.join(lines)
+
+
+def _number(value: float | None) -> str:
+    return '     -' if value is None else f'{value:6.3f}'

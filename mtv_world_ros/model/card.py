@@ -1,0 +1,73 @@
+"""`world_model.json`: what a checkpoint takes, gives and was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import json
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.errors import CheckpointError, nearest
+
+CARD = 'world_model.json'
+_CARD_KEYS = {
+    'views': list,
+    'fps': (int, float),
+    'num_frames': int,
+    'width': int,
+    'height': int,
+    'robot': str,
+    'control': str,
+    'object_mask': bool,
+    'rendering': dict,
+    'trained_on': dict,
+}
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """Returns the checked contents of `world_model.json`.
+
+    Raises:
+        CheckpointError: missing, not JSON, or with missing, unknown or ill-typed keys.
+    """
+    path = Path(folder) / CARD
+    if not path.is_file():
+        raise CheckpointError(
+            f"'{folder}' is not a checkpoint: it has no {CARD}; train one with 'mtv-world train' "
+            "or set 'checkpoint' to a folder that has it"
+        )
+    try:
+        card = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
+    check_card(card, path)
+    return card
+
+
+def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
+    """Returns what a card says of the model's input and output."""
+    return WorldModelSpec(
+        views=tuple(card['views']),
+        fps=float(card['fps']),
+        num_frames=card['num_frames'],
+        width=card['width'],
+        height=card['height'],
+        robot=card['robot'],
+    )
+
+
+def check_card(card: Mapping[str, Any], path: Path) -> None:
+    """Checks the keys and types of a card; `path` is for the message.
+
+    Raises:
+        CheckpointError: missing, unknown or ill-typed keys.
+    """
+    for key in card:
+        if key not in _CARD_KEYS:
+            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, _CARD_KEYS)}")
+    for key, kind in _CARD_KEYS.items():
+        if key not in card:
+            raise CheckpointError(f"'{path}': key '{key}' is missing")
+        if not isinstance(card[key], kind):
+            raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
