@@ -176,17 +176,17 @@ class _Run:
         settings = {**self.settings, 'path': str(path), 'donor': str(donor)}
         try:
             stored = json.loads(file.read_text(encoding='utf-8'))
-            if self.name and stored['settings'] == json.loads(json.dumps(settings)):
+            if self.name and stored['settings'] == tables.plain(settings):
                 return EpisodeResult.from_json(stored['result'])
         except (OSError, ValueError, KeyError, TypeError):
             pass  # not there, or of other settings or another version: score it again
-        result = self._score(path, donor)
-        tables.write_json(file, {'settings': settings, 'result': result.as_json()})
-        return result
+        result = tables.plain(self._score(path, donor).as_json())
+        tables.write_json(file, {'settings': settings, 'result': result})
+        return EpisodeResult.from_json(result)
 
     def _score(self, path: Path, donor: Path | None) -> EpisodeResult:
         recording = self._load(path)
-        actions = None if donor is None or not self.config.shuffle else self._load(donor)
+        actions = self._actions(donor)
         rows: list[ScoreRow] = []
         chunks: list[Prediction] = []
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
@@ -203,6 +203,15 @@ class _Run:
             seconds_per_chunk=float(np.mean(seconds)),
             has_ids=recording.object_ids is not None,
         )
+
+    def _actions(self, donor: Path | None) -> Recording | None:
+        """The episode that lends its actions; None if there is none that can be read."""
+        if donor is None or not self.config.shuffle:
+            return None
+        try:
+            return self._load(donor)
+        except MtvWorldError:  # listed with its reason when its own turn comes
+            return None
 
     def _imagine(
         self, recording: Recording, stretch: Stretch, actions: Recording

@@ -36,14 +36,15 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Writes a JSON file; NaN becomes null."""
-    write_text(path, json.dumps(_plain(values), indent=1, allow_nan=False) + '\n')
+    write_text(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Returns what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value

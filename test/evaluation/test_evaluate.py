@@ -1,0 +1,152 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.evaluation.evaluate import evaluate
+
+
+def run(pipeline, episodes, out, **options):
+    table = evaluate(pipeline, episodes, out, show_progress=False, num_resamples=200, **options)
+    return json.loads((out / 'metrics.json').read_text()), table
+
+
+@pytest.mark.parametrize('mode', ['observe', 'imagine'])
+def test_persistence_model_scores_exactly_the_persistence_baseline(
+    make_pipeline, episodes, tmp_path, mode
+):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path, mode=mode)
+    assert metrics['num_episodes'] == 3 and set(metrics['views']) == {'low', 'high'}
+    for view in metrics['views'].values():
+        assert view['j_moving'] == view['j_copy_moving'] == view['j_shuffled_moving'] < 0.8
+        assert view['j_object_mean'] == view['j_copy_mean']
+        assert view['skill'] == view['margin_moving'] == 0.0
+
+
+def test_recorded_frames_score_the_ceiling(make_pipeline, episodes, oracle, tmp_path):
+    metrics, _ = run(make_pipeline(oracle), episodes, tmp_path, reconstruct=lambda frames: frames)
+    for view in metrics['views'].values():
+        assert view['j_object_mean'] == view['j_union'] == view['j_moving'] == 1.0
+        assert view['j_ceiling'] == 1.0 and view['skill'] == 1.0
+        assert view['intervals']['margin_moving'][0] > 0.2
+
+
+def test_score_collapses_when_actions_are_shuffled(make_pipeline, episodes, oracle, tmp_path):
+    metrics, _ = run(make_pipeline(oracle), episodes, tmp_path)
+    for view in metrics['views'].values():
+        assert view['j_shuffled_moving'] == view['j_copy_moving']
+        assert view['margin_over_shuffled'] > 0.2
+
+
+def test_blur_costs_some_but_not_all(make_pipeline, episodes, blurred_oracle, tmp_path):
+    metrics, _ = run(make_pipeline(blurred_oracle), episodes, tmp_path)
+    assert 0.8 < metrics['overall']['j_moving'] < 1.0
+
+
+def test_what_is_not_measured_is_null(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path, shuffle=False)
+    low = metrics['views']['low']
+    assert low['fid'] is None and low['fvd'] is None
+    assert low['j_ceiling'] is None and low['j_shuffled_moving'] is None
+    assert low['intervals']['j_shuffled_moving'] == [None, None]
+
+
+def test_scores_against_true_masks_need_no_perfect_segmenter(
+    make_pipeline, episodes, blurred_oracle, tmp_path
+):
+    metrics, _ = run(make_pipeline(blurred_oracle), episodes, tmp_path, use_ids=True)
+    assert 0.7 < metrics['overall']['j_object_mean'] < 1.0
+    assert "simulator's" in metrics['moving_rule']
+
+
+def test_files_hold_every_row(make_pipeline, episodes, tmp_path):
+    metrics, table = run(make_pipeline(), episodes, tmp_path)
+    rows = list(csv.DictReader((tmp_path / 'rows.csv').open()))
+    objects = [row for row in rows if row['name'] != '(union)']
+    assert len(objects) == metrics['overall']['num_rows'] == 3 * 2 * 2 * 2
+    assert {row['moving'] for row in objects if row['name'] == 'blue block'} == {'False'}
+    assert {row['moving'] for row in objects if row['name'] == 'red block'} == {'True'}
+    assert (tmp_path / 'tables.md').read_text() == table
+    assert '| low ' in table and 'place_block_a2b_left · high' in table
+
+
+def test_object_outside_the_palette_is_not_scored_and_says_so(
+    make_pipeline, make_episode, tmp_path
+):
+    path = make_episode(tmp_path / 'episode', objects=('red block', 'wooden spoon'))
+    metrics, _ = run(make_pipeline(), [path], tmp_path / 'out')
+    low = metrics['views']['low']
+    assert low['num_not_scored'] == 2
+    assert low['status']['true: out_of_palette'] == 2
+
+
+def test_object_that_the_model_loses_scores_0_and_says_so(make_pipeline, episodes, tmp_path):
+    class Eraser:
+        spec = make_pipeline().spec
+
+        def predict(self, start_frame, trajectory_frames, **_):
+            frames = np.repeat(start_frame[:, None], 4, axis=1)
+            frames[..., :] = 170
+            return frames
+
+    metrics, _ = run(make_pipeline(Eraser()), episodes, tmp_path)
+    low = metrics['views']['low']
+    assert low['j_object_mean'] == 0.0 and low['num_not_scored'] == 0
+    assert set(low['status']) == {'predicted: absent'}
+
+
+def test_finished_episodes_are_not_imagined_again(make_pipeline, episodes, oracle, tmp_path):
+    pipeline = make_pipeline(oracle)
+    first, _ = run(pipeline, episodes, tmp_path, name='oracle')
+    calls = oracle.num_calls
+    assert calls == 3 * 2 * 2
+    again, _ = run(pipeline, episodes, tmp_path, name='oracle')
+    assert oracle.num_calls == calls and again == first
+    run(pipeline, episodes, tmp_path, name='oracle', seed=1)
+    assert oracle.num_calls > calls
+
+
+def test_results_without_a_name_are_not_taken_over(make_pipeline, episodes, oracle, tmp_path):
+    pipeline = make_pipeline(oracle)
+    run(pipeline, episodes, tmp_path)
+    calls = oracle.num_calls
+    run(pipeline, episodes, tmp_path)
+    assert oracle.num_calls == 2 * calls
+
+
+def test_half_written_result_is_scored_again(make_pipeline, episodes, tmp_path):
+    run(make_pipeline(), episodes[:1], tmp_path, name='x')
+    file = tmp_path / 'episodes' / 'episode_0.json'
+    file.write_text(file.read_text()[:100])
+    metrics, _ = run(make_pipeline(), episodes[:1], tmp_path, name='x')
+    assert metrics['num_episodes'] == 1
+
+
+def test_unusable_episode_is_listed_with_its_reason(make_pipeline, episodes, tmp_path):
+    missing = tmp_path / 'nothing'
+    metrics, table = run(make_pipeline(), [*episodes[:1], missing], tmp_path / 'out')
+    assert metrics['num_episodes'] == 1 and metrics['num_episodes_failed'] == 1
+    assert str(missing) in metrics['failed'] and 'not scored' in table
+
+
+def test_no_usable_episode_is_an_error(make_pipeline, tmp_path):
+    with pytest.raises(EpisodeError, match='no episode could be scored'):
+        run(make_pipeline(), [tmp_path / 'nothing'], tmp_path / 'out')
+    with pytest.raises(EpisodeError, match='none was given'):
+        run(make_pipeline(), [], tmp_path / 'out')
+
+
+def test_unknown_mode_or_option_is_an_error(make_pipeline, episodes, tmp_path):
+    with pytest.raises(EpisodeError, match='mode'):
+        run(make_pipeline(), episodes[:1], tmp_path, mode='observed')
+    with pytest.raises(ConfigError, match='sed'):
+        run(make_pipeline(), episodes[:1], tmp_path, sed=1)
+
+
+def test_success_estimates_are_compared_with_the_outcome(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path)
+    assert metrics['success']['num_outcomes_known'] == 3
+    assert metrics['success']['real_success_rate'] == pytest.approx(2 / 3)
+    assert metrics['seconds_per_chunk'] > 0
