@@ -11,6 +11,7 @@ import zlib
 
 import lz4.frame
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 import yaml
@@ -176,6 +177,8 @@ class BagReader:
         self, opcode: int, body: bytes, topics: Collection[str] | None
     ) -> Iterator[BagMessage]:
         if opcode == Opcode.MESSAGE:
+            if len(body) < _MESSAGE.size:
+                raise _Cut(f'a message of {len(body)} bytes')
             number, _, log_time, _ = _MESSAGE.unpack_from(body)
             channel = self._channels.get(number)
             if channel is None:
@@ -184,7 +187,12 @@ class BagReader:
                 msgtype = self._schemas[channel.schema_id].name
                 yield BagMessage(channel.topic, msgtype, log_time, body[_MESSAGE.size :])
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-            self._declare(opcode, ReadDataStream(io.BytesIO(body)))
+            try:
+                self._declare(opcode, ReadDataStream(io.BytesIO(body)))
+            except (McapError, UnicodeDecodeError, struct.error) as error:
+                if opcode != Opcode.METADATA:
+                    raise _Cut(f'a damaged declaration ({error!r})') from error
+                self._problem(f"'{self.path}' has a damaged metadata record ({error!r})")
 
     def _declare(self, opcode: int, stream: ReadDataStream) -> None:
         if opcode == Opcode.SCHEMA:

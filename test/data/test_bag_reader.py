@@ -226,3 +226,28 @@ def test_an_unknown_compression_is_named(tmp_path) -> None:
     path.write_bytes(path.read_bytes().replace(b'\x04\0\0\0zstd', b'\x04\0\0\0zmtv'))
     with pytest.raises(EpisodeError, match="compressed with 'zmtv'; known are zstd and lz4"):
         list(iter_messages(path))
+
+
+@pytest.mark.parametrize(
+    ('damaged', 'expected'),
+    [
+        (b'\x06\0\0\0/noise', 'damaged declaration'),
+        (b'\x04\0\0\0note', 'damaged metadata record'),
+    ],
+)
+def test_damaged_declarations_and_metadata_are_mentioned(damaged, expected, tmp_path) -> None:
+    path = tmp_path / 'a.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start(profile='ros2')
+        writer.add_metadata('note', {'key': 'text'})
+        schema = writer.register_schema(TYPE, 'ros2msg', b'')
+        channel = writer.register_channel('/noise', 'cdr', schema)
+        writer.add_message(channel, 1, payload(0, 10), 1)
+        writer.finish()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(damaged, damaged[:4] + b'\xff' * (len(damaged) - 4), 1))
+    problems: list[str] = []
+    found = list(iter_messages(path, problems=problems))
+    assert expected in problems[0]
+    assert len(found) == (1 if 'metadata' in expected else 0)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 import shutil
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.data.mcap_reader import list_episodes, read_episode, read_info
-from mtv_world_ros.errors import CalibrationError, EpisodeError
+from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
 
@@ -160,3 +161,16 @@ def test_unfinished_episodes_are_not_listed(make_episode, tmp_path) -> None:
     shutil.copytree(paths[0], tmp_path / '.c.1234.tmp')
     (tmp_path / 'notes').mkdir()
     assert list_episodes(tmp_path) == [tmp_path / 'a', tmp_path / 'b']
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_a_damaged_file_never_ends_in_another_error(seed, episode_path, tmp_path) -> None:
+    rng = np.random.default_rng(seed)
+    content = bytearray((episode_path / 'episode_0.mcap').read_bytes())
+    for position in rng.integers(0, len(content), 4):
+        content[position] = rng.integers(0, 256)
+    shutil.copytree(episode_path, tmp_path / 'episode')
+    (tmp_path / 'episode' / 'episode_0.mcap').write_bytes(content)
+    with contextlib.suppress(MtvWorldError):
+        episode = read_episode(tmp_path / 'episode')
+        assert all(np.asarray(track.frames).ndim == 4 for track in episode.images.values())
