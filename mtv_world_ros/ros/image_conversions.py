@@ -14,6 +14,9 @@ from mtv_world_ros.data_types import ByteArray, CameraModel
 from mtv_world_ros.geometry.camera import with_camera_info
 from mtv_world_ros.ros.rejection import Reason, rejected_as
 
+#: words in the `format` of compressed images that can be read
+_FORMATS = ('jpeg', 'jpg', 'png')
+
 
 def check(message: Image | CompressedImage) -> None:
     """Refuses an image that cannot be read by its fields and first bytes, without decoding it.
@@ -23,7 +26,8 @@ def check(message: Image | CompressedImage) -> None:
     """
     data = np.frombuffer(message.data, np.uint8)
     if isinstance(message, CompressedImage):
-        with rejected_as(Reason.IMAGE_ENCODING):
+        known = any(word in message.format.lower() for word in _FORMATS)
+        with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
             images.check_compressed(message.format, data)
         return
     known = message.encoding in images.ENCODINGS

@@ -81,7 +81,7 @@ class Recorder(Node):
         if not self._pending:
             return
         types = dict(self.get_topic_names_and_types())
-        for topic in [topic for topic in self._pending if types.get(topic)]:
+        for topic in [t for t in self._pending if t in types and self.count_publishers(t)]:
             self._subscribe(topic, types[topic][0])
             self._pending.remove(topic)
             if not self._pending:
@@ -106,7 +106,7 @@ class Recorder(Node):
             Qos(
                 reliability=reliability.name.lower(),
                 durability=durability.name.lower(),
-                depth=offers[0].depth or 10 if offers else 10,
+                depth=offers[0].depth or 10,
             ),
         )
         self.create_subscription(
