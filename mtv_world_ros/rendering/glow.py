@@ -118,7 +118,7 @@ class Trail:
 
     def add(self, stamps: Stamps, ages_s: FloatArray, first: int, stop: int) -> None:
         """Adds stamps first .. stop - 1, whose ages stand at the same places of `ages_s`."""
-        brightness = 0.5 ** (ages_s / self._half_life_s)
-        for n in range(first, stop):
-            if brightness[n] >= FAINTEST:
-                self.box = union(self.box, stamps.draw(self.image, n, brightness[n]))
+        brightness = 0.5 ** (ages_s[first:stop] / self._half_life_s)
+        for n in np.flatnonzero(brightness >= FAINTEST):
+            box = stamps.draw(self.image, first + int(n), float(brightness[n]))
+            self.box = union(self.box, box)

@@ -43,7 +43,9 @@ class TrajectoryVideoConfig:
         min_radius_px: smallest standard deviation of the glow [px].
         object_fill: brightness of object fills, 0 .. 1.
         show_gripper: whether the newest point has a core, white as far as the gripper is closed.
-        points_per_frame: trail points between two frames, so that trails have no gaps.
+        points_per_frame: least number of trail points from one frame to the next.
+        max_gap_m: largest distance of trail points from each other [m], so that the trails of
+            fast arms have no gaps; None leaves it at `points_per_frame`.
     """
 
     half_life_s: float = 0.5
@@ -52,6 +54,7 @@ class TrajectoryVideoConfig:
     object_fill: float = 0.35
     show_gripper: bool = True
     points_per_frame: int = 3
+    max_gap_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ('half_life_s', 'point_radius_m', 'min_radius_px'):
@@ -66,30 +69,17 @@ class TrajectoryVideoConfig:
                 f'rendering.points_per_frame is {self.points_per_frame}, must be a whole number '
                 'of at least 1'
             )
+        if self.max_gap_m is not None and not self.max_gap_m > 0:
+            raise ConfigError(f'rendering.max_gap_m is {self.max_gap_m}, must be > 0 or null')
 
 
 #: the core that shows a closed gripper, as a share of the glow's standard deviation
 _CORE_SHARE = 0.55
+#: smallest standard deviation of the core, so that it shows between pixels too [px]
+_LEAST_CORE_PX = 0.7
 #: points nearer than this are drawn as large as at this depth [m]
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Motion:
-    """Tool points over time, with points between the frames.
-
-    Attributes:
-        times: (N,) [s].
-        points: (A, N, 3) in the base frame [m].
-        closed: (A, T) 0 open .. 1 closed, at the frames.
-        shown_at: (T,) index of each frame's own point.
-    """
-
-    times: FloatArray
-    points: FloatArray
-    closed: FloatArray
-    shown_at: np.ndarray
 
 
 def render_trajectory_video(
@@ -120,7 +110,7 @@ def render_trajectory_video(
     """
     positions, times = np.asarray(positions, np.float64), np.asarray(times, np.float64)
     _check(cameras, positions, times, object_masks)
-    motion = _motion(robot, positions, times, config)
+    motion = tool_motion(robot, positions, times, config.points_per_frame, config.max_gap_m)
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.empty(shape, np.uint8)
     for view, camera in enumerate(cameras):
@@ -164,23 +154,6 @@ def _check(
         )
 
 
-def _motion(
-    robot: RobotModel, positions: FloatArray, times: FloatArray, config: TrajectoryVideoConfig
-) -> _Motion:
-    """Joint positions interpolated between the frames, so that trails follow the arm's arc."""
-    frames, per_frame = len(times), config.points_per_frame
-    fine = np.arange((frames - 1) * per_frame + 1) / per_frame
-    left = np.minimum(fine.astype(int), max(frames - 2, 0))
-    right, share = np.minimum(left + 1, frames - 1), fine - left
-    dense = (1 - share)[:, None] * positions[left] + share[:, None] * positions[right]
-    return _Motion(
-        times=(1 - share) * times[left] + share * times[right],
-        points=robot.tool_poses(dense)[..., :3, 3],
-        closed=1.0 - robot.gripper_openings(positions),
-        shown_at=np.arange(frames) * per_frame,
-    )
-
-
 def _canvas(
     camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
 ) -> ByteArray:
@@ -196,16 +169,16 @@ def _draw_view(
     camera: CameraModel,
     robot: RobotModel,
     positions: FloatArray,
-    motion: _Motion,
+    motion: ToolMotion,
     config: TrajectoryVideoConfig,
 ) -> None:
     """Draws all arms onto the (T, H, W, 3) frames of one view."""
     poses = camera_poses(camera, robot, positions)
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
-    sigmas = _sigmas(camera, depths, config)
+    core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
     cores = [
-        make_stamps(heads[arm], _CORE_SHARE * sigmas[arm], camera.width, camera.height)
+        make_stamps(heads[arm], core_sigmas[arm], camera.width, camera.height)
         for arm in range(num_arms)
     ]
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
@@ -233,7 +206,7 @@ def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConf
 def _trail_frames(
     camera: CameraModel,
     poses: FloatArray,
-    motion: _Motion,
+    motion: ToolMotion,
     arm: int,
     config: TrajectoryVideoConfig,
 ) -> Iterator[tuple[GlowArray, Box]]:
