@@ -31,6 +31,7 @@ from mtv_world_ros.rendering.glow import (
     Stamps,
     Trail,
 )
+from mtv_world_ros.rendering.tool_motion import tool_motion, ToolMotion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
