@@ -1,0 +1,165 @@
+"""Checkpoint folders: bit-equal round trip, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from diffusers import FlowMatchEulerDiscreteScheduler
+import numpy as np
+import pytest
+from small_transformer import build, inputs, SMALL
+import torch
+
+from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
+from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.world_model import DiffusionWorldModel
+
+CARD = {
+    'views': ['low', 'high'],
+    'fps': 5.0,
+    'num_frames': 4,
+    'width': 32,
+    'height': 32,
+    'robot': 'yam_bimanual',
+    'control': 'trajectory_video',
+    'object_mask': True,
+    'rendering': {},
+    'trained_on': {},
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    checkpoint = Checkpoint(
+        transformer=build(SMALL),
+        autoencoder=SpaceToDepthAutoencoder(),
+        scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
+        card=CARD,
+    )
+    save_checkpoint(checkpoint, tmp_path / 'checkpoint')
+    return tmp_path / 'checkpoint'
+
+
+def test_loads_bit_for_bit_what_was_saved(folder: Path) -> None:
+    loaded = load_checkpoint(folder)
+    for name, value in build(SMALL).state_dict().items():
+        assert torch.equal(loaded.transformer.state_dict()[name], value), name
+    torch.testing.assert_close(loaded.transformer(**inputs()), build(SMALL)(**inputs()))
+    assert loaded.scheduler.config['shift'] == 5.0
+    assert loaded.card == CARD
+
+
+def test_leaves_nothing_but_safetensors_and_json(folder: Path) -> None:
+    assert {path.suffix for path in folder.rglob('*') if path.is_file()} == {
+        '.json',
+        '.safetensors',
+    }
+    assert not list(folder.parent.glob('*.partial'))
+
+
+def test_predicts_frames_of_the_cards_size_from_a_seed(folder: Path) -> None:
+    model = DiffusionWorldModel(load_checkpoint(folder))
+    first, again, other = (predict(model, seed) for seed in (1, 1, 2))
+    assert first.shape == (2, 4, 32, 32, 3)
+    assert first.dtype == np.uint8
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def predict(model: DiffusionWorldModel, seed: int = 0, should_stop=lambda: False) -> np.ndarray:
+    generator = np.random.default_rng(0)
+    return model.predict(
+        generator.integers(0, 255, (2, 32, 32, 3), np.uint8),
+        generator.integers(0, 255, (2, 5, 32, 32, 3), np.uint8),
+        seed=seed,
+        num_inference_steps=2,
+        should_stop=should_stop,
+    )
+
+
+def test_a_preempted_prediction_is_given_up(folder: Path) -> None:
+    model = DiffusionWorldModel(load_checkpoint(folder))
+    with pytest.raises(RolloutPreempted):
+        predict(model, should_stop=lambda: True)
+
+
+@pytest.mark.parametrize(
+    'error',
+    [
+        torch.OutOfMemoryError('CUDA out of memory'),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 1 TB"),
+    ],
+)
+def test_out_of_memory_is_a_clear_error_and_the_next_call_works(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    model = DiffusionWorldModel(load_checkpoint(folder))
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model.transformer, 'forward', fail)
+        with pytest.raises(
+            ModelMemoryError, match='out of memory on cpu with 2 views of 5 frames'
+        ):
+            predict(model)
+    assert predict(model).shape == (2, 4, 32, 32, 3)
+
+
+def test_a_folder_without_a_card_is_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match='is not a checkpoint: it has no world_model.json'):
+        load_checkpoint(tmp_path)
+
+
+def test_a_missing_part_is_named(folder: Path) -> None:
+    (folder / 'scheduler').rename(folder / 'elsewhere')
+    with pytest.raises(CheckpointError, match="has no folder 'scheduler/'"):
+        load_checkpoint(folder)
+
+
+def test_pickles_are_refused(folder: Path) -> None:
+    (folder / 'transformer' / 'diffusion_pytorch_model.bin').write_bytes(b'x')
+    with pytest.raises(CheckpointError, match='holds pickle files'):
+        load_checkpoint(folder)
+
+
+def test_weights_of_another_shape_are_refused(folder: Path) -> None:
+    file = folder / 'transformer' / 'config.json'
+    config = json.loads(file.read_text())
+    config['ffn_dim'] = 48
+    file.write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match='does not fit its config'):
+        load_checkpoint(folder)
+
+
+def test_a_model_of_another_class_is_refused(folder: Path) -> None:
+    file = folder / 'transformer' / 'config.json'
+    config = json.loads(file.read_text())
+    config['_class_name'] = 'UNet2DModel'
+    file.write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match='holds a UNet2DModel, expected a MultiViewWan'):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'fsp': 5.0}, r"unknown key 'fsp' \(did you mean 'fps'\?\)"),
+        ({'fps': 'five'}, "'fps' is 'five'"),
+        ({'views': None}, "'views' is None"),
+    ],
+)
+def test_a_wrong_card_is_refused(folder: Path, change: dict, message: str) -> None:
+    (folder / 'world_model.json').write_text(json.dumps({**CARD, **change}))
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(folder)
+
+
+def test_a_damaged_weight_file_is_refused(folder: Path) -> None:
+    file = folder / 'transformer' / 'diffusion_pytorch_model.safetensors'
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(CheckpointError, match='cannot be loaded'):
+        load_checkpoint(folder)

@@ -1,0 +1,186 @@
+"""The main path on the bundled episode: clocks, chaining, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.assembly import assemble
+from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
+from mtv_world_ros.errors import CheckpointError, ObservationError, TrajectoryError
+from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.resources import share_path
+
+SPEC = WorldModelSpec(
+    views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
+)
+CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
+
+
+class CountingWorldModel(PersistenceWorldModel):
+    """Frame k is the start frame made k grey levels brighter; remembers what it was given."""
+
+    def __init__(self, spec: WorldModelSpec) -> None:
+        super().__init__(spec)
+        self.trajectories: list[np.ndarray] = []
+        self.seeds: list[int] = []
+
+    def predict(self, start_frame, trajectory_frames, *, seed, **options):
+        self.trajectories.append(trajectory_frames)
+        self.seeds.append(seed)
+        held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
+        steps = np.arange(1, held.shape[1] + 1)[None, :, None, None, None]
+        return np.minimum(held.astype(int) + steps, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope='module')
+def recording() -> Recording:
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_recording(share_path('resource', 'demo_episode'), SPEC, robot)
+
+
+@pytest.fixture
+def world_model() -> CountingWorldModel:
+    return CountingWorldModel(SPEC)
+
+
+@pytest.fixture
+def pipeline(world_model: CountingWorldModel) -> Pipeline:
+    return assemble(CARD, world_model)
+
+
+def observe(recording: Recording) -> Observation:
+    return Observation(
+        cameras=recording.cameras,
+        frames=recording.frames[:, 0],
+        positions=recording.positions[0],
+        stamp_ns=recording.stamp_ns,
+    )
+
+
+def commands(recording: Recording, seconds: float) -> JointTrajectory:
+    whole = recording.commands
+    kept = (whole.times > 1e-6) & (whole.times <= seconds + 1e-9)
+    return JointTrajectory(
+        joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
+    )
+
+
+def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
+    return list(
+        pipeline.imagine(
+            observe(recording),
+            commands(recording, seconds),
+            instruction=recording.instruction,
+            **options,
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'lengths'), [(1.6, [8]), (0.5, [3]), (3.2, [8, 8]), (2.0, [8, 2])]
+)
+def test_predicts_just_as_far_as_the_trajectory_goes(
+    pipeline: Pipeline, recording: Recording, seconds: float, lengths: list[int]
+) -> None:
+    chunks = imagine(pipeline, recording, seconds)
+    assert [len(chunk.rollout.video.times) for chunk in chunks] == lengths
+    times = np.concatenate([chunk.rollout.video.times for chunk in chunks])
+    np.testing.assert_allclose(times, np.arange(1, sum(lengths) + 1) / SPEC.fps)
+
+
+def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    first, second = imagine(pipeline, recording, 3.2)
+    assert np.array_equal(second.rollout.start_frame, first.rollout.video.frames[:, -1])
+    assert np.array_equal(first.end_observation.frames, second.rollout.start_frame)
+    end_ns = recording.stamp_ns + 1_600_000_000
+    assert first.end_observation.stamp_ns == end_ns
+
+
+def test_chunks_of_one_rollout_have_seeds_of_their_own(
+    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
+) -> None:
+    imagine(pipeline, recording, 3.2, seed=7)
+    assert world_model.seeds == [7, 8]
+
+
+def test_control_frame_zero_shows_the_observed_state(
+    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
+) -> None:
+    """And frame k the state after command k: a later start shifts the frames, not the first."""
+    (chunk,) = imagine(pipeline, recording, 1.6)
+    drawn = pipeline.draw(
+        recording.cameras,
+        np.stack([recording.positions[0], chunk.rollout.positions[0]]),
+        np.array([0.0, 0.2]),
+        chunk.start_masks,
+    )
+    assert np.array_equal(world_model.trajectories[0][:, :2], drawn.frames)
+
+
+def test_the_objects_are_those_of_the_instruction(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    (chunk,) = imagine(pipeline, recording, 1.6)
+    assert chunk.start_masks.names == recording.objects[:2]
+    assert chunk.start_masks.masks.any(axis=(2, 3, 4)).all()
+
+
+def test_without_object_masks_the_control_is_dark_but_for_the_trails(
+    world_model: CountingWorldModel, recording: Recording
+) -> None:
+    imagine(assemble({**CARD, 'object_mask': False}, world_model), recording, 1.6)
+    imagine(assemble(CARD, world_model), recording, 1.6)
+    without, with_masks = (np.count_nonzero(t) for t in world_model.trajectories)
+    assert 0 < without < with_masks
+
+
+def test_a_larger_observation_is_brought_to_the_models_size(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    large = load_recording(
+        share_path('resource', 'demo_episode'), replace(SPEC, width=384, height=288), robot
+    )
+    chunks = list(
+        pipeline.imagine(observe(large), commands(large, 1.6), instruction=large.instruction)
+    )
+    np.testing.assert_allclose(chunks[0].cameras[0].K, recording.cameras[0].K)
+    difference = np.abs(chunks[0].rollout.start_frame.astype(int) - recording.frames[:, 0])
+    assert difference.max() <= 1
+
+
+def test_views_in_another_order_are_refused(pipeline: Pipeline, recording: Recording) -> None:
+    seen = observe(recording)
+    turned = Observation(
+        cameras=seen.cameras[::-1],
+        frames=seen.frames[::-1],
+        positions=seen.positions,
+        stamp_ns=seen.stamp_ns,
+    )
+    with pytest.raises(ObservationError, match=r"\['high', 'low'\].*\['low', 'high'\]"):
+        list(pipeline.imagine(turned, commands(recording, 1.6)))
+
+
+def test_positions_outside_the_limits_are_refused(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    good = commands(recording, 1.6)
+    positions = good.positions.copy()
+    positions[3, 1] = 9.0
+    bad = replace(good, positions=positions)
+    with pytest.raises(TrajectoryError, match='left_joint2.* is 9 '):
+        list(pipeline.imagine(observe(recording), bad))
+
+
+def test_a_checkpoint_of_another_robot_is_refused(world_model: CountingWorldModel) -> None:
+    yam = share_path('config', 'robots', 'yam_bimanual.yaml')
+    with pytest.raises(CheckpointError, match="trained with robot 'other'"):
+        assemble({**CARD, 'robot': 'other'}, world_model, robot=yam)

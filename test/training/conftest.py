@@ -1,0 +1,70 @@
+"""The bundled episode and a preset small enough to train in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.config import load_training_config, TrainingConfig
+from mtv_world_ros.training.run import spec_of
+
+TINY = {
+    'transformer.num_attention_heads': 2,
+    'transformer.attention_head_dim': 12,
+    'transformer.ffn_dim': 32,
+    'transformer.num_layers': 1,
+    'transformer.stem_widths': [8, 16, 16],
+    'transformer.frames_per_token': 2,
+    'transformer.freq_dim': 16,
+    'video.num_frames': 2,
+    'video.width': 48,
+    'video.height': 40,
+    'optimizer.batch_size': 1,
+    'optimizer.warmup_steps': 1,
+    'optimizer.steps': 4,
+    'optimizer.learning_rate': 2e-3,
+}
+
+
+@pytest.fixture(scope='session')
+def episode() -> Path:
+    return share_path('resource', 'demo_episode')
+
+
+@pytest.fixture(scope='session')
+def tiny() -> TrainingConfig:
+    return load_training_config('small', TINY)
+
+
+@pytest.fixture(scope='session')
+def robot() -> RobotModel:
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='session')
+def recording(episode: Path, tiny: TrainingConfig, robot: RobotModel) -> Recording:
+    return load_recording(episode, spec_of(tiny), robot)
+
+
+@pytest.fixture
+def source(recording: Recording, tiny: TrainingConfig, robot: RobotModel):
+    batches = BatchSource(
+        [recording],
+        spec=spec_of(tiny),
+        robot=robot,
+        segmenter=ColourSegmenter(),
+        rendering=tiny.rendering,
+        object_mask=True,
+        augment=tiny.augment,
+        batch_size=1,
+        seed=0,
+    )
+    yield batches
+    batches.close()

@@ -1,0 +1,170 @@
+"""The trainer: it learns, resumes to the bit, and stops with the last good state whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.errors import ConfigError, TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.config import load_training_config, OptimizerConfig, TrainingConfig
+from mtv_world_ros.training.run import find_episodes, train
+from mtv_world_ros.training.trainer import learning_rate, Trainer
+
+
+def make(config: TrainingConfig, folder: Path, seed: int = 0) -> Trainer:
+    return Trainer(config, folder, seed=seed, device='cpu', dtype=torch.float32, trained_on={})
+
+
+def run(trainer: Trainer, source: BatchSource, save_every: int = 1000) -> list[float]:
+    reports = trainer.run(source, save_every=save_every, on_save=lambda _: None)
+    return [report.loss for report in reports]
+
+
+def test_a_killed_run_continues_as_if_nothing_had_happened(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    whole = make(tiny, tmp_path / 'whole')
+    losses = run(whole, source)
+    cut = make(tiny, tmp_path / 'cut')
+    reports = cut.run(source, save_every=2, on_save=lambda _: None)
+    first = [next(reports).loss, next(reports).loss, next(reports).loss]
+    reports.close()  # the third step is lost: the state is that of the second
+    resumed = make(tiny, tmp_path / 'cut')
+    assert resumed.load_state()
+    assert resumed.step == 2
+    assert first[:2] + run(resumed, source) == losses
+    for one, other in zip(whole.master.parameters(), resumed.master.parameters(), strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(whole.ema.shadow_params, resumed.ema.shadow_params, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: RobotModel,
+                         tmp_path: Path) -> None:  # fmt: skip
+    """The loss on the first frames of one episode halves within 60 steps."""
+    config = replace(tiny, optimizer=replace(tiny.optimizer, steps=60))
+    source = BatchSource(
+        [recording],
+        spec=_spec(config),
+        robot=robot,
+        segmenter=ColourSegmenter(),
+        rendering=config.rendering,
+        object_mask=True,
+        augment=replace(config.augment, start_noise=0.0, colour_permutation=0.0),
+        batch_size=1,
+        seed=0,
+    )
+    trainer = make(config, tmp_path)
+    batch = source.batch(0)
+    before = trainer.loss(batch, 0).item()
+    for _ in range(60):
+        trainer._train_step(batch)
+        trainer.step += 1
+    source.close()
+    assert trainer.loss(batch, 0).item() < 0.5 * before
+
+
+def _spec(config: TrainingConfig):
+    from mtv_world_ros.training.run import spec_of
+
+    return spec_of(config)
+
+
+def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    trainer = make(tiny, tmp_path)
+    reports = trainer.run(source, save_every=1, on_save=lambda _: None)
+    next(reports)
+    next(reports)
+    with torch.no_grad():
+        next(trainer.worker.parameters()).fill_(float('nan'))
+    with pytest.raises(TrainingError, match=r'the loss is nan at step 2.*learning_rate'):
+        next(reports)
+    state = json.loads((tmp_path / 'state' / 'state.json').read_text())
+    assert state['step'] == 1 or state['step'] == 2
+    resumed = make(tiny, tmp_path)
+    assert resumed.load_state()
+    assert all(torch.isfinite(p).all() for p in resumed.master.parameters())
+
+
+def test_a_state_of_another_seed_is_refused(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    run(make(tiny, tmp_path), source)
+    with pytest.raises(TrainingError, match='trained with seed 0, this run has 1'):
+        make(tiny, tmp_path, seed=1).load_state()
+
+
+def test_the_same_step_gives_the_same_batch(source: BatchSource) -> None:
+    first, again, other = source.batch(3), source.batch(3), source.batch(4)
+    assert torch.equal(first.frames, again.frames)
+    assert torch.equal(first.start_frame, again.start_frame)
+    assert torch.equal(first.trajectory, again.trajectory)
+    assert not torch.equal(first.frames, other.frames)
+
+
+def test_the_learning_rate_warms_up_holds_and_falls_to_zero() -> None:
+    config = OptimizerConfig(learning_rate=1.0, warmup_steps=4, steps=100, decay_share=0.2)
+    assert [learning_rate(step, config) for step in (0, 3, 50, 79, 90)] == pytest.approx(
+        [0.25, 1.0, 1.0, 1.0, 0.5]
+    )
+    assert 0 < learning_rate(99, config) <= 0.05
+
+
+def test_trains_from_a_folder_to_a_checkpoint_that_serves(
+    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
+) -> None:
+    out = tmp_path / 'run'
+    folder = train(
+        tiny, episode.parent, out, robot=robot, segmenter=ColourSegmenter(), save_every=2
+    )
+    pipeline = load_pipeline(folder, dtype='float32')
+    assert pipeline.spec.num_frames == 2
+    assert json.loads((folder / 'world_model.json').read_text())['trained_on']['steps'] == 4
+    assert json.loads((out / 'skipped.json').read_text()) == {}
+    assert len((out / 'log.jsonl').read_text().splitlines()) == 1
+
+
+def test_episodes_that_cannot_be_used_are_named(
+    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
+) -> None:
+    dataset = tmp_path / 'dataset'
+    (dataset / 'broken').mkdir(parents=True)
+    (dataset / 'broken' / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
+    (dataset / 'good').symlink_to(episode)
+    copied = dataset / 'copy'
+    copied.mkdir()
+    for file in episode.iterdir():
+        (copied / file.name).write_bytes(file.read_bytes())
+    train(tiny, dataset, tmp_path / 'run', robot=robot, segmenter=ColourSegmenter())
+    skipped = json.loads((tmp_path / 'run' / 'skipped.json').read_text())
+    assert [Path(path).name for path in skipped] == ['broken']
+
+
+def test_a_folder_without_episodes_says_how_to_get_some(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match='mtv-world collect'):
+        find_episodes(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('override', 'message'),
+    [
+        ({'optimizer.step': 5}, r"unknown key 'step' \(did you mean 'steps'\?\)"),
+        ({'optimiser.steps': 5}, r"unknown key 'optimiser' \(did you mean 'optimizer'\?\)"),
+        ({'steps': 5}, 'must look like section.key'),
+        ({'rendering.half_life_s': -1.0}, 'half_life_s'),
+    ],
+)
+def test_a_wrong_setting_names_the_nearest(override: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_training_config('small', override)
