@@ -50,9 +50,8 @@ class Player(Node):
         self._options = options
         self._reader = BagReader(options.episode)
         types = self._reader.topics()
-        self._names = _chosen(types, options)
         self._outputs = {
-            topic: self._offer(types[topic], name) for topic, name in self._names.items()
+            topic: self._offer(types[topic], topic) for topic in _chosen(types, options)
         }
         self._clock_output = self.create_publisher(Clock, '/clock', 10) if options.clock else None
         self._ends: list[dict[str, str]] = []
@@ -73,8 +72,9 @@ class Player(Node):
             self._wait_for_subscribers()
         while True:
             self._play_once()
-            if self._reader.truncated:
-                self.get_logger().warning(f'played up to the cut: {self._reader.truncated}')
+            cut = [f'played up to the cut: {self._reader.truncated}']
+            for problem in (cut if self._reader.truncated else []) + self._reader.problems:
+                self.get_logger().warning(problem)
             if not self._options.loop:
                 break
         self._flush()
@@ -134,7 +134,7 @@ class Player(Node):
     def _messages(self) -> Iterator[BagMessage]:
         """Messages from start to end; latched ones also where they lie before the start."""
         first_ns: int | None = None
-        for message in in_order(self._reader.messages(tuple(self._names))):
+        for message in in_order(self._reader.messages(tuple(self._outputs))):
             if first_ns is None:
                 first_ns = message.stamp_ns
                 self._first_ns = first_ns + round(self._options.start * NANO)
@@ -162,19 +162,16 @@ class Player(Node):
             if stamp_ns and self._clock_output is None:
                 stamp_ns += timeline.due(message.stamp_ns) - message.stamp_ns
                 data = with_stamp(data, stamp_ns)
-        is_plan = message.msgtype == TRAJECTORY
-        if is_plan and self._options.lock_step:
-            self._flush()
         self._outputs[message.topic].publish(data)
         self._counts['messages'] += 1
-        self._counts['trajectories'] += is_plan
+        self._counts['trajectories'] += message.msgtype == TRAJECTORY
         return stamp_ns
 
     def _flush(self) -> None:
-        """Waits until reliable subscribers have what was published."""
+        """Waits until reliable subscribers have what was published (Fast DDS: up to 3 s)."""
         for publisher in self._outputs.values():
             if publisher.get_subscription_count():
-                publisher.wait_for_all_acked(Duration(seconds=2))
+                publisher.wait_for_all_acked(Duration(seconds=4))
 
     def _publish_clock(self, bag_ns: int) -> None:
         if self._clock_output is not None:
@@ -206,14 +203,12 @@ class Player(Node):
             self.get_logger().warning(f'trajectory at {stamp_ns} ns: {state} {text}')
 
 
-def _chosen(types: dict[str, str], options: argparse.Namespace) -> dict[str, str]:
-    """Topics to play and the names they are published under."""
-    renamed = dict(rule.split(':=', 1) for rule in options.remap)
-    unknown = [topic for topic in (*options.topics, *renamed) if topic not in types]
+def _chosen(types: dict[str, str], options: argparse.Namespace) -> list[str]:
+    """Topics to play."""
+    unknown = [topic for topic in options.topics if topic not in types]
     if unknown:
         raise EpisodeError(f"'{options.episode}' has no topics {unknown}; it has {sorted(types)}")
-    chosen = options.topics or [t for t in types if t not in ('/clock', '/parameter_events')]
-    return {topic: renamed.get(topic, topic) for topic in chosen}
+    return options.topics or [t for t in types if t not in ('/clock', '/parameter_events')]
 
 
 def _rate(text: str) -> float:
@@ -224,7 +219,11 @@ def _rate(text: str) -> float:
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='mtv-world replay', description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog='mtv-world replay',
+        description=__doc__,
+        epilog='Topics are renamed by --ros-args -r /joint_trajectory:=/plan',
+    )
     add = parser.add_argument
     add('episode', type=Path, help='rosbag2 MCAP folder or .mcap file')
     add('--rate', type=_rate, default=1.0, help='seconds of the episode a second')
@@ -233,18 +232,13 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add('--start', type=float, default=0.0, help='skip this much [s]')
     add('--duration', type=float, default=float('inf'), help='play this much [s]')
     add('--topics', nargs='+', default=[], metavar='TOPIC', help='play only these')
-    add('--remap', nargs='+', default=[], metavar='FROM:=TO', help='publish under other names')
     add('--wait-for', nargs='+', default=[], metavar='TOPIC', help='default: the trajectory')
     add('--wait-timeout', type=float, default=60.0, help='wait for a subscriber this long [s]')
     add('--no-wait', action='store_true', help='play whether or not anybody listens')
     add('--lock-step', action='store_true', help='after each trajectory wait for the answer')
     add('--answer-timeout', type=float, default=120.0, help='wait for an answer this long [s]')
     add('--report-topic', default='/world_model/report', help='where answers are reported')
-    options = parser.parse_args(arguments)
-    wrong = [rule for rule in options.remap if ':=' not in rule]
-    if wrong:
-        parser.error(f'--remap {wrong}: write FROM:=TO')
-    return options
+    return parser.parse_args(arguments)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -23,8 +23,8 @@ from mtv_world_ros.ros.worker import Chunk, Ended, Result
 
 #: pause between two frames of a burst [s]: other callbacks get their turn
 _BURST_PERIOD_S = 0.0005
-#: longest wait for slow subscribers to acknowledge a chunk before the next burst [s]
-_ACKNOWLEDGE_S = 1.0
+#: pause between two bursts [s]: a subscriber of one chunk's depth gets to empty its queue
+_BURST_PAUSE_S = 0.05
 
 
 @dataclass(slots=True)
@@ -70,14 +70,15 @@ class PredictionPublisher:
         self._joint_names, self._settings = tuple(joint_names), settings
         self._on_sent, self._on_ended, self._on_error = on_sent, on_ended, on_error
         self._period_s = 1.0 / spec.fps
-        depth = spec.num_frames
+        # a chunk, and the one before it should a subscriber still ask for a frame of that again
+        depth = 2 * spec.num_frames
         self._views = [ViewPublisher(node, view, depth, settings()) for view in spec.views]
         self._joints = create_publisher(node, JointState, '~/predicted/joint_states', depth)
         self._success = create_publisher(node, Float64, '~/success', 10)
         self._jaccard = create_publisher(node, Float32MultiArray, '~/jaccard', 10)
         self._queue: deque[Result] = deque()
         self._sent = Sent()
-        self._finished_s = 0.0
+        self._not_before_s = 0.0
         self._timer = node.create_timer(
             self._period_s, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -127,7 +128,7 @@ class PredictionPublisher:
             return
         chunk = self._queue[0]
         assert isinstance(chunk, Chunk)
-        if self._sent.num_frames == 0 and self._must_wait():
+        if self._sent.num_frames == 0 and time.monotonic() < self._not_before_s:
             return
         self._publish_frame(chunk)
         if self._sent.num_frames == len(chunk.prediction.rollout.video.times):
@@ -145,16 +146,8 @@ class PredictionPublisher:
             self._on_ended(result)
             return
         sent, self._sent = self._sent, Sent()
-        self._finished_s = time.monotonic()
+        self._not_before_s = time.monotonic() + _BURST_PAUSE_S
         self._on_sent(result, sent)
-
-    def _must_wait(self) -> bool:
-        """Whether some reliable subscriber has not got all of the chunk before."""
-        if self._settings().pace != 'burst':
-            return False
-        if time.monotonic() - self._finished_s > _ACKNOWLEDGE_S:
-            return False
-        return not all(view.all_acknowledged() for view in self._views)
 
     def _publish_frame(self, chunk: Chunk) -> None:
         begin = time.monotonic()

@@ -14,6 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from mtv_world_ros.data.bag_metadata import Qos
@@ -43,6 +44,8 @@ class Recorder(Node):
         super().__init__('recorder')
         self._options = options
         self._pending = [self.resolve_topic_name(topic) for topic in options.topics]
+        self._taken: list[Subscription] = []
+        self._is_announced = False
         self._counts: Counter[str] = Counter()
         self._last_stamp_ns = 0
         self._last_message_s = 0.0
@@ -62,7 +65,7 @@ class Recorder(Node):
         begin_s = time.monotonic()
         with self._writer:
             while not self._stopping:
-                self._subscribe_to_known()
+                self._connect()
                 self._check_patience(time.monotonic() - begin_s)
                 self._executor.spin_once(timeout_sec=0.05)
             self._drain()
@@ -77,15 +80,21 @@ class Recorder(Node):
     def _on_signal(self, *_: object) -> None:
         self._stopping = True
 
-    def _subscribe_to_known(self) -> None:
+    def _connect(self) -> None:
         if not self._pending:
+            self._announce()
             return
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self._pending if t in types and self.count_publishers(t)]:
             self._subscribe(topic, types[topic][0])
             self._pending.remove(topic)
-            if not self._pending:
-                self.get_logger().info('recording')
+
+    def _announce(self) -> None:
+        """Says so, once every subscription is connected."""
+        connected = (s.get_publisher_count() for s in self._taken)
+        if not self._is_announced and all(connected):
+            self._is_announced = True
+            self.get_logger().info('recording')
 
     def _check_patience(self, waited_s: float) -> None:
         if self._pending and waited_s > self._options.wait_timeout:
@@ -109,13 +118,14 @@ class Recorder(Node):
                 depth=offers[0].depth or 10,
             ),
         )
-        self.create_subscription(
+        taken = self.create_subscription(
             message_class(msgtype),
             topic,
             self._handler(topic, msgtype),
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
             raw=True,
         )
+        self._taken.append(taken)
 
     def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:
         by_header = self._options.stamp == 'header'

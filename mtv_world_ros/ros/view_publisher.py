@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -42,7 +41,7 @@ class ViewPublisher:
     Args:
         node: owner of the publishers.
         view: name of the view.
-        depth: frames of a chunk.
+        depth: frames kept for subscribers that ask for them again.
         settings: what is offered is decided once, here.
     """
 
@@ -73,10 +72,6 @@ class ViewPublisher:
         """
         self._streams[stream].publish(pixels, header, info, quality)
 
-    def all_acknowledged(self) -> bool:
-        """Whether every reliable subscriber has received everything so far."""
-        return all(stream.all_acknowledged() for stream in self._streams.values())
-
 
 class _Stream:
     """Image, optionally compressed image, and CameraInfo under one name."""
@@ -102,14 +97,6 @@ class _Stream:
             self._image.publish(to_image(pixels, header))
         if self._compressed is not None and self._compressed.get_subscription_count():
             self._compressed.publish(to_compressed(pixels, header, quality))
-
-    def all_acknowledged(self) -> bool:
-        at_once = Duration()
-        return all(
-            publisher.wait_for_all_acked(at_once)
-            for publisher in self._publishers()
-            if publisher.get_subscription_count()
-        )
 
     def _publishers(self) -> list[Publisher]:
         optional = [self._compressed] if self._compressed is not None else []

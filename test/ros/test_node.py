@@ -205,8 +205,13 @@ def test_newer_chunk_drops_frames_of_a_plan_that_no_longer_holds(client):
     wait_for_frames(client, 1)
     client.send_scene()
     client.send_trajectory()
-    client.next_end(since)
-    client.wait(lambda: client.report_values()[-1]['state'] == 'done', 'the newer one')
+    older_rollout = client.next_end(since)['rollout']
+
+    def newer_is_done():
+        last = client.report_values()[-1]
+        return last['state'] == 'done' and last['rollout'] != older_rollout
+
+    client.wait(newer_is_done, 'the newer one')
     *older, newer = [r for r in client.report_values()[since:] if r['state'] == 'chunk']
     sent = [(int(r['frames_published']), int(r['frames_dropped'])) for r in older]
     assert all(published + dropped == NUM_FRAMES for published, dropped in sent)
@@ -332,3 +337,11 @@ def test_diagnostics_say_how_it_is(client):
     assert float(values['image_age_s.low']) < 5
     assert int(values['frames_published']) >= 4
     assert values['mode'] == 'observe'
+
+
+def test_no_frame_of_a_long_burst_is_lost_to_a_subscriber_of_one_chunks_depth(client):
+    client.imagine_one(seconds=8.0)  # ten chunks as fast as the fake model makes them
+    client.wait_for_all(FRAME_TOPICS)
+    got = stamps(client.received[PREDICTED['high']])
+    assert len(got) == 40
+    assert set(np.diff(got)) == {FRAME_NS}
