@@ -14,7 +14,11 @@ Handler = Callable[[argparse.Namespace], int]
 
 def main(argv: list[str] | None = None) -> int:
     """Runs a command; returns the exit status (1 for an error of the user's)."""
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    arguments, more = parser.parse_known_args(argv)
+    arguments.player = more
+    if more and (arguments.handler is not _replay or arguments.offline):
+        parser.error(f'unrecognized arguments: {" ".join(more)}')
     try:
         return arguments.handler(arguments)
     except MtvWorldError as error:
@@ -77,17 +81,18 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
-        'replay', help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)'
+        'replay',
+        help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
+        epilog='Without --offline it takes the options of the ROS player (--rate, --loop, --clock, '
+        '--lock-step, ...): see python -m mtv_world_ros.ros.player --help.',
+        allow_abbrev=False,
     )
     parser.add_argument('episode', type=Path)
     parser.add_argument('--offline', action='store_true', help='no ROS, as fast as it goes')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
     _add_model_options(parser)
-    parser.set_defaults(handler=_replay, takes_more=True)
-    parser.add_argument(
-        'player', nargs=argparse.REMAINDER, help='options of the ROS player, after --'
-    )
+    parser.set_defaults(handler=_replay)
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -119,8 +124,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _play(arguments: argparse.Namespace) -> int:
     import runpy
 
-    options = [o for o in arguments.player if o != '--']
-    sys.argv = ['mtv-world replay', str(arguments.episode), *options]
+    sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.player]
     runpy.run_module('mtv_world_ros.ros.player', run_name='__main__')
     return 0
 

@@ -77,7 +77,8 @@ def run_demo(
     report = _report(recording, predictions, scored, spec.views)
     (out / 'report.json').write_text(json.dumps(report, indent=2) + '\n')
     text = _table(report, spec.views)
-    sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=text.split('\n'))
+    notes = text.split('\n')[-len(spec.views) - 2 :]
+    sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=notes)
     write_png(out / 'contact_sheet.png', sheet)
     write_video(out / 'comparison.mp4', side_by_side(scored.comparison), spec.fps)
     return f'{text}\n\nwritten to {out}: contact_sheet.png comparison.mp4 predictions/ report.json'
@@ -130,8 +131,7 @@ def _report(
 ) -> dict[str, Any]:
     reports = [chunk.report for chunk in predictions.chunks]
     published = sum(int(report['frames_published']) for report in reports) * len(views)
-    keys = {'j_object_mean': 'j_object_mean', 'j_moving': 'j_moving',
-            'j_copy_moving': 'j_copy_moving', 'j_copy_mean': 'j_copy_mean'}  # fmt: skip
+    keys = ('j_object_mean', 'j_moving', 'j_copy_mean', 'j_copy_moving')
     means = {view: episode_means(scored.rows, view) for view in views}
     judged = _whole_chunks(recording, predictions.chunks)
     success = float(judged[-1].report['success'])
@@ -147,9 +147,7 @@ def _report(
         'real_time_factor': float(np.median([float(r['real_time_factor']) for r in reports])),
         'success': _known(success),
         'success_reasons': judged[-1].report['success_reasons'],
-        'views': {
-            view: {key: _known(means[view][name]) for key, name in keys.items()} for view in views
-        },
+        'views': {view: {key: _known(means[view][key]) for key in keys} for view in views},
         'objects': [
             {
                 'view': row.view,

@@ -1,0 +1,87 @@
+"""How fast does a checkpoint imagine on this machine, and which stage takes the time?
+
+    python benchmark/serving_speed.py [--checkpoint bundled] [--threads 2] [--out FOLDER]
+
+Median over chunks of the bundled episode, for several numbers of denoising steps and both number
+formats. Real-time factor: seconds of video for a second of computing, all stages.
+"""
+
+from __future__ import annotations
+
+import argparse
+from datetime import date
+from pathlib import Path
+import platform
+import statistics
+
+import numpy as np
+import torch
+
+from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.data.clips import load_recording
+from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
+from mtv_world_ros.resources import share_path
+
+
+def main() -> None:
+    """Measures and prints a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--checkpoint', default='bundled')
+    parser.add_argument('--threads', type=int, default=2)
+    parser.add_argument('--repeats', type=int, default=7)
+    parser.add_argument('--device', default='cpu')
+    parser.add_argument('--out', type=Path, help='folder for a results page')
+    options = parser.parse_args()
+    page = '\n'.join(lines(options))
+    print(page)
+    if options.out is not None:
+        name = f'serving_{options.device}{options.threads}_{date.today()}.md'
+        (options.out / name).write_text(page + '\n')
+
+
+def lines(options: argparse.Namespace) -> list[str]:
+    """The page: heading, table, what was measured."""
+    where = f'{options.device} ({options.threads} threads, {platform.machine()})'
+    command = f'`python benchmark/serving_speed.py --threads {options.threads}`'
+    setting = f'checkpoint `{options.checkpoint}`, torch {torch.__version__}, seed 0'
+    rows = [
+        f'# Serving speed, {where}, {date.today()}',
+        '',
+        f'{command}: {setting}, median of n = {options.repeats} chunks after one to warm up.',
+        '',
+        '| format | steps | chunk [s] | real-time factor | model [s] | all else [s] |',
+        '|---|---|---|---|---|---|',
+    ]
+    for dtype in ('float32', 'bfloat16'):
+        pipeline = load_pipeline(
+            options.checkpoint, device=options.device, dtype=dtype, num_threads=options.threads
+        )
+        spec = pipeline.spec
+        recording = load_recording(share_path('resource', 'demo_episode'), spec, pipeline.robot)
+        stretch = stretches(recording, spec, 'observe')[0]
+        for steps in (1, 2, 4, 8):
+            chunks = [
+                imagine_stretch(
+                    pipeline, recording, stretch, actions=recording, seed=seed,
+                    num_inference_steps=steps,
+                )[0]
+                for seed in range(options.repeats + 1)
+            ][1:]  # fmt: skip
+            total = statistics.median(sum(c.seconds.values()) for c in chunks)
+            model = statistics.median(c.seconds['model'] for c in chunks)
+            rows.append(
+                f'| {dtype} | {steps} | {total:.3f} | {spec.chunk_seconds / total:.1f} | '
+                f'{model:.3f} | {total - model:.3f} |'
+            )
+    parameters = sum(np.prod(p.shape) for p in _parameters(pipeline))
+    size = f'{len(spec.views)} views x {spec.num_frames} frames of {spec.width}x{spec.height}'
+    length = f'at {spec.fps:g} Hz = {spec.chunk_seconds:.1f} s'
+    return [*rows, '', f'A chunk: {size} {length}; {parameters / 1e6:.2f} M parameters.']
+
+
+def _parameters(pipeline: object) -> list[torch.Tensor]:
+    return list(pipeline.world_model.transformer.parameters())  # type: ignore[attr-defined]
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,126 @@
+"""The command line: quick help, clear errors, and the demo from end to end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.resources import share_path
+
+
+def run(*arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, '-m', 'mtv_world_ros.cli', *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def test_help_does_not_load_the_model(tmp_path: Path) -> None:
+    code = (
+        'import sys\nfrom mtv_world_ros.cli import main\n'
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "sys.exit(any(m in sys.modules for m in ('torch', 'diffusers', 'mujoco', 'rclpy')))"
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, cwd=tmp_path)
+    assert done.returncode == 0
+    for command in ('demo', 'replay', 'collect', 'train', 'evaluate'):
+        assert command in done.stdout.decode()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['train', 'nowhere', '--out', 'run'], 'holds no episodes'),
+        (['train', '.', '--out', 'run', '--preset', 'smal'], "config/models/smal.yaml"),
+        (['train', '.', '--out', 'run', '--set', 'optimizer.step=3'], "did you mean 'steps'"),
+        (['train', '.', '--out', 'run', '--dtype', 'int8'], "dtype 'int8' is not one of"),
+        (['evaluate', 'nowhere', '.', '--out', 'x'], 'is not a checkpoint'),
+        (['replay', 'nowhere', '--offline'], 'nowhere'),
+        (['collect', '--task', 'stack_blocks', '--episodes', '1', '--out', 'x'],
+         'stack_blocks_two'),
+    ],
+)  # fmt: skip
+def test_errors_are_one_line_and_say_what_to_do(
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.startswith('mtv-world: ')
+    assert 'Traceback' not in said
+
+
+needs_checkpoint = pytest.mark.skipif(
+    not (Path(__file__).parents[1] / 'resource' / 'checkpoint' / 'world_model.json').is_file(),
+    reason='the bundled checkpoint is not in resource/checkpoint',
+)
+
+
+@needs_checkpoint
+def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Path) -> None:
+    done = run('demo', '--out', 'out', '--threads', '1', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['chunks'] == 3
+    assert report['frames_received'] == report['frames_published'] == 3 * 16 * 2
+    assert report['camera_infos_received'] == report['frames_received']
+    for view in ('low', 'high'):
+        assert report['views'][view]['j_moving'] > report['views'][view]['j_copy_moving']
+    sheet = cv2.imread(str(tmp_path / 'out' / 'contact_sheet.png'))
+    assert sheet is not None
+    assert sheet.shape[1] > 800
+    assert (tmp_path / 'out' / 'comparison.mp4').stat().st_size > 10_000
+    assert (tmp_path / 'out' / 'predictions' / 'metadata.yaml').is_file()
+    assert 'success estimate' in done.stdout
+
+
+@needs_checkpoint
+def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
+    from mtv_world_ros.data.bag_reader import BagReader
+
+    episode = share_path('resource', 'demo_episode')
+    out = tmp_path / 'imagined'
+    done = run(
+        'replay', str(episode), '--offline', '--out', str(out), '--steps', '1', cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    counts: dict[str, int] = {}
+    for message in BagReader(out).messages():
+        counts[message.topic] = counts.get(message.topic, 0) + 1
+    infos = [n for topic, n in counts.items() if topic.endswith('predicted/camera_info')]
+    assert len(infos) == 2
+    assert infos[0] == infos[1] == 48
+
+
+@needs_checkpoint
+def test_evaluates_the_bundled_model(tmp_path: Path) -> None:
+    episode = share_path('resource', 'demo_episode')
+    done = run(
+        'evaluate', 'bundled', str(episode), '--out', 'scores', '--steps', '1', cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / 'scores' / 'metrics.json').read_text())
+    assert metrics['num_episodes'] == 1
+    for view in ('low', 'high'):
+        scores = metrics['views'][view]
+        value = scores['j_moving']
+        value = value['value'] if isinstance(value, dict) else value
+        assert 0 < value < 1
+        assert scores['fid'] is None
+    assert np.isfinite(metrics['num_episodes'])
