@@ -18,6 +18,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.results import EpisodeResult, Summary
 from mtv_world_ros.evaluation.rollouts import (
+    check_mode,
     imagine_stretch,
     predicted_frames,
     Stretch,
@@ -90,7 +91,7 @@ def evaluate(
         The tables, as Markdown.
 
     Raises:
-        ConfigError: unknown option.
+        ConfigError: unknown option or mode.
         EpisodeError: no episode can be used.
     """
     config = _config(options)
@@ -120,9 +121,11 @@ def evaluate(
 
 def _config(options: dict[str, Any]) -> EvaluationConfig:
     try:
-        return EvaluationConfig(**options)
+        config = EvaluationConfig(**options)
     except TypeError as error:
         raise ConfigError(f'evaluation: {error}') from error
+    check_mode(config.mode)
+    return config
 
 
 def _progress(results: Sequence[EpisodeResult]) -> str:

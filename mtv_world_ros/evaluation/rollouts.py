@@ -43,6 +43,12 @@ class Stretch:
         return self.frames.shape[1] - 1
 
 
+def check_mode(mode: str) -> None:
+    """Raises ConfigError if it is none of `MODES`."""
+    if mode not in MODES:
+        raise ConfigError(f"mode is '{mode}'; it must be one of {', '.join(MODES)}")
+
+
 def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Stretch]:
     """Cuts an episode into what is imagined at once.
 
@@ -53,8 +59,7 @@ def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Str
         ConfigError: unknown mode.
         EpisodeError: the episode is shorter than a frame, or has gaps everywhere.
     """
-    if mode not in MODES:
-        raise ConfigError(f"mode is '{mode}'; it must be one of {', '.join(MODES)}")
+    check_mode(mode)
     total = floor(float(recording.times[-1] - recording.times[0]) * spec.fps + 1e-3)
     length = spec.num_frames if mode == 'observe' else max(total, 1)
     found: list[Stretch] = []
