@@ -43,30 +43,30 @@ class Stamps:
     """N round Gaussians, sub-pixel exact, clipped to the image.
 
     Attributes:
-        boxes: (N, 4) int, top, bottom, left, right inside the image; empty if not in sight.
-        across: (N, S) profile along x; column j is the pixel `origin[n, 0] + j`.
-        down: (N, S) profile along y; column j is the pixel `origin[n, 1] + j`.
-        origin: (N, 2) int x, y of the profiles' first pixel, may lie outside the image.
+        boxes: N boxes inside the image; empty if not in sight.
+        across: (N, S) profile along x; column j is the pixel `origins[n][0] + j`.
+        down: (N, S) profile along y; column j is the pixel `origins[n][1] + j`.
+        origins: N pixels (x, y) where the profiles begin, may lie outside the image.
     """
 
-    boxes: np.ndarray
+    boxes: list[Box]
     across: GlowArray
     down: GlowArray
-    origin: np.ndarray
+    origins: list[tuple[int, int]]
 
     def draw(self, image: GlowArray, n: int, brightness: float) -> Box:
         """Lays stamp n onto an (H, W) image, brightest wins; returns the box that it touched."""
         top, bottom, left, right = self.boxes[n]
         if top >= bottom or left >= right:
             return NO_BOX
-        x, y = self.origin[n]
+        x, y = self.origins[n]
         glow = np.multiply.outer(
             self.down[n, top - y : bottom - y] * np.float32(brightness),
             self.across[n, left - x : right - x],
         )
         part = image[top:bottom, left:right]
         np.maximum(part, glow, out=part)
-        return top, bottom, left, right
+        return self.boxes[n]
 
 
 def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int) -> Stamps:
@@ -88,10 +88,10 @@ def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int)
     right, bottom = after.clip(0, (width, height)).T
     bottom = np.where(seen, bottom, top)
     return Stamps(
-        boxes=np.stack([top, bottom, left, right], axis=1),
+        boxes=list(zip(*(edge.tolist() for edge in (top, bottom, left, right)), strict=True)),
         across=profiles[:, 0],
         down=profiles[:, 1],
-        origin=first,
+        origins=[(x, y) for x, y in first.tolist()],
     )
 
 
