@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,16 @@ BUNDLED = 'bundled'
 def checkpoint_path(name: str | Path) -> Path:
     """Returns the folder of a checkpoint; `bundled` is the one that ships with the package."""
     return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
+
+
+def fingerprint(checkpoint: str | Path) -> str:
+    """Returns the checkpoint's name and a hash of its files: other weights, other name."""
+    digest = hashlib.sha256()
+    folder = checkpoint_path(checkpoint)
+    for file in sorted(path for path in folder.rglob('*') if path.is_file()):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        digest.update(file.read_bytes())
+    return f'{checkpoint} ({digest.hexdigest()[:8]})'
 
 
 def robot_path(name: str | Path) -> Path:

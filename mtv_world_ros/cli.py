@@ -83,8 +83,8 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'replay',
         help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
-        epilog='Without --offline it takes the options of the ROS player (--rate, --loop, --clock, '
-        '--lock-step, ...): see python -m mtv_world_ros.ros.player --help.',
+        epilog='Without --offline it takes the options of the ROS player (--rate, --loop, '
+        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.player --help.',
         allow_abbrev=False,
     )
     parser.add_argument('episode', type=Path)
@@ -218,7 +218,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.assembly import fingerprint, load_pipeline
     from mtv_world_ros.evaluation.evaluate import evaluate
     from mtv_world_ros.training.run import find_episodes
 
@@ -233,6 +233,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         pipeline,
         find_episodes(arguments.dataset)[: arguments.episodes],
         arguments.out,
+        name=fingerprint(arguments.checkpoint),
         mode=arguments.mode,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,

@@ -246,11 +246,10 @@ class Pipeline:
             masks,
             start_masks,
             start.cameras,
-            tuple(
-                camera_poses(camera, self.robot, rollout.positions[-1:])[0]
-                for camera in start.cameras
-            ),
+            self._camera_poses(start.cameras, rollout.positions[-1:]),
             instruction,
+            T_base_camera_start=self._camera_poses(start.cameras, positions[:1]),
+            gripper_openings=self.robot.gripper_openings(rollout.positions[-1:])[:, 0],
         )
         clock.lap('success')
         return Prediction(
@@ -265,6 +264,12 @@ class Pipeline:
             num_chunks=num_chunks,
             seconds=MappingProxyType(clock.seconds),
         )
+
+    def _camera_poses(
+        self, cameras: tuple[CameraModel, ...], positions: FloatArray
+    ) -> tuple[FloatArray, ...]:
+        """V poses (4, 4) at positions (1, J)."""
+        return tuple(camera_poses(camera, self.robot, positions)[0] for camera in cameras)
 
     def draw(
         self,

@@ -24,7 +24,7 @@ from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 __all__ = ['EstimatorConfig', 'SuccessEstimator', 'load_tasks']
 
 #: a gripper at least this open has let go
-OPEN_GRIPPER = 0.5
+OPEN_GRIPPER = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
