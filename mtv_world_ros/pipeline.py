@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from math import ceil
 import time
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -186,18 +186,17 @@ class Pipeline:
         names = self.objects or objects_from_instruction(instruction)
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
         positions = resample(trajectory, observation.positions, times)
+        request = _Request(names, instruction, num_inference_steps, should_stop)
         for chunk in range(num_chunks):
-            window = slice(chunk * spec.num_frames, (chunk + 1) * spec.num_frames + 1)
-            prediction = self._imagine_chunk(
-                start,
-                times[window],
-                positions[window],
-                min(spec.num_frames, total - chunk * spec.num_frames),
-                names=names,
-                instruction=instruction,
-                seed=seed + chunk,
-                num_inference_steps=num_inference_steps,
-                should_stop=should_stop,
+            first = chunk * spec.num_frames
+            window = slice(first, first + spec.num_frames + 1)
+            num_kept = min(spec.num_frames, total - first)
+            parts = self._imagine_chunk(
+                start, times[window], positions[window], num_kept, request, seed + chunk
+            )
+            prediction = Prediction(
+                **parts,
+                cameras=start.cameras,
                 stamp_ns=observation.stamp_ns,
                 chunk=chunk,
                 num_chunks=num_chunks,
@@ -211,18 +210,12 @@ class Pipeline:
         times: FloatArray,
         positions: FloatArray,
         num_kept: int,
-        *,
-        names: tuple[str, ...],
-        instruction: str,
+        request: _Request,
         seed: int,
-        num_inference_steps: int,
-        should_stop: Callable[[], bool],
-        stamp_ns: int,
-        chunk: int,
-        num_chunks: int,
-    ) -> Prediction:
+    ) -> dict[str, Any]:
+        """What is made of one chunk: fields of `Prediction`."""
         clock = _Clock()
-        start_masks = self.segmenter.segment(start.frames[:, None], names)
+        start_masks = self.segmenter.segment(start.frames[:, None], request.names)
         clock.lap('start masks')
         control = self.draw(start.cameras, positions, times, start_masks)
         clock.lap('trajectory video')
@@ -230,11 +223,12 @@ class Pipeline:
             start.frames,
             control.frames,
             seed=seed,
-            num_inference_steps=num_inference_steps,
-            should_stop=should_stop,
+            num_inference_steps=request.num_inference_steps,
+            should_stop=request.should_stop,
         )[:, :num_kept]
         clock.lap('model')
-        masks = self.segmenter.segment(frames, names, first_masks=start_masks.masks[:, :, 0])
+        first = start_masks.masks[:, :, 0]
+        masks = self.segmenter.segment(frames, request.names, first_masks=first)
         clock.lap('masks')
         rollout = Rollout(
             video=MultiViewVideo(views=start.views, times=times[1 : num_kept + 1], frames=frames),
@@ -247,23 +241,19 @@ class Pipeline:
             start_masks,
             start.cameras,
             self._camera_poses(start.cameras, rollout.positions[-1:]),
-            instruction,
+            request.instruction,
             T_base_camera_start=self._camera_poses(start.cameras, positions[:1]),
             gripper_openings=self.robot.gripper_openings(rollout.positions[-1:])[:, 0],
         )
         clock.lap('success')
-        return Prediction(
-            rollout=rollout,
-            trajectory_video=control,
-            start_masks=start_masks,
-            masks=masks,
-            success=success,
-            cameras=start.cameras,
-            stamp_ns=stamp_ns,
-            chunk=chunk,
-            num_chunks=num_chunks,
-            seconds=MappingProxyType(clock.seconds),
-        )
+        return {
+            'rollout': rollout,
+            'trajectory_video': control,
+            'start_masks': start_masks,
+            'masks': masks,
+            'success': success,
+            'seconds': MappingProxyType(clock.seconds),
+        }
 
     def _camera_poses(
         self, cameras: tuple[CameraModel, ...], positions: FloatArray
@@ -287,6 +277,15 @@ class Pipeline:
             object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
             config=self.rendering,
         )
+
+
+class _Request(NamedTuple):
+    """What all chunks of a rollout share; see `Pipeline.imagine`."""
+
+    names: tuple[str, ...]
+    instruction: str
+    num_inference_steps: int
+    should_stop: Callable[[], bool]
 
 
 class _Clock:
