@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from math import ceil
 import time
 from types import MappingProxyType
@@ -20,13 +20,13 @@ from mtv_world_ros.data_types import (
     ObjectMasks,
     Observation,
     Rollout,
-    SuccessEstimate,
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
@@ -69,46 +69,6 @@ class WorldModel(Protocol):
             ModelMemoryError: the device ran out of memory.
         """
         ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
-    """One imagined chunk and what was made on the way.
-
-    Attributes:
-        rollout: the predicted frames; `video.times` [s] counts from the rollout's observation.
-        trajectory_video: 1 + T control frames, frame 0 at the chunk's start.
-        start_masks: object masks of the chunk's start frame (T = 1).
-        masks: object masks of the predicted frames.
-        success: the estimate at the end of this chunk.
-        cameras: the V cameras at the model's size.
-        stamp_ns: stamp of the rollout's observation [ns].
-        chunk: index of this chunk in its rollout.
-        num_chunks: chunks of the rollout.
-        seconds: time spent by stage [s].
-    """
-
-    rollout: Rollout
-    trajectory_video: MultiViewVideo
-    start_masks: ObjectMasks
-    masks: ObjectMasks
-    success: SuccessEstimate
-    cameras: tuple[CameraModel, ...]
-    stamp_ns: int
-    chunk: int
-    num_chunks: int
-    seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def end_observation(self) -> Observation:
-        """The last predicted frame as an observation, for chaining the next chunk onto it."""
-        video = self.rollout.video
-        return Observation(
-            cameras=self.cameras,
-            frames=video.frames[:, -1],
-            positions=self.rollout.positions[-1],
-            stamp_ns=self.stamp_ns + round(float(video.times[-1]) * 1e9),
-        )
 
 
 def _never() -> bool:

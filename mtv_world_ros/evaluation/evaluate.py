@@ -31,7 +31,8 @@ from mtv_world_ros.evaluation.scores import (
     true_masks,
 )
 from mtv_world_ros.evaluation.statistics import episode_means
-from mtv_world_ros.pipeline import Pipeline, Prediction
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.jaccard import mean_of_known
 

@@ -12,7 +12,7 @@ from mtv_world_ros.data import messages
 from mtv_world_ros.data.bag_writer import BagWriter
 from mtv_world_ros.data.episode import optical_frame
 from mtv_world_ros.data_types import ByteArray, CameraModel, ObjectMasks
-from mtv_world_ros.pipeline import Prediction
+from mtv_world_ros.prediction import Prediction
 
 NODE = '/world_model'
 FLOAT64 = 'std_msgs/msg/Float64'

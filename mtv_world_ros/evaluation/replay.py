@@ -15,7 +15,8 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.evaluation.prediction_writer import ERROR, OK, PredictionWriter
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.pipeline import Pipeline, Prediction
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.pipeline import Prediction
+from mtv_world_ros.prediction import Prediction
 
 #: kinds of frames, in the order of rows and columns
 KINDS = ('real', 'trajectory', 'imagined')

@@ -15,7 +15,8 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.pipeline import Pipeline, Prediction
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
 
 #: observe: every chunk from real frames; imagine: chunks chained from the episode's first frame
 MODES = ('observe', 'imagine')

@@ -11,7 +11,8 @@ import traceback
 
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
-from mtv_world_ros.pipeline import Pipeline, Prediction
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.observation_buffer import Scene
 from mtv_world_ros.ros.rejection import Reason, Rejection
 from mtv_world_ros.ros.timing import from_observation, TimeLimits

@@ -1,0 +1,56 @@
+"""One imagined chunk and what was made on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from mtv_world_ros.data_types import (
+    CameraModel,
+    MultiViewVideo,
+    ObjectMasks,
+    Observation,
+    Rollout,
+    SuccessEstimate,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """One imagined chunk and what was made on the way.
+
+    Attributes:
+        rollout: the predicted frames; `video.times` [s] counts from the rollout's observation.
+        trajectory_video: 1 + T control frames, frame 0 at the chunk's start.
+        start_masks: object masks of the chunk's start frame (T = 1).
+        masks: object masks of the predicted frames.
+        success: the estimate at the end of this chunk.
+        cameras: the V cameras at the model's size.
+        stamp_ns: stamp of the rollout's observation [ns].
+        chunk: index of this chunk in its rollout.
+        num_chunks: chunks of the rollout.
+        seconds: time spent by stage [s].
+    """
+
+    rollout: Rollout
+    trajectory_video: MultiViewVideo
+    start_masks: ObjectMasks
+    masks: ObjectMasks
+    success: SuccessEstimate
+    cameras: tuple[CameraModel, ...]
+    stamp_ns: int
+    chunk: int
+    num_chunks: int
+    seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def end_observation(self) -> Observation:
+        """The last predicted frame as an observation, for chaining the next chunk onto it."""
+        video = self.rollout.video
+        return Observation(
+            cameras=self.cameras,
+            frames=video.frames[:, -1],
+            positions=self.rollout.positions[-1],
+            stamp_ns=self.stamp_ns + round(float(video.times[-1]) * 1e9),
+        )
