@@ -58,7 +58,7 @@ setup(
         'zstandard>=0.22',
     ],
     extras_require={
-        'train': ['accelerate>=1.15', 'peft>=0.21', 'tensorboard>=2.21'],
+        'train': ['tensorboard>=2.21'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
