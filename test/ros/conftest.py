@@ -137,10 +137,10 @@ class Client:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def connect_outputs(self, topics, timeout_s=TIMEOUT_S):
+    def connect_outputs(self, topics, timeout_s=TIMEOUT_S, depth=NUM_FRAMES):
         """Subscribes to `{topic: type}` and waits for their publishers."""
         for topic, kind in topics.items():
-            self.subscribe(kind, topic)
+            self.subscribe(kind, topic, depth)
         for topic in topics:
             self.wait(
                 lambda topic=topic: self.node.count_publishers(topic), f'a publisher of {topic}'
