@@ -40,18 +40,22 @@ def subscribe(
         guarded: wraps a handler so that it never raises.
     """
     kind, suffix = (CompressedImage, '/compressed') if compressed else (Image, '')
-    wanted: list[tuple[Any, str, Handler, int]] = []
+    newest: list[tuple[Any, str, Handler, int]] = []
     for view, topic in parameters.declare_camera_topics(node, views).items():
-        wanted += [
+        newest += [
             (CameraInfo, f'{topic}/camera_info', partial(buffer.add_camera_info, view), 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
         ]
-    wanted += [
+    newest += [
         (JointState, 'joint_states', buffer.add_joint_state, 10),
         (String, 'instruction', on_instruction, 1),
-        (JointTrajectory, 'joint_trajectory', on_trajectory, 10),
     ]
-    return [
-        MatchedSubscription(node, kind, topic, guarded(handle), depth)
-        for kind, topic, handle, depth in wanted
+    subscriptions = [
+        MatchedSubscription(node, kind, topic, guarded(handle), depth=depth)
+        for kind, topic, handle, depth in newest
     ]
+    handle = guarded(on_trajectory)
+    plans = MatchedSubscription(
+        node, JointTrajectory, 'joint_trajectory', handle, depth=10, default='reliable'
+    )
+    return [*subscriptions, plans]

@@ -22,9 +22,10 @@ _HIGHEST = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 class MatchedSubscription:
     """Starts with what every publisher can serve and asks for more once all of them offer it.
 
-    The better subscription takes over when it is connected, so nothing is lost between the two.
-    `qos_overrides.<topic>.subscription.reliability` (match, reliable, best_effort) and
-    `.depth` override it.
+    Nothing is lost between the two: the first goes only at a refresh after the second is
+    connected. Until then a message may come twice, so that this is for messages of which the
+    newest counts. `qos_overrides.<topic>.subscription.reliability` (match, reliable, best_effort)
+    and `.depth` override what it does.
 
     Args:
         node: owner.
@@ -32,16 +33,24 @@ class MatchedSubscription:
         topic: relative or absolute name.
         callback: gets the messages.
         depth: messages kept.
+        default: `match`, or `reliable`, `best_effort` for a plain subscription.
     """
 
     def __init__(
-        self, node: Node, kind: Any, topic: str, callback: Callable[[Any], None], depth: int
+        self,
+        node: Node,
+        kind: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        *,
+        depth: int,
+        default: str = 'match',
     ) -> None:
         self._node, self._kind, self._callback = node, kind, callback
         self.topic = node.resolve_topic_name(topic)
         prefix = f'qos_overrides.{self.topic}.subscription'
         read_only = ParameterDescriptor(read_only=True)
-        choice = node.declare_parameter(f'{prefix}.reliability', 'match', read_only).value
+        choice = node.declare_parameter(f'{prefix}.reliability', default, read_only).value
         if choice not in _RELIABILITIES:
             raise ConfigError(
                 f"parameter '{prefix}.reliability' is '{choice}'; it must be one of "
@@ -54,9 +63,18 @@ class MatchedSubscription:
             self._qos = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
         self._current = self._create(self._qos)
         self._next: Subscription | None = None
+        self._is_next_connected = False
+
+    @property
+    def num_publishers(self) -> int:
+        """Publishers it is connected to."""
+        return self._current.get_publisher_count()
 
     def refresh(self) -> None:
-        """Looks at the publishers again."""
+        """Looks at the publishers again; to be called now and then."""
+        if self._next is not None and self._is_next_connected:
+            self._node.destroy_subscription(self._current)
+            self._current, self._next = self._next, None
         if not self._matches or self._next is not None:
             return
         offered = [
@@ -71,6 +89,7 @@ class MatchedSubscription:
         )
         if wanted != self._qos:
             self._qos = wanted
+            self._is_next_connected = False
             self._next = self._create(wanted)
 
     def _create(self, qos: tuple[Any, ...]) -> Subscription:
@@ -90,5 +109,4 @@ class MatchedSubscription:
         if self._next is None:
             self.refresh()
         elif qos == self._qos and event.current_count:
-            self._node.destroy_subscription(self._current)
-            self._current, self._next = self._next, None
+            self._is_next_connected = True

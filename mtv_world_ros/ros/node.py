@@ -186,6 +186,7 @@ class WorldModelNode(Node):
             'checkpoint': self._settings.checkpoint,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            **{f'publishers.{i.topic}': i.num_publishers for i in self._inputs},
             **self._buffer.ages(self.get_clock().now().nanoseconds),
         }
 

@@ -23,8 +23,8 @@ from mtv_world_ros.ros.worker import Chunk, Ended, Result
 
 #: pause between two frames of a burst [s]: other callbacks get their turn
 _BURST_PERIOD_S = 0.0005
-#: pause between two bursts [s]: a subscriber of one chunk's depth gets to empty its queue
-_BURST_PAUSE_S = 0.05
+#: pause between two chunks of a rollout [s]: subscribers of one chunk's depth empty their queue
+_BURST_PAUSE_S = 0.1
 
 
 @dataclass(slots=True)
@@ -146,7 +146,8 @@ class PredictionPublisher:
             self._on_ended(result)
             return
         sent, self._sent = self._sent, Sent()
-        self._not_before_s = time.monotonic() + _BURST_PAUSE_S
+        is_last = result.prediction.chunk + 1 == result.prediction.num_chunks
+        self._not_before_s = 0.0 if is_last else time.monotonic() + _BURST_PAUSE_S
         self._on_sent(result, sent)
 
     def _publish_frame(self, chunk: Chunk) -> None:

@@ -83,6 +83,8 @@ class Reporter:
 
     def crash(self, error: Exception) -> None:
         """Counts an error that nobody raised on purpose."""
+        if not self._node.context.ok():
+            return  # ROS was shut down under a callback
         self._node.get_logger().error(''.join(traceback.format_exception(error)))
         text = f'{type(error).__name__}: {error}'
         self._tally.reject(Rejection(Reason.INTERNAL_ERROR, text), time.monotonic())

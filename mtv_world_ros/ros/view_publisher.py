@@ -81,6 +81,7 @@ class _Stream:
         self._image = create_publisher(node, Image, f'{name}/image_raw', depth)
         self._info = create_publisher(node, CameraInfo, f'{name}/camera_info', depth)
         self._compressed: Publisher | None = None
+        self._scaled: tuple[CameraInfo, CameraInfo] | None = None
 
     def offer_compressed(self, node: Node) -> None:
         topic = f'{self._name}/image_raw/compressed'
@@ -92,11 +93,18 @@ class _Stream:
     def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
         height, width = pixels.shape[:2]
         if self._info.get_subscription_count():
-            self._info.publish(scale_camera_info(info, width, height, header))
+            self._info.publish(self._scale(info, width, height, header))
         if self._image.get_subscription_count():
             self._image.publish(to_image(pixels, header))
         if self._compressed is not None and self._compressed.get_subscription_count():
             self._compressed.publish(to_compressed(pixels, header, quality))
+
+    def _scale(self, info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:
+        """Scales an info once for all frames of a rollout."""
+        if self._scaled is None or self._scaled[0] is not info:
+            self._scaled = info, scale_camera_info(info, width, height, header)
+        self._scaled[1].header = header
+        return self._scaled[1]
 
     def _publishers(self) -> list[Publisher]:
         optional = [self._compressed] if self._compressed is not None else []

@@ -115,15 +115,23 @@ class Client:
         profile = QoSProfile(depth=10, durability=durability)
         for topic, kind in topics.items():
             self.publishers[topic] = self.node.create_publisher(kind, topic, profile)
-        for topic in topics:
-            publisher = self.publishers[topic]
-            self.wait(lambda p=publisher: self._is_settled(p), f'a subscriber of {topic}')
+        since = [time.monotonic()]
 
-    def _is_settled(self, publisher):
-        """The node's subscription asks for what is offered, and no other is left."""
+        def are_settled():
+            """For a while: graph and middleware tell each other with a delay."""
+            if not all(self._is_settled(topic) for topic in topics):
+                since[0] = time.monotonic()
+            return time.monotonic() > since[0] + 0.3
+
+        self.wait(are_settled, f'subscribers of {list(topics)}')
+
+    def _is_settled(self, topic):
+        """The node's subscription asks for what is offered, no other is left, and it is there."""
+        publisher = self.publishers[topic]
         infos = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
         reliable = [i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos]
-        return all(reliable) and publisher.get_subscription_count() == len(infos) > 0
+        is_known = self.diagnostic_values().get(f'publishers.{topic}', '1') != '0'
+        return all(reliable) and is_known and publisher.get_subscription_count() == len(infos) > 0
 
     def wait(self, condition, what='it', timeout_s=TIMEOUT_S):
         """Spins until the condition holds."""
@@ -197,6 +205,11 @@ class Client:
 
     def send_trajectory(self, message=None, **fields):
         self.publish('/joint_trajectory', message or make_trajectory(**fields))
+
+    def send_trajectory_and_wait_until_it_runs(self):
+        self.received['/diagnostics'].clear()
+        self.send_trajectory()
+        self.wait(lambda: self.diagnostic_values().get('busy') == 'true', 'the model')
 
     # what the node said
 

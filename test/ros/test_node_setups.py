@@ -170,7 +170,6 @@ def test_ends_cleanly_in_the_middle_of_a_rollout(start, new_client, ros, number)
     process = start('seed:=1002')  # the fake model goes on until it is told to stop
     client.connect_inputs(ros.INPUTS)
     client.send_scene()
-    client.send_trajectory()
-    client.wait(lambda: client.diagnostic_values().get('busy') == 'true', 'the model')
+    client.send_trajectory_and_wait_until_it_runs()
     assert process.stop(number) == 0
     assert 'Traceback' not in process.output()
