@@ -145,7 +145,7 @@ def load_recording(
         cameras=tuple(
             scaled(episode.cameras[view], spec.width, spec.height) for view in spec.views
         ),
-        times=(stamps - origin) * 1e-9,
+        times=np.asarray((stamps - origin) * 1e-9, np.float64),
         frames=np.stack(frames),
         object_ids=_object_ids(episode, stamps, spec),
         positions=_measured(episode, robot, stamps),

@@ -102,9 +102,7 @@ def test_out_of_memory_is_a_clear_error_and_the_next_call_works(
 
     with monkeypatch.context() as patch:
         patch.setattr(model.transformer, 'forward', fail)
-        with pytest.raises(
-            ModelMemoryError, match='out of memory on cpu with 2 views of 5 '
-        ):
+        with pytest.raises(ModelMemoryError, match='out of memory on cpu with 2 views of 5 '):
             predict(model)
     assert predict(model).shape == (2, 4, 32, 32, 3)
 
