@@ -123,7 +123,8 @@ class RolloutWorker:
         """Gives up what runs and waits, drops chunks not taken, forgets the last frames."""
         with self._changed:
             self._results = deque(r for r in self._results if isinstance(r, Ended))
-            for request in (self._running, self._pending):
+            running = None if self._abandoned else self._running
+            for request in (running, self._pending):
                 if request is not None:
                     self._put(Ended(request=request, state='reset', num_chunks=0))
             self._abandoned = self._running is not None
