@@ -87,6 +87,7 @@ class Pipeline:
         rendering: how trajectory videos look; must be what the model was trained with.
         object_mask: whether trajectory videos carry the object masks.
         objects: names of the objects; empty = the ones the instruction names.
+        limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
     robot: RobotModel
@@ -96,6 +97,7 @@ class Pipeline:
     rendering: TrajectoryVideoConfig
     object_mask: bool = True
     objects: tuple[str, ...] = ()
+    limit_tolerance: float = 1e-3
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -109,7 +111,7 @@ class Pipeline:
             TrajectoryError: joints missing, positions outside the limits.
         """
         matched = match_joints(trajectory, self.robot, current)
-        check_positions(self.robot, matched.positions)
+        check_positions(self.robot, matched.positions, tolerance=self.limit_tolerance)
         return matched
 
     def imagine(

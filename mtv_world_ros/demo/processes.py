@@ -58,7 +58,9 @@ def record_through_node(
         command += ['--overwrite', '--stamp', 'header', '--wait-timeout', str(_NODE_START_S)]
         recorder = _start('recorder', command, logs, environment)
         wanted = [f'/{view}/image_raw/compressed' for view in views] + ['/joint_trajectory']
-        command = _module('player', str(episode), '--clock', '--lock-step', '--wait-for', *wanted)
+        command = _module(
+            'player', str(episode), '--clock', '--lock-step', '--wait-for', *wanted, *recorded
+        )
         command += ['--wait-timeout', str(_NODE_START_S), '--answer-timeout', '300']
         player = _start('player', command, logs, environment)
         _wait(player, (node, recorder), logs)

@@ -81,6 +81,7 @@ class RequestMaker:
             num_inference_steps=settings.num_inference_steps,
             limits=limits,
             received_s=received_s,
+            limit_tolerance=settings.limit_tolerance,
         )
 
     def _real_scene(self, now_ns: int) -> Scene:

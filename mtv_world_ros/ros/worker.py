@@ -35,6 +35,7 @@ class Request:
         num_inference_steps: denoising steps a chunk.
         limits: what is too old or too long.
         received_s: when it came in [s], of `time.monotonic`.
+        limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
     rollout: int
@@ -48,6 +49,7 @@ class Request:
     num_inference_steps: int
     limits: TimeLimits
     received_s: float
+    limit_tolerance: float = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,9 +199,11 @@ class RolloutWorker:
         trajectory = from_observation(
             request.trajectory, request.stamp_ns, scene.observation.stamp_ns, request.limits
         )
-        pipeline = self._pipeline
-        if request.objects:
-            pipeline = replace(pipeline, objects=request.objects)
+        pipeline = replace(
+            self._pipeline,
+            objects=request.objects or self._pipeline.objects,
+            limit_tolerance=request.limit_tolerance,
+        )
         predictions = pipeline.imagine(
             scene.observation,
             trajectory,
