@@ -87,7 +87,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Pa
     assert sheet.shape[1] > 800
     assert (tmp_path / 'out' / 'comparison.mp4').stat().st_size > 10_000
     assert (tmp_path / 'out' / 'predictions' / 'metadata.yaml').is_file()
-    assert 'success estimate' in done.stdout
+    assert 'success estimate after each chunk' in done.stdout
 
 
 @needs_checkpoint

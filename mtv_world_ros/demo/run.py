@@ -146,6 +146,7 @@ def _report(
         'latency_s': [float(report['latency_s']) for report in reports],
         'real_time_factor': float(np.median([float(r['real_time_factor']) for r in reports])),
         'success': _known(success),
+        'success_by_chunk': [_known(float(chunk.report['success'])) for chunk in judged],
         'success_reasons': judged[-1].report['success_reasons'],
         'views': {view: {key: _known(means[view][key]) for key in keys} for view in views},
         'objects': [
@@ -190,9 +191,12 @@ def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
             f'{view:8} moving objects: J {_number(means["j_moving"])}, first frame held '
             f'{_number(means["j_copy_moving"])}; all objects: J {_number(means["j_object_mean"])}'
         )
-    success = report['success']
-    told = 'abstains' if success is None else f'{success:.2f}'
-    lines.append(f'success estimate: {told} (recorded outcome: {report["outcome"]})')
+    told = ', '.join(
+        'abstains' if value is None else f'{value:.2f}' for value in report['success_by_chunk']
+    )
+    lines.append(
+        f'success estimate after each chunk: {told} (recorded outcome: {report["outcome"]})'
+    )
     latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
     lines.append(
         f'{report["chunks"]} chunks, {report["frames_received"]} of '
