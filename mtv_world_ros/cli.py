@@ -6,8 +6,12 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.errors import MtvWorldError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.pipeline import Pipeline
 
 Handler = Callable[[argparse.Namespace], int]
 
@@ -42,13 +46,31 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_model_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
     parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
     parser.add_argument('--device', default='cpu')
-    parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = cores minus 1')
     parser.add_argument('--steps', type=int, default=4, help='denoising steps')
     parser.add_argument('--seed', type=int, default=0)
+
+
+def _add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
+
+
+def _add_dtype(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
+
+
+def _pipeline(arguments: argparse.Namespace) -> Pipeline:
+    from mtv_world_ros.assembly import load_pipeline
+
+    return load_pipeline(
+        arguments.checkpoint,
+        robot=arguments.robot,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        num_threads=arguments.threads,
+    )
 
 
 def _add_demo(commands: argparse._SubParsersAction) -> None:
@@ -57,6 +79,7 @@ def _add_demo(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episode', type=Path, help='default: the bundled one')
     parser.add_argument('--out', type=Path, default=Path('out/demo'))
+    _add_checkpoint(parser)
     _add_model_options(parser)
     parser.set_defaults(handler=_demo)
 
@@ -91,6 +114,8 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--offline', action='store_true', help='no ROS, as fast as it goes')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
+    _add_checkpoint(parser)
+    _add_dtype(parser)
     _add_model_options(parser)
     parser.set_defaults(handler=_replay)
 
@@ -98,19 +123,11 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 def _replay(arguments: argparse.Namespace) -> int:
     if not arguments.offline:
         return _play(arguments)
-    from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.evaluation.replay import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
-    pipeline = load_pipeline(
-        arguments.checkpoint,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        num_threads=arguments.threads,
-    )
     summary = replay_offline(
-        pipeline,
+        _pipeline(arguments),
         arguments.episode,
         out,
         calibration=arguments.calibration,
@@ -158,7 +175,7 @@ def _add_train(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, help='use only the first so many')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
-    parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
+    _add_dtype(parser)
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all cores')
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
     parser.set_defaults(handler=_train)
@@ -208,29 +225,18 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--mode', choices=('observe', 'imagine'), default='observe')
     parser.add_argument('--episodes', type=int, help='use only the first so many')
-    parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
-    parser.add_argument('--device', default='cpu')
-    parser.add_argument('--dtype', default='auto')
-    parser.add_argument('--threads', type=int, default=0)
-    parser.add_argument('--steps', type=int, default=4)
-    parser.add_argument('--seed', type=int, default=0)
+    _add_dtype(parser)
+    _add_model_options(parser)
     parser.set_defaults(handler=_evaluate)
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.evaluation.evaluate import evaluate
     from mtv_world_ros.training.run import find_episodes
 
-    pipeline = load_pipeline(
-        arguments.checkpoint,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        num_threads=arguments.threads,
-    )
     table = evaluate(
-        pipeline,
+        _pipeline(arguments),
         find_episodes(arguments.dataset)[: arguments.episodes],
         arguments.out,
         name=fingerprint(arguments.checkpoint),

@@ -87,8 +87,8 @@ def read_info(path: Path | str) -> EpisodeInfo:
 
 
 def list_episodes(folder: Path | str) -> list[Path]:
-    """Episode folders in a folder, by name; unfinished (hidden) ones are not among them."""
-    found = Path(folder).glob('*/metadata.yaml')
+    """Episode folders anywhere in a folder, by path; unfinished (hidden) ones are left out."""
+    found = Path(folder).rglob('metadata.yaml')
     return sorted(file.parent for file in found if not file.parent.name.startswith('.'))
 
 

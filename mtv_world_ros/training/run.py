@@ -13,6 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.mcap_reader import list_episodes
 from mtv_world_ros.data.recording_cache import cached_recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import MtvWorldError, TrainingError
@@ -32,7 +33,7 @@ def find_episodes(dataset: Path) -> list[Path]:
     Raises:
         TrainingError: there is none.
     """
-    found = sorted(path.parent for path in Path(dataset).rglob('metadata.yaml'))
+    found = list_episodes(dataset)
     if not found:
         raise TrainingError(
             f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
