@@ -1,5 +1,7 @@
 """Everything that "can go wrong" is sent to the running node: refused, counted, and it goes on."""
 
+import time
+
 import numpy as np
 import pytest
 
