@@ -1,0 +1,32 @@
+"""The command `mtv-world`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from mtv_world_ros.cli import collect, demo, evaluate, replay, train
+from mtv_world_ros.errors import MtvWorldError
+
+COMMANDS = (demo, replay, collect, train, evaluate)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs a command; returns the exit status (1 for an error of the user's)."""
+    parser = argparse.ArgumentParser(
+        prog='mtv-world', description='An online embodied world model for ROS 2.'
+    )
+    commands = parser.add_subparsers(required=True, metavar='COMMAND')
+    for command in COMMANDS:
+        command.add(commands)
+    arguments, more = parser.parse_known_args(argv)
+    arguments.player = more
+    if more and not getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
+        parser.error(f'unrecognized arguments: {" ".join(more)}')
+    try:
+        return arguments.handler(arguments)
+    except MtvWorldError as error:
+        print(f'mtv-world: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130

@@ -1,0 +1,38 @@
+"""`mtv-world demo`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from mtv_world_ros.cli.options import add_checkpoint, add_model_options
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'demo', help='replay the bundled episode through the real node and score what it imagines'
+    )
+    parser.add_argument('--episode', type=Path, help='default: the bundled one')
+    parser.add_argument('--out', type=Path, default=Path('out/demo'))
+    add_checkpoint(parser)
+    add_model_options(parser)
+    parser.set_defaults(handler=_demo)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.demo.run import run_demo
+    from mtv_world_ros.resources import share_path
+
+    text = run_demo(
+        arguments.episode or share_path('resource', 'demo_episode'),
+        arguments.out,
+        checkpoint=arguments.checkpoint,
+        robot=arguments.robot,
+        device=arguments.device,
+        num_threads=arguments.threads,
+        num_inference_steps=arguments.steps,
+        seed=arguments.seed,
+    )
+    print(text)
+    return 0

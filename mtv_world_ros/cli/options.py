@@ -1,0 +1,41 @@
+"""Options that several commands share, and the pipeline that they describe."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mtv_world_ros.pipeline import Pipeline
+
+
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Adds robot, device, threads, steps and seed."""
+    parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
+    parser.add_argument('--device', default='cpu')
+    parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = cores minus 1')
+    parser.add_argument('--steps', type=int, default=4, help='denoising steps')
+    parser.add_argument('--seed', type=int, default=0)
+
+
+def add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    """Adds `--checkpoint`."""
+    parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
+
+
+def add_dtype(parser: argparse.ArgumentParser) -> None:
+    """Adds `--dtype`."""
+    parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
+
+
+def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
+    """Returns the pipeline of a command's checkpoint and model options."""
+    from mtv_world_ros.assembly import load_pipeline
+
+    return load_pipeline(
+        arguments.checkpoint,
+        robot=arguments.robot,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        num_threads=arguments.threads,
+    )

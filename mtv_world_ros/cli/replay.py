@@ -1,0 +1,54 @@
+"""`mtv-world replay`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import sys
+
+from mtv_world_ros.cli.options import add_checkpoint, add_dtype, add_model_options, pipeline_of
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'replay',
+        help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
+        epilog='Without --offline it takes the options of the ROS player (--rate, --loop, '
+        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.player --help.',
+        allow_abbrev=False,
+    )
+    parser.add_argument('episode', type=Path)
+    parser.add_argument('--offline', action='store_true', help='no ROS, as fast as it goes')
+    parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
+    parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
+    add_checkpoint(parser)
+    add_dtype(parser)
+    add_model_options(parser)
+    parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    if not arguments.offline:
+        return _play(arguments)
+    from mtv_world_ros.evaluation.replay import replay_offline
+
+    out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
+    summary = replay_offline(
+        pipeline_of(arguments),
+        arguments.episode,
+        out,
+        calibration=arguments.calibration,
+        seed=arguments.seed,
+        num_inference_steps=arguments.steps,
+    )
+    print(summary)
+    return 0
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    import runpy
+
+    sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.player]
+    runpy.run_module('mtv_world_ros.ros.player', run_name='__main__')
+    return 0
