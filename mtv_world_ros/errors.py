@@ -50,6 +50,19 @@ class SimulatorError(MtvWorldError):
     """The simulator cannot render or build a scene."""
 
 
+class DescriptionError(MtvWorldError):
+    """The objects of a scene could not be had; not the same answer as "there are none".
+
+    Attributes:
+        status: `unreachable`, `timeout`, `rate_limited`, `server_error`, `rejected`, `refused`,
+            `invalid` or `unlisted`.
+    """
+
+    def __init__(self, text: str, status: str = 'invalid') -> None:
+        super().__init__(text)
+        self.status = status
+
+
 class RolloutPreempted(MtvWorldError):
     """A newer trajectory arrived; the running rollout was given up."""
 
