@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
+from mtv_world_ros.success.describer import Describer, InstructionDescriber
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.segmenter import ColourSegmenter, Segmenter
+
+if TYPE_CHECKING:
+    from mtv_world_ros.success.describer_config import DescriberConfig
+    from mtv_world_ros.success.vlm_describer import Chat
 
 BUNDLED = 'bundled'
 
@@ -113,3 +118,45 @@ def assemble(
 def assemble_segmenter() -> Segmenter:
     """The segmenter used where no weights of a larger one are at hand."""
     return ColourSegmenter()
+
+
+def assemble_describer(config: DescriberConfig | str | Path | None = None) -> Describer:
+    """Returns what names the objects of a scene; by default the instruction's words alone.
+
+    Args:
+        config: a configuration, or a YAML file like `config/describer.yaml`.
+
+    Raises:
+        ConfigError: the configuration is wrong, a key or a package is missing.
+        CheckpointError: the local model cannot be loaded.
+    """
+    from mtv_world_ros.success.describer_config import DescriberConfig, load_describer_config
+
+    if config is None:
+        return InstructionDescriber()
+    if not isinstance(config, DescriberConfig):
+        config = load_describer_config(Path(config))
+    if config.kind == 'list':
+        from mtv_world_ros.success.object_list import load_object_list
+
+        return load_object_list(Path(config.list))
+    chat = _chat(config)
+    if chat is None:
+        return InstructionDescriber()
+    from mtv_world_ros.success.description_cache import DescriptionCache
+    from mtv_world_ros.success.vlm_describer import VlmDescriber
+
+    return VlmDescriber(chat, DescriptionCache(Path(config.cache)) if config.cache else None)
+
+
+def _chat(config: DescriberConfig) -> Chat | None:
+    """The vision-language model, if one is asked for."""
+    if config.kind == 'openai' and config.openai:
+        from mtv_world_ros.success.openai_chat import OpenAIChat
+
+        return OpenAIChat(config.openai)
+    if config.kind == 'local' and config.local:
+        from mtv_world_ros.success.local_vlm import LocalVlm
+
+        return LocalVlm(config.local)
+    return None

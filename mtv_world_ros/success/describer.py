@@ -1,4 +1,4 @@
-"""From an instruction to the names of the objects it is about."""
+"""What names the objects of a scene, and the way to do it by the instruction's words alone."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Protocol
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.success.palette import PALETTE
+from mtv_world_ros.success.scene_objects import check_objects, SceneObject
 
 #: colour words that name an object although the colour segmenter cannot find it
 OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', 'silver', 'gold'})
@@ -21,12 +22,15 @@ _MAX_WORDS = 4
 class Describer(Protocol):
     """Names the objects of a scene."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[str, ...]:
-        """Returns the objects' names, each a short noun phrase.
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+        """Returns the objects; empty if there are none.
 
         Args:
             first_frame: (H, W, 3) uint8 RGB, a real frame, never a predicted one.
             instruction: what the robot was told.
+
+        Raises:
+            DescriptionError: they could not be had.
         """
         ...
 
@@ -34,10 +38,13 @@ class Describer(Protocol):
 class InstructionDescriber:
     """Names the objects that the instruction names by colour; looks at no image."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[str, ...]:
-        """Returns `objects_from_instruction(instruction)`."""
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+        """Returns what `objects_from_instruction` finds; no more than colours is known of it."""
         del first_frame
-        return objects_from_instruction(instruction)
+        names = objects_from_instruction(instruction)
+        return check_objects(
+            [{'name': name, 'colour': name.split()[0]} for name in names], complete=False
+        )
 
 
 def objects_from_instruction(instruction: str) -> tuple[str, ...]:

@@ -27,7 +27,9 @@ def test_objects_are_the_coloured_noun_phrases_in_order(instruction, expected):
 
 def test_describer_needs_no_image():
     frame = np.zeros((2, 2, 3), np.uint8)
-    assert InstructionDescriber().describe(frame, 'lift the cyan cube') == ('cyan cube',)
+    (found,) = InstructionDescriber().describe(frame, 'lift the cyan cube')
+    assert (found.name, found.colour, found.role) == ('cyan cube', 'cyan', None)
+    assert InstructionDescriber().describe(frame, 'lift it') == ()
 
 
 def test_colour_word_outside_the_palette_is_no_colour():
