@@ -17,6 +17,13 @@ from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.results import EpisodeResult, Summary
+from mtv_world_ros.evaluation.rollout_store import (
+    join,
+    rollout_path,
+    save_rollout,
+    stored_stretch,
+    StoredRollout,
+)
 from mtv_world_ros.evaluation.rollouts import (
     check_mode,
     imagine_stretch,
@@ -25,6 +32,7 @@ from mtv_world_ros.evaluation.rollouts import (
     stretches,
 )
 from mtv_world_ros.evaluation.scores import (
+    find_masks,
     score_frames,
     score_rows,
     ScoreRow,
@@ -34,7 +42,7 @@ from mtv_world_ros.evaluation.statistics import episode_means
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.success.describer import objects_from_instruction
-from mtv_world_ros.success.jaccard import mean_of_known
+from mtv_world_ros.success.jaccard import mean_of_known, object_scores
 
 #: sends (V, T, H, W, 3) frames through the model's autoencoder and back
 Reconstruct = Callable[[ByteArray], ByteArray]
@@ -193,9 +201,13 @@ class _Run:
         actions = self._actions(donor)
         rows: list[ScoreRow] = []
         chunks: list[Prediction] = []
+        shown: list[StoredRollout] = []
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._imagine(recording, stretch, recording)
-            rows += self._rows(recording, stretch, chunks, actions)
+            found, stored = self._rows(recording, stretch, chunks, actions)
+            rows += found
+            shown.append(stored)
+        save_rollout(rollout_path(self.out, Path(path).name), join(shown))
         seconds = [sum(chunk.seconds.values()) for chunk in chunks]
         return EpisodeResult(
             episode=Path(path).name,
@@ -235,7 +247,7 @@ class _Run:
         stretch: Stretch,
         chunks: list[Prediction],
         actions: Recording | None,
-    ) -> list[ScoreRow]:
+    ) -> tuple[list[ScoreRow], StoredRollout]:
         segmenter = self.pipeline.segmenter
         names = self.pipeline.objects or recording.objects
         truth = true_masks(
@@ -251,5 +263,16 @@ class _Run:
             shuffled = score_frames(frames, truth, segmenter)
         if self.reconstruct is not None:
             ceiling = score_frames(self.reconstruct(stretch.frames[:, 1:]), truth, segmenter)
-        predicted = score_frames(predicted_frames(chunks), truth, segmenter)
-        return score_rows(stretch, self.pipeline.spec.views, truth, predicted, shuffled, ceiling)
+        masks = find_masks(predicted_frames(chunks), truth, segmenter)
+        predicted = object_scores(masks, truth.masks)
+        rows = score_rows(stretch, self.pipeline.spec.views, truth, predicted, shuffled, ceiling)
+        stored = stored_stretch(
+            chunks,
+            stretch,
+            start_seconds=float(recording.times[stretch.start]),
+            fps=self.pipeline.spec.fps,
+            true_masks=truth.masks,
+            masks=masks,
+            j=predicted.frames,
+        )
+        return rows, stored

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.evaluation.video_file import encode_video
 from mtv_world_ros.prediction import Prediction
 
 #: kinds of frames, in the order of rows and columns
@@ -156,12 +155,9 @@ def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
 
 def write_png(path: Path, image: ByteArray) -> None:
     """Writes an RGB picture beside its name and renames it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode('.png', image[..., ::-1])
     assert done
-    beside = path.with_name(f'.{path.name}.part')
-    beside.write_bytes(data.tobytes())
-    beside.replace(path)
+    _write(path, data.tobytes())
 
 
 def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> None:
@@ -173,18 +169,13 @@ def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> 
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
     """
+    _write(path, encode_video(frames, fps, crf=crf))
+
+
+def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f'.{path.name}.part')
-    rate = Fraction(fps).limit_denominator(1000)
-    options = {'crf': str(crf), 'preset': 'veryfast'}
-    with av.open(str(beside), 'w', format='mp4', options={'movflags': '+faststart'}) as container:
-        stream = container.add_stream('libx264', rate=rate, options=options)
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = 'yuv420p'
-        for frame in frames:
-            image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format='rgb24')
-            container.mux(stream.encode(image))
-        container.mux(stream.encode())
+    beside.write_bytes(data)
     beside.replace(path)
 
 

@@ -148,4 +148,6 @@ class Summary:
             'num_not_scored': sum(not np.isfinite(row.j) for row in rows),
             'status': {word: sum(row.status == word for row in rows) for word in status},
             'j_moving_by_frame': horizon(rows),
+            'j_copy_moving_by_frame': horizon(rows, 'j_copy_frames'),
+            'j_shuffled_moving_by_frame': horizon(rows, 'j_shuffled_frames'),
         }

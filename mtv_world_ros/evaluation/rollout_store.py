@@ -15,9 +15,12 @@ import zipfile
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
+from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.evaluation.report import compare
+from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video_file import decode_video, encode_video
+from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
 
 #: frames are shrunk until neither side is longer [px]; with `MAX_FRAMES` it bounds a file's size
@@ -74,6 +77,43 @@ class StoredRollout:
             found = getattr(self, name).shape
             if found != shape:
                 raise EpisodeError(f'rollout: {name} has shape {found}, expected {shape}')
+
+
+def stored_stretch(
+    chunks: Sequence[Prediction],
+    stretch: Stretch,
+    *,
+    start_seconds: float,
+    fps: float,
+    true_masks: ObjectMasks,
+    masks: ObjectMasks,
+    j: FloatArray,
+) -> StoredRollout:
+    """Returns what is kept of one stretch.
+
+    Args:
+        chunks: imagined from the stretch's first frame.
+        stretch: the recorded frames.
+        start_seconds: of the stretch since the episode's first frame [s].
+        fps: of the model.
+        true_masks: of the recorded frames 1..T.
+        masks: of the predicted frames.
+        j: (V, O, T) J per frame.
+    """
+    shown = compare(chunks, stretch.frames[:, 1:])
+    return StoredRollout(
+        views=shown.views,
+        objects=masks.names,
+        fps=fps,
+        stretches=np.full(len(shown.times), stretch.index),
+        times=shown.times + start_seconds,
+        real=shown.real,
+        trajectory=shown.trajectory,
+        imagined=shown.imagined,
+        true_masks=true_masks.masks,
+        masks=masks.masks,
+        j=j,
+    )
 
 
 def rollout_path(out: Path, episode: str) -> Path:

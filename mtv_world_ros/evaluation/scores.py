@@ -24,6 +24,9 @@ MOVING_RULE = (
     'quarter of its largest area do not count'
 )
 
+#: fields of a row that hold a value per frame
+FRAME_FIELDS = ('j_frames', 'j_copy_frames', 'j_shuffled_frames')
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoreRow:
@@ -42,6 +45,8 @@ class ScoreRow:
         j_shuffled: with the actions of another episode.
         j_ceiling: of recorded frames that went through the autoencoder.
         j_frames: (T,) J per frame.
+        j_copy_frames: the same of the first frame held.
+        j_shuffled_frames: the same with the actions of another episode; empty = not imagined.
     """
 
     stretch: int
@@ -56,11 +61,14 @@ class ScoreRow:
     j_shuffled: float
     j_ceiling: float
     j_frames: tuple[float, ...]
+    j_copy_frames: tuple[float, ...]
+    j_shuffled_frames: tuple[float, ...]
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values, None for NaN."""
         values = asdict(self)
-        values['j_frames'] = [_known(value) for value in self.j_frames]
+        for field in FRAME_FIELDS:
+            values[field] = [_known(value) for value in values[field]]
         return {
             key: _known(value) if isinstance(value, float) else value
             for key, value in values.items()
@@ -72,7 +80,8 @@ class ScoreRow:
         read: dict[str, Any] = {
             key: np.nan if value is None else value for key, value in values.items()
         }
-        read['j_frames'] = tuple(np.nan if v is None else v for v in values['j_frames'])
+        for field in FRAME_FIELDS:
+            read[field] = tuple(np.nan if v is None else v for v in values[field])
         return ScoreRow(**read)
 
 
@@ -131,10 +140,14 @@ def true_masks(
     return Truth(first=first, masks=masks, moving=moving)
 
 
+def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectMasks:
+    """Segments (V, T, H, W, 3) frames, starting from the recorded first masks."""
+    return segmenter.segment(frames, truth.names, first_masks=truth.first.masks[:, :, 0])
+
+
 def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectScores:
     """Scores (V, T, H, W, 3) frames; the segmenter starts from the recorded first masks."""
-    found = segmenter.segment(frames, truth.names, first_masks=truth.first.masks[:, :, 0])
-    return object_scores(found, truth.masks)
+    return object_scores(find_masks(frames, truth, segmenter), truth.masks)
 
 
 def score_rows(
@@ -150,7 +163,6 @@ def score_rows(
     rows = []
     for v, view in enumerate(views):
         for o, name in enumerate(truth.names):
-            frames = predicted.frames[v, o]
             rows.append(
                 ScoreRow(
                     stretch=stretch.index,
@@ -164,11 +176,17 @@ def score_rows(
                     j_copy=float(copy.objects[v, o]),
                     j_shuffled=_value(shuffled, v, o),
                     j_ceiling=_value(ceiling, v, o),
-                    j_frames=tuple(frames.tolist()),
+                    j_frames=_frames(predicted, v, o),
+                    j_copy_frames=_frames(copy, v, o),
+                    j_shuffled_frames=_frames(shuffled, v, o),
                 )
             )
         rows.append(_union_row(stretch, view, v, predicted, copy, shuffled, ceiling))
     return rows
+
+
+def _frames(scores: ObjectScores | None, view: int, item: int) -> tuple[float, ...]:
+    return () if scores is None else tuple(scores.frames[view, item].tolist())
 
 
 def _value(scores: ObjectScores | None, view: int, item: int) -> float:
@@ -198,4 +216,6 @@ def _union_row(
         j_shuffled=nan if shuffled is None else float(shuffled.union[v]),
         j_ceiling=nan if ceiling is None else float(ceiling.union[v]),
         j_frames=(),
+        j_copy_frames=(),
+        j_shuffled_frames=(),
     )

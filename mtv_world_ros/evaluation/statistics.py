@@ -129,9 +129,17 @@ def _percentiles(values: FloatArray) -> Interval:
     return (float(low), float(high))
 
 
-def horizon(rows: Sequence[ScoreRow], *, moving: bool = True) -> list[float]:
-    """Returns the mean J of each predicted frame, 1..T, over rows of (moving) objects."""
-    kept = [row.j_frames for row in rows if row.name and (row.moving or not moving)]
+def horizon(
+    rows: Sequence[ScoreRow], field: str = 'j_frames', *, moving: bool = True
+) -> list[float]:
+    """Returns the mean J of each predicted frame, 1..T, over rows of (moving) objects.
+
+    Args:
+        rows: scores.
+        field: one of `scores.FRAME_FIELDS`.
+        moving: only objects that really move.
+    """
+    kept = [getattr(row, field) for row in rows if row.name and (row.moving or not moving)]
     longest = max(map(len, kept), default=0)
     table = np.full((len(kept), longest), np.nan)
     for index, frames in enumerate(kept):

@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.evaluation.scores import ScoreRow
+from mtv_world_ros.evaluation.scores import FRAME_FIELDS, ScoreRow
 from mtv_world_ros.evaluation.statistics import Estimate
 
 #: columns of the Markdown tables: key -> heading
@@ -70,7 +70,8 @@ def rows_csv(rows: Iterable[tuple[str, str, ScoreRow]]) -> str:
     writer: csv.DictWriter[str] | None = None
     for episode, task, row in rows:
         values = {'episode': episode, 'task': task, **row.as_json()}
-        values.pop('j_frames')
+        for field in FRAME_FIELDS:
+            values.pop(field)
         values['name'] = row.name or '(union)'
         if writer is None:
             writer = csv.DictWriter(stream, list(values), lineterminator='\n')

@@ -32,7 +32,7 @@ def encode_video(
     rate = Fraction(fps).limit_denominator(1000)
     options = {'crf': str(crf), 'preset': preset}
     file = io.BytesIO()
-    with av.open(file, 'w', format='mp4', options={'movflags': '+faststart'}) as container:
+    with av.open(file, 'w', format='mp4') as container:
         stream = container.add_stream('libx264', rate=rate, options=options)
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = 'yuv444p' if full_colour else 'yuv420p'

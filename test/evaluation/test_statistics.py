@@ -22,6 +22,8 @@ def row(j, copy, *, name='red block', view='low', moving=True, frames=4, shuffle
         j_shuffled=shuffled,
         j_ceiling=NAN,
         j_frames=(j,) * frames,
+        j_copy_frames=(copy,) * frames,
+        j_shuffled_frames=(shuffled,) * frames,
     )
 
 
