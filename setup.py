@@ -59,6 +59,8 @@ setup(
     ],
     extras_require={
         'train': ['tensorboard>=2.21'],
+        # Vision-language models that name objects: behind a server, or here.
+        'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.

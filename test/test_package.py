@@ -21,6 +21,7 @@ MODULES = sorted((ROOT / 'mtv_world_ros').rglob('*.py'))
 
 #: imported name -> the distribution that setup.py asks for, where they differ
 DISTRIBUTIONS = {
+    'PIL': 'pillow',
     'cv2': 'opencv-python-headless',
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',

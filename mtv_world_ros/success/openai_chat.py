@@ -214,7 +214,8 @@ def _client(config: OpenAIConfig, key: str) -> Any:
         import openai
     except ImportError as error:
         raise ConfigError(
-            "the describer 'openai' needs the package 'openai' (pip install openai)"
+            f"the describer 'openai' needs the package openai ({error}); "
+            "pip install 'mtv_world_ros[describe]'"
         ) from error
     return openai.OpenAI(
         api_key=key or 'none',
