@@ -219,8 +219,11 @@ class ObjectMasks:
     Attributes:
         names: O names.
         masks: (V, O, T, H, W) bool.
-        status: V tuples of O words: `ok`, or why the mask is not to be trusted (`absent`,
-            `ambiguous`, `out_of_palette`, `area_jump`, `teleport`).
+        status: V tuples of O words: `ok`, or why the mask is not to be trusted: never seen
+            (`absent`), seen and then missing (`lost`; `out_of_view` from the image's edge on),
+            one of several or no known colour (`ambiguous`, `out_of_palette`), found without
+            certainty (`low_confidence`), jumps (`area_jump`, `teleport`), a frame that the
+            simulator's masks do not cover (`not_recorded`).
     """
 
     names: tuple[str, ...]

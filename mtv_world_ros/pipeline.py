@@ -190,7 +190,9 @@ class Pipeline:
         )[:, :num_kept]
         clock.lap('model')
         first = start_masks.masks[:, :, 0]
-        masks = self.segmenter.segment(frames, request.names, first_masks=first)
+        masks = self.segmenter.segment(
+            frames, request.names, first_masks=first, first_frames=start.frames
+        )
         clock.lap('masks')
         rollout = Rollout(
             video=MultiViewVideo(views=start.views, times=times[1 : num_kept + 1], frames=frames),

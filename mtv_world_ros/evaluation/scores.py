@@ -15,7 +15,7 @@ from mtv_world_ros.success.jaccard import (
     ObjectScores,
     persistence_scores,
 )
-from mtv_world_ros.success.segmenter import masks_from_ids, Segmenter
+from mtv_world_ros.success.segmenter import keep_doubts, masks_from_ids, Segmenter
 
 #: what `moving` means, for whoever reads the numbers
 MOVING_RULE = (
@@ -95,11 +95,13 @@ class Truth:
 
     Attributes:
         first: (V, O, H, W) masks of frame 0.
+        first_frames: (V, H, W, 3) uint8 RGB, frame 0.
         masks: of the frames 1..T.
         moving: (V, O) whether each object really moves.
     """
 
     first: ObjectMasks
+    first_frames: ByteArray
     masks: ObjectMasks
     moving: np.ndarray
 
@@ -127,17 +129,22 @@ def true_masks(
         use_ids: score against the recorded identities instead, where there are any. Which
             objects move is read from them in any case.
     """
-    first = segmenter.segment(stretch.frames[:, :1], names)
-    masks = segmenter.segment(stretch.frames[:, 1:], names, first_masks=first.masks[:, :, 0])
+    start = stretch.frames[:, 0]
+    first = segmenter.segment(start[:, None], names)
+    masks = segmenter.segment(
+        stretch.frames[:, 1:], names, first_masks=first.masks[:, :, 0], first_frames=start
+    )
+    masks = keep_doubts(first, masks)
     ids = stretch.object_ids
     if ids is None:
-        return Truth(first=first, masks=masks, moving=moves(masks.masks, first.masks[:, :, 0]))
+        moving = moves(masks.masks, first.masks[:, :, 0])
+        return Truth(first=first, first_frames=start, masks=masks, moving=moving)
     true_first = masks_from_ids(ids[:, :1], objects, names)
     true = masks_from_ids(ids[:, 1:], objects, names)
     moving = moves(true.masks, true_first.masks[:, :, 0])
     if use_ids:
-        return Truth(first=true_first, masks=true, moving=moving)
-    return Truth(first=first, masks=masks, moving=moving)
+        return Truth(first=true_first, first_frames=start, masks=true, moving=moving)
+    return Truth(first=first, first_frames=start, masks=masks, moving=moving)
 
 
 def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectMasks:

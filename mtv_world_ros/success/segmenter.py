@@ -11,22 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, ObservationError
 from mtv_world_ros.success.describer import colour_of
 from mtv_world_ros.success.palette import PALETTE
 from mtv_world_ros.success.tracking import Track, track, TrackingConfig
 
 Floats = NDArray[np.floating]
 
+#: a start mask of such a status may be another object's; nothing that follows it can tell
+START_DOUBTS = frozenset({'ambiguous', 'low_confidence'})
+
 
 class Segmenter(Protocol):
     """Finds named objects in videos."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for reports."""
+        ...
 
     def segment(
         self,
         frames: ByteArray,
         names: tuple[str, ...],
         first_masks: BoolArray | None = None,
+        first_frames: ByteArray | None = None,
     ) -> ObjectMasks:
         """Returns the objects' masks in every frame, with a status per view and object.
 
@@ -34,8 +43,43 @@ class Segmenter(Protocol):
             frames: (V, T, H, W, 3) uint8 RGB.
             names: O object names.
             first_masks: (V, O, H, W) masks just before the first frame, where known.
+            first_frames: (V, H, W, 3) uint8 RGB, the frames that `first_masks` belong to.
+
+        Raises:
+            ObservationError: sizes or numbers do not fit each other.
         """
         ...
+
+
+def check_request(
+    frames: ByteArray,
+    names: tuple[str, ...],
+    first_masks: BoolArray | None,
+    first_frames: ByteArray | None,
+) -> None:
+    """Checks what a segmenter is given, see `Segmenter.segment`.
+
+    Raises:
+        ObservationError: sizes or numbers do not fit each other.
+    """
+    if frames.ndim != 5 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+        raise ObservationError(
+            f'frames to segment are {frames.shape} {frames.dtype}; they must be '
+            '(views, frames, height, width, 3) uint8 RGB'
+        )
+    num_views, _, height, width, _ = frames.shape
+    wanted = (num_views, len(names), height, width)
+    if first_masks is not None and first_masks.shape != wanted:
+        raise ObservationError(
+            f'the start masks are {first_masks.shape} (views, objects, height, width), the frames '
+            f'and names want {wanted}; bring both to one size with `resize_masks`'
+        )
+    wanted = (num_views, height, width, 3)
+    if first_frames is not None and first_frames.shape != wanted:
+        raise ObservationError(
+            f'the frames of the start masks are {first_frames.shape}; they must be {wanted} like '
+            'the frames to segment'
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +118,8 @@ class ColourSegmenter:
     pieces are then followed from frame to frame.
     """
 
+    name = 'colour'
+
     def __init__(self, config: ColourSegmenterConfig | None = None) -> None:
         self.config = config or ColourSegmenterConfig()
         self._words = tuple(PALETTE)
@@ -86,8 +132,10 @@ class ColourSegmenter:
         frames: ByteArray,
         names: tuple[str, ...],
         first_masks: BoolArray | None = None,
+        first_frames: ByteArray | None = None,
     ) -> ObjectMasks:
-        """See `Segmenter.segment`."""
+        """See `Segmenter.segment`; `first_frames` are not needed."""
+        check_request(frames, names, first_masks, first_frames)
         num_views, num_frames, height, width, _ = frames.shape
         masks = np.zeros((num_views, len(names), num_frames, height, width), np.bool_)
         status: list[list[str]] = []
@@ -156,6 +204,23 @@ def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolA
     """Pixels that objects of the same colour word, found before, already hold."""
     held = [tracks[i].masks for i in rivals if i < index]
     return np.any(held, axis=0) if held else None
+
+
+def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
+    """Returns `masks`, doubted where it was uncertain which object they start from.
+
+    Args:
+        first: masks of the start frame.
+        masks: what was followed from them.
+    """
+    status = tuple(
+        tuple(
+            doubt if doubt in START_DOUBTS and word == 'ok' else word
+            for doubt, word in zip(doubts, words, strict=True)
+        )
+        for doubts, words in zip(first.status, masks.status, strict=True)
+    )
+    return ObjectMasks(names=masks.names, masks=masks.masks, status=status)
 
 
 def masks_from_ids(ids: ByteArray, objects: Sequence[str], names: Sequence[str]) -> ObjectMasks:

@@ -28,7 +28,8 @@ class TrackingConfig:
         max_step: largest motion between frames, as a share of the image's diagonal.
         max_growth: largest area, relative to that of the frame before; areas below a few
             `min_area_share` count as that, for an object may come out from behind a gripper.
-        max_missing: share of frames without the object above which it is absent.
+        max_missing: share of frames without the object above which it is absent or, where it was
+            seen before, lost.
     """
 
     min_area_share: float = 0.0006
@@ -50,7 +51,7 @@ class Track:
 
     Attributes:
         masks: (T, H, W) bool.
-        status: `ok`, `absent`, `ambiguous`, `out_of_palette`, `area_jump` or `teleport`.
+        status: a word of `ObjectMasks.status`.
     """
 
     masks: BoolArray
@@ -64,11 +65,12 @@ class Track:
 
 @dataclass(slots=True)
 class _State:
-    """Where the object was last seen, and how large."""
+    """Where the object was last seen, how large, and whether at the image's edge."""
 
-    centre: FloatArray | None
+    centre: FloatArray | None = None
     area: float = 0.0
     gap: int = 0
+    at_edge: bool = False
     status: str = 'ok'
 
     def doubt(self, status: str) -> None:
@@ -94,19 +96,49 @@ def track(
     if taken is not None:
         pixels = pixels & ~taken
     masks = np.zeros(pixels.shape, np.bool_)
-    state = _State(centre=None)
+    state = _State()
     if first is not None:
-        state = _State(centre=_centroid(first), area=float(np.count_nonzero(first)))
+        _remember(first, state)
     for index, frame in enumerate(pixels):
         found = _find(frame, state, config)
         if found is None:
             state.gap += 1
             continue
         masks[index] = found
-    missing = 1.0 - masks.any((1, 2)).mean() if len(masks) else 1.0
-    if missing > config.max_missing:
-        state.doubt('absent')
+    _doubt_if_missing(masks, state, config)
     return Track(masks=masks, status=state.status)
+
+
+def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
+    """Returns the status of masks that something else tracked.
+
+    Args:
+        masks: (T, H, W) as tracked.
+        first: (H, W) the mask they were tracked from, not empty.
+        config: when to doubt.
+    """
+    state = _State()
+    _remember(first, state)
+    for mask in masks:
+        if mask.any():
+            _check(mask, state, config, hypot(*mask.shape))
+        else:
+            state.gap += 1
+    _doubt_if_missing(masks, state, config)
+    return state.status
+
+
+def _doubt_if_missing(masks: BoolArray, state: _State, config: TrackingConfig) -> None:
+    """Says why an object is not seen: never there, out of the image, or lost inside it."""
+    missing = 1.0 - masks.any((1, 2)).mean() if len(masks) else 1.0
+    if missing <= config.max_missing:
+        return
+    if state.centre is None:
+        state.doubt('absent')
+    elif state.at_edge:
+        state.doubt('out_of_view')
+    else:
+        state.doubt('lost')
 
 
 def _find(frame: BoolArray, state: _State, config: TrackingConfig) -> BoolArray | None:
@@ -156,7 +188,7 @@ def _join(main: int, pieces: Labels, stats: Labels, config: TrackingConfig) -> l
 
 
 def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: float) -> None:
-    """Doubts jumps in place or area, then remembers both."""
+    """Doubts jumps in place or area, then remembers the mask."""
     centre, area = _centroid(mask), float(np.count_nonzero(mask))
     if state.centre is not None:
         step = hypot(*(centre - state.centre))
@@ -164,8 +196,14 @@ def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: flo
             state.doubt('teleport')
     if state.area and area > config.max_growth * max(state.area, 5 * config.min_area(mask.shape)):
         state.doubt('area_jump')
-    state.centre, state.gap = centre, 0
-    state.area = area
+    _remember(mask, state)
+
+
+def _remember(mask: BoolArray, state: _State) -> None:
+    state.centre, state.area = _centroid(mask), float(np.count_nonzero(mask))
+    state.gap = 0
+    border = (mask[0], mask[-1], mask[:, 0], mask[:, -1])
+    state.at_edge = any(bool(line.any()) for line in border)
 
 
 def _centroid(mask: BoolArray) -> FloatArray:

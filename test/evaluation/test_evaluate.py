@@ -94,7 +94,7 @@ def test_object_that_the_model_loses_scores_0_and_says_so(make_pipeline, episode
     metrics, _ = run(make_pipeline(Eraser()), episodes, tmp_path)
     low = metrics['views']['low']
     assert low['j_object_mean'] == 0.0 and low['num_not_scored'] == 0
-    assert set(low['status']) == {'predicted: absent'}
+    assert set(low['status']) == {'predicted: lost'}
 
 
 def test_finished_episodes_are_not_imagined_again(make_pipeline, episodes, oracle, tmp_path):

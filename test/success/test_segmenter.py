@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, ObservationError
 from mtv_world_ros.success.jaccard import jaccard
 from mtv_world_ros.success.palette import PALETTE
 from mtv_world_ros.success.segmenter import (
@@ -135,9 +135,38 @@ def test_sudden_growth_is_an_area_jump():
     assert segment(np.concatenate([small, large], 1), 'red block').status == (('area_jump',),)
 
 
-def test_object_that_vanishes_for_most_of_the_video_is_absent():
+def test_object_that_vanishes_for_most_of_the_video_is_lost():
     frames, _ = video([{'red': (40, 40)}] + [{'blue': (10, 10)}] * 3)
-    assert segment(frames, 'red block').status == (('absent',),)
+    assert segment(frames, 'red block').status == (('lost',),)
+
+
+def test_object_that_is_gone_from_the_start_mask_on_is_lost():
+    frames, _ = video([{'blue': (10, 10)}] * 3)
+    _, start = video([{'red': (40, 40)}])
+    found = segment(frames, 'red block', first_masks=start['red'][None])
+    assert found.status == (('lost',),) and not found.masks.any()
+
+
+def test_object_that_leaves_the_image_is_out_of_view():
+    frames, _ = video([{'red': (0, 40)}] + [{'blue': (40, 10)}] * 3)
+    assert segment(frames, 'red block').status == (('out_of_view',),)
+
+
+def test_start_masks_of_another_size_are_refused_with_both_sizes():
+    frames, true = video([{'red': (20, 40)}] * 2)
+    with pytest.raises(ObservationError, match=r'\(1, 1, 36, 48\).*\(1, 1, 72, 96\)'):
+        segment(frames, 'red block', first_masks=resize_masks(true['red'][None, :1], 48, 36))
+
+
+def test_start_masks_of_another_number_of_objects_are_refused():
+    frames, true = video([{'red': (20, 40)}] * 2)
+    with pytest.raises(ObservationError, match=r'want \(1, 2, 72, 96\)'):
+        segment(frames, 'red block', 'blue block', first_masks=true['red'][None, :1])
+
+
+def test_frames_that_are_not_bytes_are_refused():
+    with pytest.raises(ObservationError, match='float64.*uint8'):
+        segment(np.zeros((1, 1, HEIGHT, WIDTH, 3)), 'red block')
 
 
 def test_short_occlusion_stays_ok_and_empty():

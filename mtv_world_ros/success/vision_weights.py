@@ -1,0 +1,147 @@
+"""Public vision models from a local folder: found by type, checked, loaded without pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.errors import CheckpointError, ConfigError
+
+#: `model_type` in a folder's config.json -> (class in transformers, a public name of it)
+VISION_MODELS = {
+    'mm-grounding-dino': (
+        'MMGroundingDinoForObjectDetection',
+        'openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det',
+    ),
+    'sam2_video': ('Sam2VideoModel', 'facebook/sam2.1-hiera-tiny'),
+    'sam3_video': ('Sam3VideoModel', 'facebook/sam3'),
+}
+
+
+def find_weights(root: Path) -> dict[str, Path]:
+    """Returns the folders of vision models in or up to two levels below a folder, by type.
+
+    The folders' names do not matter; of two models of a type the first by name is taken.
+
+    Raises:
+        ConfigError: `root` is no folder.
+    """
+    if not root.is_dir():
+        raise ConfigError(
+            f"'{root}' is no folder; set MTV_WORLD_WEIGHTS to the folder that holds the weights, "
+            'or unset it to segment by colour'
+        )
+    found: dict[str, Path] = {}
+    for pattern in ('config.json', '*/config.json', '*/*/config.json'):
+        for config in sorted(root.glob(pattern)):
+            kind = _model_type(config)
+            if kind in VISION_MODELS:
+                found.setdefault(kind, config.parent)
+    return found
+
+
+def load_vision_model(folder: Path, kind: str, device: str) -> Any:
+    """Returns a model of `transformers`, float32, in evaluation mode.
+
+    Args:
+        folder: as `huggingface-cli download <name> --local-dir <folder>` leaves it.
+        kind: the `model_type` that its config.json must have, a key of `VISION_MODELS`.
+        device: `cpu`, `cuda`, ...
+
+    Raises:
+        CheckpointError: files are missing, broken, or of another model.
+        ConfigError: transformers is not installed.
+    """
+    class_name, public_name = VISION_MODELS[kind]
+    _check_folder(folder, kind, public_name)
+    transformers = import_transformers()
+    from safetensors import SafetensorError
+    import torch
+
+    transformers.utils.logging.disable_progress_bar()
+    try:
+        model, report = getattr(transformers, class_name).from_pretrained(
+            folder,
+            local_files_only=True,
+            use_safetensors=True,
+            dtype=torch.float32,
+            output_loading_info=True,
+        )
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        raise CheckpointError(f"the weights in '{folder}' cannot be read: {error}") from error
+    if report['missing_keys']:
+        raise CheckpointError(
+            f"the weights in '{folder}' lack {_some(sorted(report['missing_keys']))}; "
+            f'download {public_name} again'
+        )
+    return model.to(device).eval()
+
+
+def import_transformers() -> Any:
+    """Returns the package `transformers`.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import transformers
+    except ImportError as error:
+        raise ConfigError(
+            "the package 'transformers' is not installed; install mtv_world_ros[vision], or "
+            'choose the segmenter `colour`, which needs no weights'
+        ) from error
+    return transformers
+
+
+def load_tokenizer(folder: Path) -> Any:
+    """Returns the tokenizer beside the weights.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    if not any((folder / name).is_file() for name in ('tokenizer.json', 'vocab.txt')):
+        raise CheckpointError(f"'{folder}' has no tokenizer.json; download the whole repository")
+    return import_transformers().AutoTokenizer.from_pretrained(folder, local_files_only=True)
+
+
+def preprocessor_config(folder: Path) -> dict[str, Any]:
+    """Returns what the folder says of the preparation of images; empty where it says nothing."""
+    path = folder / 'preprocessor_config.json'
+    return _read(path) if path.is_file() else {}
+
+
+def _check_folder(folder: Path, kind: str, public_name: str) -> None:
+    config = folder / 'config.json'
+    if not config.is_file():
+        raise CheckpointError(
+            f"'{folder}' has no config.json; name a folder with {public_name} or another "
+            f'{kind} model'
+        )
+    found = _model_type(config)
+    if found != kind:
+        raise CheckpointError(
+            f"'{folder}' holds a model of type '{found}', not '{kind}' ({public_name})"
+        )
+    if not any(folder.glob('*.safetensors')):
+        raise CheckpointError(
+            f"'{folder}' has no *.safetensors; other formats are not loaded, for they may run code"
+        )
+
+
+def _model_type(config: Path) -> str:
+    return str(_read(config).get('model_type'))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"'{path}' cannot be read: {error}") from error
+    return values if isinstance(values, dict) else {}
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f' and {len(names) - 3} more' if len(names) > 3 else ''
+    return ', '.join(names[:3]) + more
