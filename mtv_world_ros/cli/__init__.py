@@ -21,6 +21,7 @@ def main(argv: list[str] | None = None) -> int:
         command.add(commands)
     arguments, more = parser.parse_known_args(argv)
     arguments.player = more
+    arguments.command_line = sys.argv[1:] if argv is None else argv
     if more and not getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
         parser.error(f'unrecognized arguments: {" ".join(more)}')
     try:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from mtv_world_ros.cli.options import add_dtype, add_model_options, pipeline_of
+from mtv_world_ros.cli.provenance import provenance
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -31,6 +32,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         find_episodes(arguments.dataset)[: arguments.episodes],
         arguments.out,
         name=fingerprint(arguments.checkpoint),
+        provenance={**provenance(arguments), 'dataset': str(arguments.dataset)},
         mode=arguments.mode,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 import json
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,7 @@ def evaluate(
     *,
     name: str = '',
     reconstruct: Reconstruct | None = None,
+    provenance: Mapping[str, str] = MappingProxyType({}),
     show_progress: bool = True,
     **options: Any,
 ) -> str:
@@ -93,6 +95,7 @@ def evaluate(
         name: identifies the checkpoint in the tables; only results of the same name are taken
             over, and none without a name.
         reconstruct: the autoencoder's round trip, for the ceiling.
+        provenance: what the results were made with, by heading; goes into metrics.json.
         show_progress: draw a progress bar.
         **options: fields of `EvaluationConfig`.
 
@@ -120,6 +123,7 @@ def evaluate(
         name=name,
         spec=pipeline.spec,
         settings=asdict(config),
+        provenance=provenance,
         results=sorted(results, key=lambda result: result.episode),
         failed=failed,
         seed=config.seed,

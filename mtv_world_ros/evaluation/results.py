@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,7 @@ class Summary:
         settings: how it was evaluated, by name; goes into metrics.json.
         results: scored episodes.
         failed: reason by path of those that could not be.
+        provenance: what the results were made with, by heading.
         seed: of the bootstrap.
         num_resamples: of the bootstrap.
     """
@@ -78,6 +79,7 @@ class Summary:
     settings: Mapping[str, Any]
     results: Sequence[EpisodeResult]
     failed: Mapping[str, str]
+    provenance: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
     num_resamples: int = 2000
 
@@ -102,7 +104,9 @@ class Summary:
         source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return {
             'name': self.name,
+            'provenance': self.provenance,
             'num_episodes': len(self.results),
+            'episodes': [result.episode for result in self.results],
             'num_episodes_failed': len(self.failed),
             'failed': self.failed,
             **self.settings,
