@@ -43,7 +43,8 @@ def attempt(request: Callable[[], bytes], config: RetryConfig) -> bytes:
             if not _is_passing(error.status_code, error.code):
                 raise
             asked = retry_after(error.response.headers)
-            wait = asked or backoff  # 'at once' would end in a flood of requests
+            # "at once" would end in a flood of requests
+            wait = backoff if asked is None else max(asked, config.first_wait_s)
             if time.monotonic() + wait > deadline:
                 raise
         time.sleep(wait)
