@@ -92,6 +92,11 @@ class Summary:
         tables.write_text(out / 'tables.md', text)
         return text
 
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the tasks."""
+        return sorted({result.task for result in self.results})
+
     def estimates(self, view: str | None, task: str | None = None) -> dict[str, Estimate]:
         """Returns the numbers of a view (None = all) and a task (None = all)."""
         chosen = [result for result in self.results if task in (None, result.task)]
@@ -110,10 +115,12 @@ class Summary:
             'num_episodes_failed': len(self.failed),
             'failed': self.failed,
             **self.settings,
+            'model': asdict(self.spec),
             'moving_rule': MOVING_RULE.format(source=source),
             'interval': f'95 % bootstrap over episodes, {self.num_resamples} resamples',
             'views': {view: self._view(view) for view in self.spec.views},
             'overall': self._view(None),
+            'tasks': {task: self._task(task) for task in self.tasks},
             'success': agreement(
                 [Judgement(probability=r.probability, outcome=r.outcome) for r in self.results]
             ),
@@ -124,12 +131,14 @@ class Summary:
     def markdown(self) -> str:
         """Returns the tables: view by number, and task and view by number."""
         views = [*self.spec.views]
-        tasks = sorted({result.task for result in self.results})
         counts = ', '.join(
-            f'{sum(r.task == task for r in self.results)} of {task or "no task"}' for task in tasks
+            f'{sum(r.task == task for r in self.results)} of {task or "no task"}'
+            for task in self.tasks
         )
         by_view = [(view, self.estimates(view)) for view in views]
-        by_task = [(f'{t} · {view}', self.estimates(view, t)) for t in tasks for view in views]
+        by_task = [
+            (f'{t} · {view}', self.estimates(view, t)) for t in self.tasks for view in views
+        ]
         parts = [
             f'# {self.name or "Evaluation"}\n\n{len(self.results)} episodes: {counts}.',
             BRACKETS,
@@ -140,13 +149,17 @@ class Summary:
             parts.append('\n'.join(f'- not scored: {p}: {why}' for p, why in self.failed.items()))
         return '\n\n'.join(parts) + '\n'
 
-    def _view(self, view: str | None) -> dict[str, Any]:
-        rows = [
-            row for r in self.results for row in r.rows if row.name and view in (None, row.view)
-        ]
+    def _task(self, task: str) -> dict[str, Any]:
+        views = {view: self._view(view, task) for view in self.spec.views}
+        number = sum(result.task == task for result in self.results)
+        return {'num_episodes': number, 'views': views, 'overall': self._view(None, task)}
+
+    def _view(self, view: str | None, task: str | None = None) -> dict[str, Any]:
+        chosen = [result for result in self.results if task in (None, result.task)]
+        rows = [row for r in chosen for row in r.rows if row.name and view in (None, row.view)]
         status = sorted({row.status for row in rows})
         return {
-            **tables.estimates_json(self.estimates(view)),
+            **tables.estimates_json(self.estimates(view, task)),
             'num_rows': len(rows),
             'num_moving': sum(row.moving for row in rows),
             'num_not_scored': sum(not np.isfinite(row.j) for row in rows),
