@@ -9,7 +9,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 ARMS = ('left', 'right')
 #: arm bases in the base frame [m]; both are turned +90 degrees about z, so they reach to +y
 BASE_POSITIONS = {'left': (-0.28, 0.0, 0.0), 'right': (0.28, 0.0, 0.0)}
-FINGER_WIDTH_M = 0.015
+FINGER_WIDTH_M, FINGER_THICKNESS_M = 0.015, 0.01
 
 _LIGHT, _MID, _DARK = '0.62 0.62 0.63 1', '0.36 0.36 0.38 1', '0.16 0.16 0.17 1'
 
@@ -126,7 +126,7 @@ def _finger_xml(arm: str, side: str, closed: float) -> str:
     # finger axes in link_6: x is -z, y is y, z is x
     face = -(x + sign * closed)
     outward = -sign if closes_upwards else sign
-    thickness = 0.005
+    thickness = FINGER_THICKNESS_M / 2
     low, high = _FINGER_RANGE if side == 'left' else (-_FINGER_RANGE[1], -_FINGER_RANGE[0])
     pad = f'{z - 0.110:.4f} {-y:.4f} {face + outward * thickness:.5f}'
     rail = f'{z - 0.074:.4f} {-y:.4f} {face + outward * 0.008:.5f}'

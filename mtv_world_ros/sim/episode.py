@@ -98,7 +98,7 @@ class SimEpisode:
             self._renderer = mujoco.Renderer(self._model, height, width)
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-        self._target = self.home
+        self._target, self._seen = self.home, []
         self._data.qpos[self._arm_qpos] = self._spread(self.home)
         self._data.ctrl[:] = self._spread(self.home)
         mujoco.mj_forward(self._model, self._data)
@@ -156,29 +156,38 @@ class SimEpisode:
         gripper = (measured[:, 6] - measured[:, 7]) / 2
         return np.concatenate([measured[:, :6], gripper[:, None]], axis=1).reshape(-1)
 
-    def object_positions(self) -> FloatArray:
-        """Returns the objects' centres (O, 3) in the base frame [m]."""
-        return np.array([self._data.body(item.role).xpos for item in self.scene.objects])
+    def object_poses(self) -> FloatArray:
+        """Returns T_base_object (O, 4, 4) of the objects' centres [m]."""
+        poses = np.tile(np.eye(4), (len(self.scene.objects), 1, 1))
+        for pose, item in zip(poses, self.scene.objects, strict=True):
+            body = self._data.body(item.role)
+            pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return poses
 
-    def history(self, centres: FloatArray, positions: FloatArray) -> History:
-        """Returns what predicates look at, from (T, O, 3) centres and (T, J) joints."""
+    def history(self) -> History:
+        """Returns what predicates look at: all that was observed since reset."""
+        poses = np.array([poses for poses, _ in self._seen])
+        scene = self.scene
         return History(
-            positions={item.role: centres[:, i] for i, item in enumerate(self.scene.objects)},
-            heights={item.role: item.size[2] for item in self.scene.objects},
-            openings=self.robot.gripper_openings(positions),
+            positions={item.role: poses[:, i, :3, 3] for i, item in enumerate(scene.objects)},
+            rotations={item.role: poses[:, i, :3, :3] for i, item in enumerate(scene.objects)},
+            sizes={item.role: item.size for item in scene.objects},
+            openings=self.robot.gripper_openings(np.array([seen for _, seen in self._seen])),
+            starts={item.role: poses[0, i, :3, 3] for i, item in enumerate(scene.objects)},
+            goals=tuple(np.asarray(goal) for goal in scene.goals),
         )
 
     def observe(self) -> SimObservation:
         """Renders all views and evaluates the task's predicate now."""
         positions = self.positions()
+        self._seen.append((self.object_poses(), positions))
         images, masks = self._render() if self._rendering else ({}, {})
-        history = self.history(self.object_positions()[None], positions[None])
         return SimObservation(
             time_s=self.time_s,
             images=images,
             masks=masks,
             positions=positions,
-            success=bool(self.task.succeeds(history)[0]),
+            success=bool(self.task.succeeds(self.history())[-1]),
         )
 
     def _render(self) -> tuple[dict[str, ByteArray], dict[str, ByteArray]]:

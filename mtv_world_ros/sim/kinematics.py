@@ -10,6 +10,7 @@ import pinocchio as pin
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot import RobotModel, Tool
+from mtv_world_ros.geometry.transforms import rotation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,15 +32,16 @@ class IkConfig:
     limit_margin: float = 0.005
 
 
-def top_down(position: FloatArray, yaw: float) -> FloatArray:
+def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
     """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
 
     The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
-    along the base's x.
+    along the base's x. `lean` [rad] swings the tool about its own x, in the plane of the travel.
     """
     cos, sin = np.cos(yaw), np.sin(yaw)
     pose = np.eye(4)
-    pose[:3, :3] = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
+    down = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
+    pose[:3, :3] = down @ rotation((np.sin(lean / 2), 0.0, 0.0, np.cos(lean / 2)))
     pose[:3, 3] = position
     return pose
 

@@ -27,7 +27,7 @@ class RecordConfig:
     """How an episode is sampled.
 
     Attributes:
-        duration_s: from the first frame to the last [s].
+        hold_s: from the end of the commands to the last frame, at least [s].
         frame_period_s: between frames [s]; a multiple of 0.02.
         chunk_s: the policy publishes an action chunk this often, of this horizon [s].
         point_period_s: between the points of a chunk [s]; a multiple of 0.02.
@@ -35,7 +35,7 @@ class RecordConfig:
         max_attempts: seeds tried before an episode is given up.
     """
 
-    duration_s: float = 7.0
+    hold_s: float = 0.6
     frame_period_s: float = 0.1
     chunk_s: float = 3.2
     point_period_s: float = 0.1
@@ -43,7 +43,7 @@ class RecordConfig:
     max_attempts: int = 25
 
     def __post_init__(self) -> None:
-        for field in ('duration_s', 'frame_period_s', 'chunk_s', 'point_period_s'):
+        for field in ('hold_s', 'frame_period_s', 'chunk_s', 'point_period_s'):
             value = getattr(self, field)
             periods = value / CONTROL_PERIOD_S
             if value <= 0 or abs(periods - round(periods)) > 1e-6:
@@ -62,7 +62,8 @@ class Take:
         commands: what the expert commanded.
         ever: the task's predicate held in some frame.
         final: it held in each of the last frames.
-        moved: (O,) distance of every object from its start at the end [m].
+        moved: role -> distance of the object from its start at the end [m].
+        missed: role of the object that the gripper is to miss; None = none.
         physics_s: CPU time of planning and physics.
         rendering_s: CPU time of building the scene and rendering.
     """
@@ -72,14 +73,15 @@ class Take:
     commands: JointTrajectory
     ever: bool
     final: bool
-    moved: FloatArray
+    moved: dict[str, float]
+    missed: str | None
     physics_s: float
     rendering_s: float
 
-    def is_as_wanted(self, *, miss: bool) -> bool:
-        """Returns whether a success succeeded and held, or a miss left all objects alone."""
-        if miss:
-            return not self.ever and bool((self.moved < MISS_TOLERANCE_M).all())
+    def is_as_wanted(self) -> bool:
+        """Returns whether a success succeeded and held, or a miss left its object alone."""
+        if self.missed is not None:
+            return not self.ever and self.moved[self.missed] < MISS_TOLERANCE_M
         return self.ever and self.final
 
 
@@ -100,18 +102,18 @@ def simulate(
     observations = [sim.reset(seed, task)]
     rendering = time.process_time() - started
     commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
-    measured, centres = [sim.positions()], [sim.object_positions()]
+    measured = [sim.positions()]
     every = round(config.frame_period_s / CONTROL_PERIOD_S)
-    for k in range(1, round(config.duration_s / CONTROL_PERIOD_S) + 1):
-        sim.advance(commands.positions[min(k, len(commands.times) - 1)])
+    last = len(commands.times) - 1
+    num_frames = -(-(last + round(config.hold_s / CONTROL_PERIOD_S)) // every)
+    for k in range(1, num_frames * every + 1):
+        sim.advance(commands.positions[min(k, last)])
         measured.append(sim.positions())
         if k % every == 0:
             before = time.process_time()
             observations.append(sim.observe())
             rendering += time.process_time() - before
-            centres.append(sim.object_positions())
-    track = np.asarray(centres)
-    history = sim.history(track, np.array([seen.positions for seen in observations]))
+    history = sim.history()
     ever, final = ever_and_final(task.succeeds(history))
     return Take(
         observations=tuple(observations),
@@ -119,7 +121,11 @@ def simulate(
         commands=commands,
         ever=ever,
         final=final,
-        moved=np.linalg.norm(track[-1] - track[0], axis=1),
+        moved={
+            role: float(np.linalg.norm(centres[-1] - centres[0]))
+            for role, centres in history.positions.items()
+        },
+        missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
         physics_s=time.process_time() - started - rendering,
         rendering_s=rendering,
     )

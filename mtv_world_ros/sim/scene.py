@@ -7,14 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.errors import nearest, SimulatorError
+from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.arm import actuators_xml, arm_xml, ARMS
 from mtv_world_ros.sim.cameras import camera_xml
+from mtv_world_ros.sim.shape_geoms import Size
+from mtv_world_ros.sim.shapes import shape_named
 
 TIMESTEP_S = 0.002
-BLOCK_DENSITY = 400.0  # kg/m3, light wood
+
+Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,9 +38,9 @@ class SceneObject:
     role: str
     name: str
     shape: str
-    size: tuple[float, float, float]
+    size: Size
     rgb: tuple[float, float, float]
-    position: tuple[float, float, float]
+    position: Place
     yaw: float
 
 
@@ -52,39 +56,31 @@ class SceneLook:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Everything that is drawn and simulated; the instance id of `objects[i]` is i + 1."""
+    """Everything that is drawn and simulated.
+
+    Attributes:
+        objects: the instance id of `objects[i]` is i + 1.
+        cameras: in the order of the views.
+        look: table and light.
+        goals: where the subject of each of the task's moves should come to rest [m].
+    """
 
     objects: tuple[SceneObject, ...]
     cameras: tuple[CameraModel, ...]
     look: SceneLook
+    goals: tuple[Place, ...] = ()
 
 
 def _numbers(values: tuple[float, ...]) -> str:
     return ' '.join(f'{value:.9g}' for value in values)
 
 
-def _block_geoms(item: SceneObject) -> str:
-    half = _numbers(tuple(extent / 2 for extent in item.size))
-    return (
-        f'<geom class="object" name="{item.role}" type="box" size="{half}" '
-        f'rgba="{_numbers(item.rgb)} 1" density="{BLOCK_DENSITY}"/>'
-    )
-
-
-#: shape -> geoms of the object's body
-SHAPES = {'block': _block_geoms}
-
-
 def _object_xml(item: SceneObject) -> str:
-    if item.shape not in SHAPES:
-        raise SimulatorError(
-            f"object '{item.name}' has shape '{item.shape}'{nearest(item.shape, SHAPES)}; "
-            f'known are {sorted(SHAPES)}'
-        )
+    geoms = shape_named(item.shape).geoms(item.size, item.rgb)
     turn = _numbers((float(np.cos(item.yaw / 2)), 0, 0, float(np.sin(item.yaw / 2))))
     return (
         f'<body name="{item.role}" pos="{_numbers(item.position)}" quat="{turn}">'
-        f'<freejoint name="{item.role}"/>{SHAPES[item.shape](item)}</body>'
+        f'<freejoint name="{item.role}"/>{geoms}</body>'
     )
 
 
@@ -134,13 +130,16 @@ def scene_xml(scene: Scene, robot: RobotModel) -> str:
 </mujoco>"""
 
 
+def rotation_of(item: SceneObject) -> FloatArray:
+    """Returns the (3, 3) rotation of an object as it is placed."""
+    return rotation((0.0, 0.0, np.sin(item.yaw / 2), np.cos(item.yaw / 2)))
+
+
 def corners(item: SceneObject) -> FloatArray:
     """Returns the (8, 3) corners of the object's bounding box in the base frame [m]."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     local = signs * np.asarray(item.size) / 2
-    cos, sin = np.cos(item.yaw), np.sin(item.yaw)
-    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return local @ turn.T + np.asarray(item.position)
+    return local @ rotation_of(item).T + np.asarray(item.position)
 
 
 def check_cameras(scene: Scene) -> None:

@@ -11,6 +11,7 @@ from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.opengl import load_mujoco, missing_opengl
 from mtv_world_ros.sim.randomize import draw_scene
 from mtv_world_ros.sim.scene import check_cameras, corners, scene_xml
+from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks import TASKS
 
 
@@ -52,6 +53,33 @@ def test_projected_block_corners_bound_the_rendered_mask(robot, expert, opengl):
                 seen += 1
     sim.close()
     assert seen >= 12
+
+
+@pytest.mark.parametrize('name', SHAPES)
+def test_every_shape_fills_its_bounding_box_and_rests_on_the_table(robot, expert, scene, name):
+    mujoco, shape = load_mujoco(rendering=False), SHAPES[name]
+    item = replace(
+        scene.objects[0], shape=name, size=shape.largest, yaw=0.0,
+        position=(0.0, 0.28, shape.largest[2] / 2),
+    )  # fmt: skip
+    model = mujoco.MjModel.from_xml_string(scene_xml(replace(scene, objects=(item,)), robot))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    body = model.body(item.role)
+    for geom in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]):
+        turn, centre, half = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom], None
+        half = np.abs(turn) @ centre[3:]
+        middle = data.geom_xpos[geom] + turn @ centre[:3]
+        low, high = np.minimum(low, middle - half), np.maximum(high, middle + half)
+    np.testing.assert_allclose(high - low, shape.largest, atol=0.006)
+    assert low[2] == pytest.approx(0.0, abs=0.003)
+    # let go, it stays where it is
+    start = data.qpos.copy()
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    rest = data.joint(item.role).qpos[:3]
+    np.testing.assert_allclose(rest, start[-7:-4], atol=0.004)
 
 
 def test_blocks_show_in_their_own_colour(robot, expert, opengl):
