@@ -13,7 +13,8 @@ from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.describer import Describer, InstructionDescriber
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter, Segmenter
+from mtv_world_ros.success.segmenter import Segmenter
+from mtv_world_ros.success.segmenter_choice import choose_segmenter
 
 if TYPE_CHECKING:
     from mtv_world_ros.success.describer_config import DescriberConfig
@@ -60,6 +61,7 @@ def load_pipeline(
     device: str = 'cpu',
     dtype: str = 'auto',
     num_threads: int = 0,
+    segmenter: str = 'auto',
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -71,6 +73,7 @@ def load_pipeline(
         device: `cpu`, `cuda`, ...
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
         num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
+        segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
@@ -82,7 +85,14 @@ def load_pipeline(
     set_num_threads(num_threads)
     loaded = load_checkpoint(checkpoint_path(checkpoint))
     world_model = DiffusionWorldModel(loaded, device=device, dtype=choose_dtype(dtype, device))
-    return assemble(loaded.card, world_model, robot=robot, objects=objects, task=task)
+    return assemble(
+        loaded.card,
+        world_model,
+        robot=robot,
+        objects=objects,
+        task=task,
+        segmenter=assemble_segmenter(segmenter, device=device),
+    )
 
 
 def assemble(
@@ -92,6 +102,7 @@ def assemble(
     robot: str | Path | None = None,
     objects: tuple[str, ...] = (),
     task: str | None = None,
+    segmenter: Segmenter | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says.
 
@@ -107,7 +118,7 @@ def assemble(
     return Pipeline(
         robot=model,
         world_model=world_model,
-        segmenter=assemble_segmenter(),
+        segmenter=segmenter or assemble_segmenter(),
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task),
         rendering=TrajectoryVideoConfig(**card['rendering']),
         object_mask=card['object_mask'],
@@ -115,9 +126,9 @@ def assemble(
     )
 
 
-def assemble_segmenter() -> Segmenter:
-    """The segmenter used where no weights of a larger one are at hand."""
-    return ColourSegmenter()
+def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:
+    """Returns the segmenter of that name, see `choose_segmenter`; its `name` says which it is."""
+    return choose_segmenter(choice, device=device)
 
 
 def assemble_describer(config: DescriberConfig | str | Path | None = None) -> Describer:

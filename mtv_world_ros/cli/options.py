@@ -10,12 +10,17 @@ if TYPE_CHECKING:
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Adds robot, device, threads, steps and seed."""
+    """Adds robot, device, threads, steps, seed and segmenter."""
     parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = cores minus 1')
     parser.add_argument('--steps', type=int, default=4, help='denoising steps')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument(
+        '--segmenter',
+        default='auto',
+        help='auto, colour, sam2 or sam3; auto = sam2 where MTV_WORLD_WEIGHTS has it, else colour',
+    )
 
 
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
@@ -38,4 +43,5 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
         device=arguments.device,
         dtype=arguments.dtype,
         num_threads=arguments.threads,
+        segmenter=arguments.segmenter,
     )
