@@ -162,6 +162,7 @@ class Pipeline:
                 stamp_ns=observation.stamp_ns,
                 chunk=chunk,
                 num_chunks=num_chunks,
+                segmenter=self.segmenter.name,
             )
             yield prediction
             start = prediction.end_observation

@@ -30,6 +30,7 @@ class Prediction:
         stamp_ns: stamp of the rollout's observation [ns].
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
+        segmenter: name of what found the masks.
         seconds: time spent by stage [s].
     """
 
@@ -42,6 +43,7 @@ class Prediction:
     stamp_ns: int
     chunk: int
     num_chunks: int
+    segmenter: str = ''
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     @property

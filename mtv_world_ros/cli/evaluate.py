@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_dtype, add_model_options, pipeline_of
+from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, pipeline_of
 from mtv_world_ros.cli.provenance import provenance
 
 
@@ -19,6 +19,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, help='use only the first so many')
     add_dtype(parser)
     add_model_options(parser)
+    add_segmenter(parser)
     parser.set_defaults(handler=_evaluate)
 
 

@@ -10,12 +10,16 @@ if TYPE_CHECKING:
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Adds robot, device, threads, steps, seed and segmenter."""
+    """Adds robot, device, threads, steps and seed."""
     parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = cores minus 1')
     parser.add_argument('--steps', type=int, default=4, help='denoising steps')
     parser.add_argument('--seed', type=int, default=0)
+
+
+def add_segmenter(parser: argparse.ArgumentParser) -> None:
+    """Adds `--segmenter`."""
     parser.add_argument(
         '--segmenter',
         default='auto',

@@ -6,7 +6,13 @@ import argparse
 from pathlib import Path
 import sys
 
-from mtv_world_ros.cli.options import add_checkpoint, add_dtype, add_model_options, pipeline_of
+from mtv_world_ros.cli.options import (
+    add_checkpoint,
+    add_dtype,
+    add_model_options,
+    add_segmenter,
+    pipeline_of,
+)
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -25,6 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
+    add_segmenter(parser)
     parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
 
 

@@ -17,6 +17,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides'
     )
+    parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
     parser.add_argument('--episodes', type=int, help='use only the first so many')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
@@ -32,7 +33,7 @@ def _train(arguments: argparse.Namespace) -> int:
     import torch
     import yaml
 
-    from mtv_world_ros.assembly import assemble_segmenter, robot_path
+    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
@@ -52,12 +53,13 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.dataset,
         arguments.out,
         robot=load_robot(robot_path(config.video.robot)),
-        segmenter=assemble_segmenter(),
+        segmenter=assemble_segmenter(device=arguments.device),
         seed=arguments.seed,
         device=arguments.device,
         dtype=choose_dtype(arguments.dtype, arguments.device),
         save_every=arguments.save_every,
         num_episodes=arguments.episodes,
+        initial=arguments.init and checkpoint_path(arguments.init),
     )
     print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
     return 0

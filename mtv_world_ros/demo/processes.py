@@ -96,6 +96,8 @@ def _node_command(options: DemoOptions) -> list[str]:
         'num_threads': str(options.num_threads),
         'num_inference_steps': str(options.num_inference_steps),
         'seed': str(options.seed),
+        # the same numbers whatever weights are at hand
+        'segmenter': 'colour',
     }
     assignments = [f'{key}:={value}' for key, value in values.items() if value]
     flags = [part for assignment in assignments for part in ('-p', assignment)]

@@ -87,7 +87,7 @@ def run_demo(
 def _score(
     recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
 ) -> Scored:
-    segmenter = assemble_segmenter()
+    segmenter = assemble_segmenter('colour')
     rows: list[ScoreRow] = []
     shown: list[tuple[np.ndarray, ...]] = []
     for index, chunk in enumerate(chunks):

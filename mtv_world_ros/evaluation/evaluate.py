@@ -122,7 +122,7 @@ def evaluate(
     summary = Summary(
         name=name,
         spec=pipeline.spec,
-        settings=asdict(config),
+        settings={**asdict(config), 'segmenter': pipeline.segmenter.name},
         provenance=provenance,
         results=sorted(results, key=lambda result: result.episode),
         failed=failed,
@@ -173,6 +173,7 @@ class _Run:
             'name': name,
             'spec': [list(spec.views), spec.fps, spec.num_frames, spec.width, spec.height],
             'ceiling': reconstruct is not None,
+            'segmenter': pipeline.segmenter.name,
         }
         self.settings.pop('num_resamples')
 

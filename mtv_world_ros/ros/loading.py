@@ -21,6 +21,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
         task=settings.task or None,
         device=settings.device,
         num_threads=settings.num_threads,
+        segmenter=settings.segmenter,
     )
 
 

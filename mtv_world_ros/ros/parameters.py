@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.success.segmenter_choice import SEGMENTERS
 
 MODES = ('observe', 'imagine')
 STAMP_MODES = ('target', 'source')
@@ -78,6 +79,12 @@ TABLE: tuple[Entry, ...] = (
     ),
     _at_start(
         'task', '', 'Task to judge (config/tasks); empty = the one the instruction matches.'
+    ),
+    _at_start(
+        'segmenter',
+        'auto',
+        'What finds the objects; auto = sam2 where MTV_WORLD_WEIGHTS has its weights, else colour.',
+        choices=SEGMENTERS,
     ),
     _at_start(
         'compressed_input', False, 'Subscribe to <camera>/image_raw/compressed (JPEG or PNG).'
@@ -145,6 +152,7 @@ class Settings:
     device: str
     num_threads: int
     task: str
+    segmenter: str
     compressed_input: bool
     mode: str
     diagnostics_period_s: float

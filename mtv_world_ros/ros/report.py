@@ -81,6 +81,7 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
         'success_high': success.interval[1],
         'success_reasons': '; '.join(success.reasons),
         'objects': masks.names,
+        'segmenter': prediction.segmenter,
     }
     for row, view in enumerate(prediction.rollout.video.views):
         for column, name in enumerate(masks.names):
