@@ -87,6 +87,7 @@ def train(
     dtype: torch.dtype = torch.float32,
     save_every: int = 250,
     num_episodes: int | None = None,
+    initial: Path | None = None,
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
@@ -101,6 +102,7 @@ def train(
         dtype: of forward and backward.
         save_every: steps between saved states.
         num_episodes: use only the first so many.
+        initial: checkpoint whose weights a new run starts from; a resumed one has its own.
 
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
@@ -128,6 +130,8 @@ def train(
     }
     trainer = Trainer(config, out, seed=seed, device=device, dtype=dtype, trained_on=trained_on)
     resumed = trainer.load_state()
+    if initial is not None and not resumed:
+        trainer.start_from(initial)
     tqdm.write(
         f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
         f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '

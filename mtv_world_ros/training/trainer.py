@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
-from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import condition, encode_frames
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
@@ -93,6 +93,24 @@ class Trainer:
             weight_decay=config.optimizer.weight_decay,
         )
         self.step = 0
+        self._share_weights()
+
+    def start_from(self, folder: Path) -> None:
+        """Takes the weights of a checkpoint of the same architecture; the optimizer starts anew.
+
+        Raises:
+            CheckpointError: the folder holds no checkpoint.
+            TrainingError: its transformer is of another shape.
+        """
+        weights = load_checkpoint(folder).transformer.state_dict()
+        try:
+            self.master.load_state_dict(weights)
+        except RuntimeError as error:
+            raise TrainingError(
+                f"'{folder}' does not fit the preset's transformer: {error}; give --preset the "
+                'one it was trained with, or leave --init out'
+            ) from error
+        self.ema.shadow_params = [p.detach().clone() for p in self.master.parameters()]
         self._share_weights()
 
     def run(

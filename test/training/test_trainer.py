@@ -168,3 +168,32 @@ def test_a_folder_without_episodes_says_how_to_get_some(tmp_path: Path) -> None:
 def test_a_wrong_setting_names_the_nearest(override: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_training_config('small', override)
+
+
+def test_a_run_may_start_from_the_weights_of_a_checkpoint(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    first = make(tiny, tmp_path / 'first')
+    run(first, source)
+    first.export(tmp_path / 'checkpoint', dtype=torch.float32)
+    second = make(tiny, tmp_path / 'second', seed=1)
+    second.start_from(tmp_path / 'checkpoint')
+    assert second.step == 0
+    for averaged, weight, worker in zip(
+        first.ema.shadow_params,
+        second.master.parameters(),
+        second.worker.parameters(),
+        strict=True,
+    ):
+        assert torch.equal(averaged, weight) and torch.equal(weight, worker)
+
+
+def test_weights_of_another_architecture_are_refused(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    first = make(tiny, tmp_path / 'first')
+    first.export(tmp_path / 'checkpoint')
+    layers = int(tiny.transformer['num_layers']) + 1
+    deeper = replace(tiny, transformer={**tiny.transformer, 'num_layers': layers})
+    with pytest.raises(TrainingError, match=r'--preset|--init'):
+        make(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
