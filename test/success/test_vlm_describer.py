@@ -22,6 +22,8 @@ from mtv_world_ros.success.retries import retry_after
 from mtv_world_ros.success.scene_objects import SceneObject
 from mtv_world_ros.success.vlm_describer import VlmDescriber
 
+pytest.importorskip('openai')
+
 FRAME = np.random.default_rng(0).integers(0, 256, (18, 24, 3), np.uint8)
 INSTRUCTION = 'put the red block into the bowl'
 KEY = 'sk-secret-1234'
