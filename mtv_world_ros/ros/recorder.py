@@ -28,6 +28,8 @@ _DEPTH = 2000
 #: after a stop signal, silence for this long means that everything arrived [s]
 _SILENCE_S = 0.5
 _LONGEST_DRAIN_S = 10.0
+#: topics that are not there yet are looked for this often [s]
+_LOOK_PERIOD_S = 0.05
 
 
 class Recorder(Node):
@@ -44,7 +46,9 @@ class Recorder(Node):
         super().__init__('recorder')
         self._options = options
         self._pending = [self.resolve_topic_name(topic) for topic in options.topics]
+        self._optional = [self.resolve_topic_name(topic) for topic in options.if_published]
         self._taken: list[Subscription] = []
+        self._next_look_s = 0.0
         self._is_announced = False
         self._counts: Counter[str] = Counter()
         self._last_stamp_ns = 0
@@ -83,11 +87,14 @@ class Recorder(Node):
     def _connect(self) -> None:
         if not self._pending:
             self._announce()
+        if time.monotonic() < self._next_look_s or not (self._pending or self._optional):
             return
+        self._next_look_s = time.monotonic() + _LOOK_PERIOD_S
         types = dict(self.get_topic_names_and_types())
-        for topic in [t for t in self._pending if t in types and self.count_publishers(t)]:
-            self._subscribe(topic, types[topic][0])
-            self._pending.remove(topic)
+        for waiting in (self._pending, self._optional):
+            for topic in [t for t in waiting if t in types and self.count_publishers(t)]:
+                self._subscribe(topic, types[topic][0])
+                waiting.remove(topic)
 
     def _announce(self) -> None:
         """Says so, once every subscription is connected."""
@@ -155,6 +162,13 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add = parser.add_argument
     add('out', type=Path, help='folder to make; it appears when the record is complete')
     add('topics', nargs='+', metavar='TOPIC')
+    add(
+        '--if-published',
+        nargs='+',
+        default=[],
+        metavar='TOPIC',
+        help='record these too from when somebody publishes them, without waiting for it',
+    )
     add('--overwrite', action='store_true', help='replace an existing folder')
     add(
         '--stamp',

@@ -1,0 +1,1 @@
+"""Preflight of a recording: do calibration, robot, clocks and pictures belong together?"""

@@ -1,0 +1,235 @@
+"""Inspects a recording: every check of every view, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.data.clips import stitch
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
+from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
+from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.inspection.clocks import (
+    check_commands,
+    check_joint_states,
+    check_rate,
+    check_skew,
+    ClockConfig,
+)
+from mtv_world_ros.inspection.findings import broken, Finding, Inspection, Section, suspicious
+from mtv_world_ros.inspection.joint_track import JointTrack
+from mtv_world_ros.inspection.motion_residual import (
+    measure_residual,
+    MotionResidual,
+    ResidualConfig,
+)
+from mtv_world_ros.inspection.overlay import overlay_picture
+from mtv_world_ros.inspection.projection_checks import check_limits, check_visibility
+from mtv_world_ros.inspection.shapes import load_shape, RobotShape
+
+Checked = tuple[dict[str, str], list[Finding]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectionConfig:
+    """From where on a view is suspicious or broken.
+
+    Attributes:
+        suspicious_residual: distance of drawn robot and moving pixels, share of the image width.
+        broken_residual: likewise.
+        rods_factor: both times this, where the robot's shape is not known.
+        min_match: correlation of drawn and seen motion below which they are unrelated.
+        max_lag_s: delay of the images against the joint states from which on it matters [s].
+        residual: how it is measured.
+        clocks: limits of the clock checks.
+    """
+
+    suspicious_residual: float = 0.012
+    broken_residual: float = 0.03
+    rods_factor: float = 3.0
+    min_match: float = 0.12
+    max_lag_s: float = 0.1
+    residual: ResidualConfig = field(default_factory=ResidualConfig)
+    clocks: ClockConfig = field(default_factory=ClockConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.suspicious_residual <= self.broken_residual:
+            raise ConfigError(
+                f'inspection.suspicious_residual is {self.suspicious_residual}, must be in 0 .. '
+                f'broken_residual = {self.broken_residual}'
+            )
+
+
+class Inspector:
+    """Checks recordings of one robot.
+
+    Args:
+        robot: the robot.
+        shape: what it looks like.
+        config: limits.
+    """
+
+    def __init__(
+        self, robot: RobotModel, shape: RobotShape, config: InspectionConfig | None = None
+    ) -> None:
+        self.robot = robot
+        self.shape = shape
+        self._config = config or InspectionConfig()
+        factor = 1.0 if shape.is_known else self._config.rods_factor
+        self._suspicious = factor * self._config.suspicious_residual
+        self._broken = factor * self._config.broken_residual
+
+    def inspect(self, episode: Episode) -> Inspection:
+        """Checks an episode that was read with its cameras.
+
+        Raises:
+            EpisodeError: it has no joint states.
+            TrajectoryError: they lack a joint of the robot.
+        """
+        states = episode.joint_states
+        if states is None:
+            raise EpisodeError(
+                f"'{episode.info.path}' has no joint_states: nothing can be projected; record "
+                'the topic joint_states too'
+            )
+        joints = JointTrack(states, self.robot)
+        return Inspection(
+            episode=episode.info.path,
+            robot=self.robot.name,
+            views=tuple(self._view(episode, view, joints) for view in episode.views),
+            recording=self._recording(episode, joints),
+        )
+
+    def picture(self, episode: Episode, view: str) -> ByteArray:
+        """Returns the overlay picture of a view, (H, W, 3) RGB."""
+        assert episode.joint_states is not None
+        joints = JointTrack(episode.joint_states, self.robot)
+        return overlay_picture(episode, view, self.robot, self.shape.parts, joints)
+
+    def _view(self, episode: Episode, view: str, joints: JointTrack) -> Section:
+        track, camera = episode.images[view], episode.cameras[view]
+        clocks = self._config.clocks
+        residual = self._residual(episode, view, joints)
+        if isinstance(residual, Finding):
+            measured: Checked = ({}, [residual])
+            notes: tuple[str, ...] = ()
+        else:
+            measured, notes = self._judge(residual, camera)
+        return _section(
+            view,
+            [
+                check_visibility(camera, self.robot, joints.at(track.stamps_ns)),
+                measured,
+                check_rate('frames', track.stamps_ns, clocks),
+                check_skew(view, episode.images, clocks),
+                check_joint_states(track.stamps_ns, joints, clocks),
+            ],
+            notes,
+        )
+
+    def _residual(
+        self, episode: Episode, view: str, joints: JointTrack
+    ) -> MotionResidual | Finding:
+        try:
+            return measure_residual(
+                episode.images[view],
+                episode.cameras[view],
+                self.robot,
+                self.shape.parts,
+                joints,
+                self._config.residual,
+            )
+        except EpisodeError as error:
+            return broken(f'its images cannot be read: {error}')
+
+    def _judge(
+        self, residual: MotionResidual, camera: CameraModel
+    ) -> tuple[Checked, tuple[str, ...]]:
+        if residual.reason:
+            text = f'calibration not checked against the images: {residual.reason}'
+            if camera.mount_link != self.robot.base_link:
+                return ({'residual': 'not measured'}, []), (text,)
+            return ({'residual': 'not measured'}, [suspicious(text)]), ()
+        x, y = residual.shift_px
+        measures = {
+            'residual': f'{np.hypot(x, y):.1f} px (x {x:+.1f}, y {y:+.1f}) from the drawn robot '
+            f'to the moving pixels',
+            'motion match': f'{residual.match:.2f} over {residual.num_pairs} pairs of frames',
+            'image delay': f'{residual.lag_s:+.1f} s against the joint states',
+        }
+        findings = [*self._distance(residual, camera)]
+        if abs(residual.lag_s) >= self._config.max_lag_s - 1e-9:
+            findings.append(
+                suspicious(
+                    f'the images fit the joint states best {residual.lag_s:+.1f} s later: their '
+                    'clocks differ, or the camera is that slow'
+                )
+            )
+        return (measures, findings), (f'the robot is drawn with {self.shape.source}',)
+
+    def _distance(self, residual: MotionResidual, camera: CameraModel) -> list[Finding]:
+        if residual.match < self._config.min_match:
+            text = (
+                f'what moves in the images does not move like the drawn robot (match '
+                f'{residual.match:.2f}, at least {self._config.min_match:g} is expected): wrong '
+                'camera, pose or robot'
+            )
+            return [broken(text)]
+        x, y = residual.shift_px
+        distance = float(np.hypot(x, y))
+        text = (
+            f'the robot is drawn {distance:.1f} px beside the moving pixels (they are at '
+            f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset'
+        )
+        border = max(abs(x), abs(y)) >= self._config.residual.reach * camera.width - 1
+        if border or distance > self._broken * camera.width:
+            return [broken(text)]
+        return [suspicious(text)] if distance > self._suspicious * camera.width else []
+
+    def _recording(self, episode: Episode, joints: JointTrack) -> Section:
+        frames_ns = episode.images[episode.views[0]].stamps_ns
+        clocks, origin = self._config.clocks, int(frames_ns[0])
+        checks = [
+            check_limits('measured', self.robot, joints.positions),
+            check_rate('joint states', joints.stamps_ns, clocks),
+        ]
+        try:
+            commands = self._commands(episode, origin)
+            if commands is not None:
+                checks.append(check_limits('commanded', self.robot, commands.positions))
+            checks.append(check_commands(commands, origin, frames_ns, joints, clocks))
+        except MtvWorldError as error:
+            checks.append(({}, [broken(f'commands: {error}')]))
+        warnings = [suspicious(text) for text in episode.warnings]
+        return _section('recording', [*checks, ({}, warnings)], ())
+
+    def _commands(self, episode: Episode, origin_ns: int) -> JointTrajectory | None:
+        if not episode.trajectories:
+            return None
+        matched = [(s, match_joints(t, self.robot)) for s, t in episode.trajectories]
+        return stitch(matched, origin_ns)
+
+
+def load_inspector(robot_file: Path, config: InspectionConfig | None = None) -> Inspector:
+    """Returns the inspector of a robot YAML.
+
+    Raises:
+        ConfigError, RobotError: the robot cannot be used.
+    """
+    robot = load_robot(robot_file)
+    return Inspector(robot, load_shape(robot_file, robot), config)
+
+
+def _section(name: str, checks: Iterable[Checked], notes: Sequence[str]) -> Section:
+    measures: dict[str, str] = {}
+    findings: list[Finding] = []
+    for measured, found in checks:
+        measures.update(measured)
+        findings += found
+    return Section(name=name, measures=measures, findings=tuple(findings), notes=tuple(notes))

@@ -1,0 +1,290 @@
+"""How far the drawn robot is from the pixels that move: a calibration check without markers.
+
+P pairs of frames, J joints, H W pixels of the shrunk images, R the search radius.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.data.episode import Track
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.geometry.camera import camera_poses, project, scaled
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.inspection.joint_track import JointTrack
+from mtv_world_ros.inspection.shapes import LinkShape
+
+FloatImage = NDArray[np.float32]
+
+#: an image whose joints moved less than this in any pair shows no motion [px]
+_LEAST_AREA_PX = 20
+#: pixels are drawn with this many fractional bits
+_SHIFT_BITS = 4
+_FAR_PX = 4000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualConfig:
+    """How the residual is measured.
+
+    Attributes:
+        width: images are shrunk to this width [px].
+        step_s: time between the two frames of a pair [s].
+        max_pairs: pairs compared, spread over the recording.
+        reach: search radius, as a share of the image width.
+        blur_px: standard deviation that both motions are blurred by [px].
+        saturation: grey levels from which a pixel counts as moving, so that one that changes
+            more counts no more.
+        lags_s: delays of the images against the joint states that are tried [s].
+    """
+
+    width: int = 384
+    step_s: float = 0.5
+    max_pairs: int = 60
+    reach: float = 0.08
+    blur_px: float = 1.5
+    saturation: float = 25.0
+    lags_s: tuple[float, ...] = (-0.2, -0.1, 0.0, 0.1, 0.2)
+
+    def __post_init__(self) -> None:
+        for name in ('width', 'step_s', 'max_pairs', 'reach', 'blur_px', 'saturation'):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f'residual.{name} is {getattr(self, name)}, must be positive')
+        if 0.0 not in self.lags_s:
+            raise ConfigError(f'residual.lags_s is {self.lags_s}, must contain 0')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionResidual:
+    """Where the moving pixels are, seen from the drawn robot.
+
+    Attributes:
+        shift_px: (x, y) from the drawn robot to the moving pixels, in pixels of the recorded
+            images; NaN where it could not be measured.
+        match: mean correlation of drawn and seen motion there, -1 .. 1.
+        contrast: by how many standard deviations that stands out from other shifts.
+        lag_s: delay of the images against the joint states at which the motions fit best [s].
+        num_pairs: pairs of frames in which the robot moves.
+        reason: why it could not be measured; empty where it was.
+    """
+
+    shift_px: tuple[float, float] = (float('nan'), float('nan'))
+    match: float = float('nan')
+    contrast: float = float('nan')
+    lag_s: float = float('nan')
+    num_pairs: int = 0
+    reason: str = ''
+
+
+def measure_residual(
+    track: Track,
+    camera: CameraModel,
+    robot: RobotModel,
+    shapes: Sequence[LinkShape],
+    joints: JointTrack,
+    config: ResidualConfig,
+) -> MotionResidual:
+    """Compares the motion that joint states and calibration predict with the one in the images.
+
+    For pairs of frames `step_s` apart, each link's silhouettes at both times are drawn; where
+    they differ the image should have changed. The maps of all pairs are correlated with the
+    images' differences over shifts, for each link on its own. Links count alike, so that one
+    whose drawn shape is wrong does not decide; a calibration error moves all of them.
+
+    Args:
+        track: frames of a camera that stands still.
+        camera: its calibration, at the size of the frames.
+        robot: gives the links' poses.
+        shapes: of the links.
+        joints: measured positions.
+        config: how.
+    """
+    if camera.mount_link != robot.base_link:
+        return MotionResidual(reason=f"the camera moves with '{camera.mount_link}'")
+    pairs = _pairs(track.stamps_ns, joints, config)
+    if len(pairs) == 0:
+        return MotionResidual(
+            reason=f'no two frames {config.step_s:g} s apart with joint states and motion'
+        )
+    small = _shrunk(camera, config.width)
+    seen = _seen_motion(track, pairs, small, config)
+    surfaces = [
+        _surface(seen, track.stamps_ns[pairs], lag, small, robot, shapes, joints, config)
+        for lag in config.lags_s
+    ]
+    now = surfaces[config.lags_s.index(0.0)]
+    if now is None:
+        return MotionResidual(reason='no link moves within the image')
+    shift = _peak(now) * camera.width / small.width
+    spread = float(now.std())
+    return MotionResidual(
+        shift_px=(float(shift[0]), float(shift[1])),
+        match=float(now.max()),
+        contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
+        lag_s=_best_lag(config.lags_s, surfaces),
+        num_pairs=len(pairs),
+    )
+
+
+def _shrunk(camera: CameraModel, width: int) -> CameraModel:
+    if camera.width <= width:
+        return camera
+    return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
+
+
+def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, config: ResidualConfig) -> np.ndarray:
+    """(P, 2) indices of frames between which a joint moves."""
+    later = np.searchsorted(stamps_ns, stamps_ns + round(config.step_s * 1e9) - 1000)
+    first = np.flatnonzero(later < len(stamps_ns))
+    pairs = np.stack([first, later[first]], axis=-1)
+    span = (stamps_ns[pairs[:, 1]] - stamps_ns[pairs[:, 0]]) * 1e-9
+    pairs = pairs[span < 2 * config.step_s]
+    pairs = pairs[joints.covers(stamps_ns[pairs]).all(axis=1)] if len(pairs) else pairs
+    if len(pairs) == 0:
+        return pairs
+    moved = np.abs(np.diff(joints.at(stamps_ns[pairs].ravel()).reshape(*pairs.shape, -1), axis=1))
+    pairs = pairs[(moved[:, 0] > 1e-3).any(axis=1)]
+    chosen = np.linspace(0, len(pairs) - 1, min(config.max_pairs, len(pairs)))
+    return pairs[np.unique(chosen.round().astype(int))]
+
+
+def _seen_motion(
+    track: Track, pairs: np.ndarray, small: CameraModel, config: ResidualConfig
+) -> list[FloatImage]:
+    """How much each pixel changed between the frames of a pair, 0 .. 1."""
+    grey = {int(i): _grey(track.frames[int(i)], small) for i in np.unique(pairs)}
+    return [_softened(np.abs(grey[int(j)] - grey[int(i)]), config) for i, j in pairs]
+
+
+def _grey(frame: NDArray[np.uint8], small: CameraModel) -> FloatImage:
+    resized = cv2.resize(frame, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return resized.astype(np.float32).mean(axis=-1)
+
+
+def _softened(change: FloatImage, config: ResidualConfig) -> FloatImage:
+    blurred = cv2.GaussianBlur(change, (0, 0), config.blur_px)
+    return np.asarray(np.minimum(blurred / config.saturation, 1), np.float32)
+
+
+def _surface(
+    seen: Sequence[FloatImage],
+    stamps_ns: NDArray[np.int64],
+    lag_s: float,
+    small: CameraModel,
+    robot: RobotModel,
+    shapes: Sequence[LinkShape],
+    joints: JointTrack,
+    config: ResidualConfig,
+) -> FloatArray | None:
+    """(2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
+    positions = joints.at(stamps_ns.ravel() - round(lag_s * 1e9))
+    poses = robot.forward_kinematics(positions)
+    T_base_camera = camera_poses(small, robot, positions)
+    radius = max(2, round(config.reach * small.width))
+    total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
+    for link in dict.fromkeys(shape.link for shape in shapes):
+        parts = [
+            _project_part(part, poses[link], small, T_base_camera)
+            for part in shapes
+            if part.link == link
+        ]
+        surface, count = _correlate(seen, _fill(parts, small), radius, config)
+        total += np.sqrt(count) * surface
+        weights += np.sqrt(count)
+    return total / weights if weights else None
+
+
+def draw_silhouettes(
+    shapes: Sequence[LinkShape], camera: CameraModel, robot: RobotModel, positions: FloatArray
+) -> NDArray[np.uint8]:
+    """(T, H, W) 1 where the robot is in the image, for positions (T, J)."""
+    poses = robot.forward_kinematics(positions)
+    T_base_camera = camera_poses(camera, robot, positions)
+    parts = [_project_part(part, poses[part.link], camera, T_base_camera) for part in shapes]
+    return _fill(parts, camera)
+
+
+def _project_part(
+    part: LinkShape, poses: FloatArray, camera: CameraModel, T_base_camera: FloatArray
+) -> FloatArray:
+    """(T, N, 2) pixels of its points."""
+    points = np.einsum('tij,nj->tni', poses[:, :3, :3], part.points) + poses[:, None, :3, 3]
+    return project(camera, T_base_camera[:, None], points)[0]
+
+
+def _fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
+    """(T, H, W) the convex hulls of the parts' pixels; parts that reach behind are left out."""
+    images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
+    for part in parts:
+        for image, pixels in zip(images, part, strict=True):
+            if np.isfinite(pixels).all():
+                fixed = np.rint(pixels.clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS).astype(np.int32)
+                cv2.fillConvexPoly(image, cv2.convexHull(fixed), 1, shift=_SHIFT_BITS)
+    return images
+
+
+def _correlate(
+    seen: Sequence[FloatImage],
+    drawn: NDArray[np.uint8],
+    radius: int,
+    config: ResidualConfig,
+) -> tuple[FloatArray, int]:
+    """One link's normalised correlation over shifts, and the pairs in which it moves."""
+    total = np.zeros((2 * radius + 1,) * 2)
+    energy_seen = energy_drawn = 0.0
+    count = 0
+    for index, change in enumerate(seen):
+        differs = (drawn[2 * index] != drawn[2 * index + 1]).astype(np.float32)
+        if differs.sum() < _LEAST_AREA_PX:
+            continue
+        template, window = _cut(differs, change, radius, config.blur_px)
+        total += cv2.matchTemplate(window, template, cv2.TM_CCORR)
+        energy_seen += float((window**2).mean()) * template.size
+        energy_drawn += float((template**2).sum())
+        count += 1
+    return total / np.sqrt(energy_seen * energy_drawn + 1e-12), count
+
+
+def _cut(
+    differs: FloatImage, change: FloatImage, radius: int, blur_px: float
+) -> tuple[FloatImage, FloatImage]:
+    """The drawn motion's surroundings and the window of the image to search, means removed."""
+    rim = round(5 * blur_px)
+    rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
+    top, bottom = max(rows[0] - rim, 0), rows[-1] + rim + 1
+    left, right = max(columns[0] - rim, 0), columns[-1] + rim + 1
+    template = cv2.GaussianBlur(differs, (0, 0), blur_px)[top:bottom, left:right]
+    height, width = template.shape
+    padded = cv2.copyMakeBorder(
+        change, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=float(change.mean())
+    )
+    window = padded[top : top + height + 2 * radius, left : left + width + 2 * radius]
+    return template - template.mean(), window - window.mean()
+
+
+def _peak(surface: FloatArray) -> FloatArray:
+    """(x, y) of the maximum from the centre, refined by a parabola [px]."""
+    radius = len(surface) // 2
+    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
+    x = _refined(surface[row], int(column)) - radius
+    return np.array([x, _refined(surface[:, column], int(row)) - radius])
+
+
+def _refined(line: FloatArray, at: int) -> float:
+    """Where a parabola through the maximum and its neighbours has its top."""
+    if not 0 < at < len(line) - 1:
+        return float(at)
+    before, top, after = line[at - 1 : at + 2]
+    bend = float(before - 2 * top + after)
+    return at + 0.5 * float(before - after) / bend if bend < 0 else float(at)
+
+
+def _best_lag(lags_s: Sequence[float], surfaces: Sequence[FloatArray | None]) -> float:
+    values = [-np.inf if surface is None else float(surface.max()) for surface in surfaces]
+    return lags_s[int(np.argmax(values))]
