@@ -83,7 +83,7 @@ TABLE: tuple[Entry, ...] = (
     _at_start(
         'segmenter',
         'auto',
-        'What finds the objects; auto = sam2 where MTV_WORLD_WEIGHTS has its weights, else colour.',
+        'What finds the objects; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
         choices=SEGMENTERS,
     ),
     _at_start(
