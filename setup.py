@@ -61,6 +61,8 @@ setup(
         'train': ['tensorboard>=2.21'],
         # Vision-language models that name objects: behind a server, or here.
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
+        # PSNR and SSIM of `mtv-world evaluate --quality`
+        'evaluate': ['torchmetrics>=1.8'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
