@@ -71,6 +71,7 @@ class BatchSource:
         self._spec, self._robot, self._segmenter = spec, robot, segmenter
         self._rendering, self._object_mask, self._augment = rendering, object_mask, augment
         self._batch_size, self._seed = batch_size, seed
+        self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._ahead: tuple[int, Future[Batch]] | None = None
 
@@ -108,7 +109,7 @@ class BatchSource:
     def _sample(
         self, rng: np.random.Generator
     ) -> tuple[ByteArray, ByteArray, ByteArray, ByteArray | None]:
-        recording, starts = self._starts[rng.integers(len(self._starts))]
+        recording, starts = self._choose(rng)
         clip = cut_clip(recording, int(starts[rng.integers(len(starts))]), self._spec)
         names = clip.objects or objects_from_instruction(recording.instruction)
         trajectory = self._draw(clip, names)
@@ -119,6 +120,14 @@ class BatchSource:
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         return np.ascontiguousarray(frames), start.copy(), trajectory, clip.object_ids
+
+    def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
+        """An episode and the starts of its clips; failed ones as often as they are asked for."""
+        share = self._augment.failure_share
+        pool = self._starts
+        if share is not None and self._failed and rng.random() < share:
+            pool = self._failed
+        return pool[rng.integers(len(pool))]
 
     def _draw(self, clip: Clip, names: tuple[str, ...]) -> ByteArray:
         masks = None

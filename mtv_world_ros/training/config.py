@@ -50,11 +50,20 @@ class ObjectiveConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
-    """Disturbances of the start frame and of colours, as probabilities and sizes."""
+    """Disturbances of the start frame and of colours, and which episodes are seen how often.
+
+    Attributes:
+        start_noise: probability of a start frame that is blurred and noisy.
+        start_noise_std: largest standard deviation of that noise, as a share of full range.
+        colour_permutation: probability of exchanged colour channels.
+        failure_share: share of clips drawn from failed episodes alone, on top of those that come
+            by chance: they are few, and a model that rarely sees a miss imagines grasps instead.
+    """
 
     start_noise: float = 0.5
     start_noise_std: float = 0.04
     colour_permutation: float = 0.3
+    failure_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

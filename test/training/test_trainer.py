@@ -6,6 +6,7 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -197,3 +198,25 @@ def test_weights_of_another_architecture_are_refused(
     deeper = replace(tiny, transformer={**tiny.transformer, 'num_layers': layers})
     with pytest.raises(TrainingError, match=r'--preset|--init'):
         make(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
+
+
+def test_failed_episodes_are_drawn_as_often_as_asked(
+    recording: Recording, tiny: TrainingConfig, robot: RobotModel
+) -> None:
+    failed = replace(recording, outcome='failure', frames=np.zeros_like(recording.frames))
+    augment = replace(tiny.augment, start_noise=0.0, failure_share=0.5)
+    source = BatchSource(
+        [recording] * 9 + [failed],
+        spec=_spec(tiny),
+        robot=robot,
+        segmenter=ColourSegmenter(),
+        rendering=tiny.rendering,
+        object_mask=False,
+        augment=augment,
+        batch_size=1,
+        seed=0,
+    )
+    black = [not source.batch(step).frames.any() for step in range(60)]
+    source.close()
+    # 0.5 + 0.5 / 10, three standard deviations of 60 draws
+    assert 0.55 - 0.19 < np.mean(black) < 0.55 + 0.19
