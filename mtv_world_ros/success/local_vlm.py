@@ -119,7 +119,7 @@ def _load(config: LocalVlmConfig) -> tuple[Any, Any]:
     except ImportError as error:
         raise ConfigError(
             f"the describer 'local' needs transformers and pillow ({error}); "
-            "pip install 'mtv_world_ros[describe]'"
+            "pip install '.[describe]'"
         ) from error
     dtype = config.dtype if config.dtype == 'auto' else getattr(torch, config.dtype, None)
     if dtype != 'auto' and not isinstance(dtype, torch.dtype):

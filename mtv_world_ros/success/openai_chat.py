@@ -214,8 +214,7 @@ def _client(config: OpenAIConfig, key: str) -> Any:
         import openai
     except ImportError as error:
         raise ConfigError(
-            f"the describer 'openai' needs the package openai ({error}); "
-            "pip install 'mtv_world_ros[describe]'"
+            f"the describer 'openai' needs the package openai ({error}); pip install '.[describe]'"
         ) from error
     return openai.OpenAI(
         api_key=key or 'none',
