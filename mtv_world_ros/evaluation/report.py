@@ -133,24 +133,33 @@ def _view_band(
 
 
 def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
-    """Returns (T, H, W, 3) uint8 RGB frames: a row per view; real, trajectory, imagined."""
+    """Returns (T, H, W, 3) uint8 RGB frames: a row per view; real, trajectory, imagined.
+
+    Above each row stand the view and the captions of the imagined frames.
+    """
     height, width = _tile_size(comparison.real.shape[2:4], tile_width)
     num_views, num_frames = len(comparison.views), len(comparison.times)
     total = (
-        _even(_HEAD + num_views * (height + _GAP)),
+        _even(num_views * (_HEAD + height) + _GAP),
         _even(len(KINDS) * (width + _GAP) + _GAP),
     )
     video = np.stack([_blank(*total)] * num_frames)
     for frame in range(num_frames):
         for column, kind in enumerate(KINDS):
             x = _GAP + column * (width + _GAP)
-            _text(video[frame], kind, (x + 4, 18))
             for v in range(num_views):
-                y = _HEAD + v * (height + _GAP)
+                y = v * (_HEAD + height) + _HEAD
+                _text(video[frame], _heading(comparison, kind, v, frame), (x + 4, y - 8))
                 tile = comparison.frames(kind)[v, frame]
                 video[frame, y : y + height, x : x + width] = _fit(tile, width, height)
-        _text(video[frame], f'{comparison.times[frame]:+.1f} s', (total[1] - 76, 18))
     return video
+
+
+def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
+    if kind == 'real':
+        return f'{comparison.views[view]}: {kind}  {comparison.times[frame]:+.1f} s'
+    caption = comparison.captions[view][frame] if comparison.captions else ''
+    return f'{kind}  {caption}' if kind == 'imagined' else kind
 
 
 def write_png(path: Path, image: ByteArray) -> None:

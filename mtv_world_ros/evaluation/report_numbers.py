@@ -1,0 +1,299 @@
+"""The report's numbers: headline, horizon, the paper's tables, tables by task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite, nan
+from typing import Any
+
+from mtv_world_ros.evaluation.charts import Dot, dot_chart, Line, line_chart
+from mtv_world_ros.evaluation.evaluated import Evaluated
+from mtv_world_ros.evaluation.horizon import curve
+from mtv_world_ros.evaluation.markup import element, join, Markup, table
+from mtv_world_ros.evaluation.tables import COLUMNS
+
+#: what is imagined, held and shuffled: (of objects that move, of all objects)
+_KEYS = (
+    ('j_moving', 'j_copy_moving', 'j_shuffled_moving'),
+    ('j_object_mean', 'j_copy_mean', 'j_shuffled_mean'),
+)
+_MARGINS = {
+    'margin_moving': 'the first frame held',
+    'margin_over_shuffled': "another episode's actions",
+}
+_FIELDS = {
+    'j_shuffled_frames': 'shuffled',
+    'j_copy_frames': 'held',
+    'j_frames': '',
+}
+_NUM_HUES = 6
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Returns a number as text; a dash where there is none."""
+    return '–' if value is None or not isfinite(value) else f'{value:.{digits}f}'
+
+
+def with_interval(numbers: Mapping[str, Any], key: str) -> str:
+    """Returns a number of metrics.json with its interval."""
+    low, high = interval(numbers, key)
+    text = number(numbers.get(key))
+    return f'{text} [{low:.3f}, {high:.3f}]' if isfinite(low) and text != '–' else text
+
+
+def interval(numbers: Mapping[str, Any], key: str) -> tuple[float, float]:
+    """Returns the interval of a number of metrics.json, NaN where there is none."""
+    low, high = numbers.get('intervals', {}).get(key) or (None, None)
+    return (nan, nan) if low is None or high is None else (low, high)
+
+
+def letter(index: int) -> str:
+    """Returns how the report calls an evaluation: A, B, ... Z, A2, ..."""
+    return chr(ord('A') + index % 26) + (str(index // 26 + 1) if index >= 26 else '')
+
+
+def hue(index: int) -> str:
+    """Returns the class of an evaluation's colour."""
+    return f'c{index % _NUM_HUES}'
+
+
+def badge(index: int, evaluations: Sequence[Evaluated]) -> Markup | None:
+    """Returns an evaluation's letter in its colour; None where there is only one."""
+    if len(evaluations) == 1:
+        return None
+    return element('span', letter(index), class_=f'badge {hue(index)}')
+
+
+def all_views(evaluations: Sequence[Evaluated]) -> list[str]:
+    """Returns the names of all views, in the order in which they come first."""
+    return list(dict.fromkeys(view for found in evaluations for view in found.views))
+
+
+def headline(evaluations: Sequence[Evaluated]) -> Markup:
+    """Returns J per view with intervals, against what knows nothing."""
+    keys, words = _keys(evaluations)
+    panels = [
+        element('figure', element('h3', f'View {view}'), _dots(evaluations, view, keys))
+        for view in all_views(evaluations)
+    ]
+    return element(
+        'section',
+        element('h2', 'Does it beat knowing nothing?'),
+        *(_verdict(index, evaluations) for index in range(len(evaluations))),
+        element(
+            'p',
+            f'Jaccard index J of the {words}, 1 = the masks agree in every pixel. Held: the '
+            "first frame stands still. Shuffled: imagined with another episode's actions. "
+            'Whiskers: 95 % bootstrap over episodes.',
+            class_='faint',
+        ),
+        element('div', *panels, class_='panels'),
+        id='headline',
+    )
+
+
+def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:
+    moving, every = _KEYS
+    measured = any(found.metrics['overall'].get(moving[0]) is not None for found in evaluations)
+    return (moving, 'objects that really move') if measured else (every, 'objects')
+
+
+def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
+    found = evaluations[index]
+    doubts = []
+    for view, numbers in found.metrics['views'].items():
+        for key, words in _MARGINS.items():
+            low, _ = interval(numbers, key)
+            if not low > 0:
+                how = 'not measured' if number(numbers.get(key)) == '–' else 'not above 0'
+                doubts.append(f'{view}: margin over {words} {how}')
+    text = (
+        f'Not shown in every view ({"; ".join(doubts)}).'
+        if doubts
+        else 'Yes, in every view: the intervals of the margins over both lie above 0.'
+    )
+    style = 'verdict doubt' if doubts else 'verdict'
+    return element('p', badge(index, evaluations), text, class_=style)
+
+
+def _dots(evaluations: Sequence[Evaluated], view: str, keys: tuple[str, str, str]) -> Markup:
+    alone = len(evaluations) == 1
+    dots = []
+    for index, found in enumerate(evaluations):
+        numbers = found.metrics['views'].get(view)
+        if numbers is None:
+            continue
+        colour = hue(index)
+        styles = (colour, 'held', 'alone shuffled' if alone else f'{colour} shuffled')
+        for key, word, style in zip(keys, ('imagined', 'held', 'shuffled'), styles, strict=True):
+            dots.append(
+                Dot(
+                    label=word if alone else f'{letter(index)} {word}',
+                    value=nan if numbers.get(key) is None else numbers[key],
+                    interval=interval(numbers, key),
+                    style=style,
+                )
+            )
+    return dot_chart(f'J in view {view}', dots)
+
+
+def horizon_section(evaluations: Sequence[Evaluated]) -> Markup | None:
+    """Returns J against how far ahead was imagined; None if no object moves anywhere."""
+    panels = []
+    for view in all_views(evaluations):
+        lines = [line for i in range(len(evaluations)) for line in _lines(i, evaluations, view)]
+        if lines:
+            seconds = _seconds(evaluations, max(len(line.values) for line in lines))
+            chart = line_chart(
+                f'J against time, view {view}', lines, seconds, 'J of moving objects'
+            )
+            panels.append(element('figure', element('h3', f'View {view}'), chart))
+    if not panels:
+        return None
+    return element(
+        'section',
+        element('h2', 'J against horizon'),
+        element(
+            'p',
+            'Objects that really move. Bands: 95 % bootstrap over episodes. Frames that fewer '
+            'than a third of the rollouts reach are left out.',
+            class_='faint',
+        ),
+        _key(evaluations),
+        element('div', *panels, class_='panels'),
+        id='horizon',
+    )
+
+
+def _seconds(evaluations: Sequence[Evaluated], count: int) -> list[float]:
+    """Times of the frames [s]; all evaluations on the first one's clock."""
+    return [(k + 1) / evaluations[0].metrics['model']['fps'] for k in range(count)]
+
+
+def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line]:
+    found = evaluations[index]
+    rows = [result.rows for result in found.results.values()]
+    clock = evaluations[0].metrics['model']['fps'] / found.metrics['model']['fps']
+    lines = []
+    for field, word in _FIELDS.items():
+        drawn = curve(rows, view, field, seed=found.metrics.get('seed', 0))
+        if not drawn.values:
+            continue
+        style = _style(index, evaluations, word)
+        label = f'{letter(index)} {word or "imagined"}'
+        values, band = _on_clock(drawn.values, clock), _on_clock(drawn.band, clock)
+        lines.append(Line(label=label, values=values, band=band, style=style))
+    return lines
+
+
+def _on_clock(values: Sequence[Any], clock: float) -> list[Any]:
+    """Every frame's value at the frames of a clock that is `clock` times as fast."""
+    count = max(int(len(values) * clock + 1e-6), 1)
+    return [values[min(max(round((k + 1) / clock) - 1, 0), len(values) - 1)] for k in range(count)]
+
+
+def _style(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
+    if word == 'held':
+        return 'held'
+    if word == 'shuffled':
+        return 'alone shuffled' if len(evaluations) == 1 else f'{hue(index)} shuffled'
+    return hue(index)
+
+
+def _key(evaluations: Sequence[Evaluated]) -> Markup:
+    """What the lines mean."""
+    items = []
+    for index in range(len(evaluations)):
+        prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
+        for word in ('', 'held', 'shuffled'):
+            stroke = element(
+                'line', x1=1, y1=6, x2=25, y2=6, class_=f'line {_style(index, evaluations, word)}'
+            )
+            drawn = element('svg', stroke, viewBox='0 0 26 12', aria_hidden='true')
+            items.append(element('li', drawn, f'{prefix}{word or "imagined"}'))
+    return element('ul', *items, class_='key')
+
+
+def paper_tables(evaluations: Sequence[Evaluated]) -> Markup:
+    """Returns method by view and task by view in the form of the paper's tables 1 and 3."""
+    views = all_views(evaluations)
+    head = ['Method', *(f'{view} {what}' for view in views for what in ('FID ↓', 'FVD ↓', 'J ↑'))]
+    rows = [
+        [_name(index, evaluations), *_method_cells(found, views, 'j_union')]
+        for index, found in enumerate(evaluations)
+    ]
+    held = [f'{_name(0, evaluations)}: first frame held']
+    for view in views:
+        copy = evaluations[0].metrics['views'].get(view, {}).get('j_copy_union')
+        held += ['–', '–', number(copy)]
+    return element(
+        'section',
+        element('h2', "In the form of the paper's tables"),
+        element(
+            'p',
+            'J of the union of all objects, mean over frames and episodes (the paper prints it '
+            'times 100). FID and FVD need feature weights; a dash is not measured.',
+            class_='faint',
+        ),
+        table(head, [*rows, held], caption='Method × view'),
+        _task_by_view(evaluations, views),
+        id='paper',
+    )
+
+
+def _method_cells(found: Evaluated, views: Sequence[str], key: str) -> list[str]:
+    cells = []
+    for view in views:
+        numbers = found.metrics['views'].get(view, {})
+        cells += [number(numbers.get('fid'), 1), number(numbers.get('fvd'), 1)]
+        cells.append(number(numbers.get(key)))
+    return cells
+
+
+def _name(index: int, evaluations: Sequence[Evaluated]) -> str:
+    prefix = '' if len(evaluations) == 1 else f'{letter(index)} · '
+    return f'{prefix}{evaluations[index].name}'
+
+
+def _task_by_view(evaluations: Sequence[Evaluated], views: Sequence[str]) -> Markup:
+    tasks = list(dict.fromkeys(task for found in evaluations for task in found.metrics['tasks']))
+    alone = len(evaluations) == 1
+    head = ['Task'] + [
+        f'{"" if alone else letter(index) + " "}{view}'
+        for index in range(len(evaluations))
+        for view in views
+    ]
+    rows = []
+    for task in tasks:
+        cells = [task or 'no task']
+        for found in evaluations:
+            by_view = found.metrics['tasks'].get(task, {}).get('views', {})
+            cells += [number(by_view.get(view, {}).get('j_union')) for view in views]
+        rows.append(cells)
+    return table(head, rows, caption='J, task × view')
+
+
+def task_section(evaluations: Sequence[Evaluated]) -> Markup:
+    """Returns every number by task and view, with intervals."""
+    head = ['Task', 'View', 'Episodes', *COLUMNS.values()]
+    tables = []
+    for index, found in enumerate(evaluations):
+        rows = []
+        groups = {**found.metrics['tasks'], 'all tasks': found.metrics}
+        for task, group in groups.items():
+            for view, numbers in {**group['views'], 'all views': group['overall']}.items():
+                cells = [with_interval(numbers, key) for key in COLUMNS]
+                rows.append([task or 'no task', view, str(group['num_episodes']), *cells])
+        tables.append(table(head, rows, num_labels=2, caption=_name(index, evaluations)))
+    return element(
+        'section',
+        element('h2', 'By task'),
+        element(
+            'p',
+            'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: '
+            'of the objects that really move. Skill: (J − J held) / (1 − J held).',
+            class_='faint',
+        ),
+        join(tables),
+        id='tasks',
+    )
