@@ -98,11 +98,11 @@ def _json_in(text: str) -> dict[str, Any]:
     """The first JSON object in a text."""
     start = text.find('{')
     if start < 0:
-        raise DescriptionError(f"it holds no JSON object but '{excerpt(text)}'")
+        raise DescriptionError('it holds no JSON object')
     try:
         value, _ = json.JSONDecoder().raw_decode(text, start)
     except (ValueError, RecursionError) as error:
-        raise DescriptionError(f"it is not JSON ({error}): '{excerpt(text)}'") from error
+        raise DescriptionError(f'it is not JSON ({error})') from error
     return value
 
 
