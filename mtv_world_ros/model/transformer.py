@@ -115,9 +115,11 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         self.stem, self.prediction = stem, prediction
         self.patch_size = tuple(patch_size)
         dim = num_attention_heads * attention_head_dim
-        self.rope = MultiViewRotaryPosEmbed(
-            attention_head_dim, patch_size, rope_max_seq_len, view_offset
-        )
+        # computed, not loaded: real also where the weights are still to come (meta device)
+        with torch.device('cpu'):
+            self.rope = MultiViewRotaryPosEmbed(
+                attention_head_dim, patch_size, rope_max_seq_len, view_offset
+            )
         self.view_embedding = nn.Parameter(torch.zeros(num_views, dim))
         if context == 'none':
             self._drop_context()
