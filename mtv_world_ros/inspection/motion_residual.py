@@ -114,11 +114,12 @@ def measure_residual(
         )
     small = _shrunk(camera, config.width)
     seen = _seen_motion(track, pairs, small, config)
-    surfaces = [
-        _surface(seen, track.stamps_ns[pairs], lag, small, robot, shapes, joints, config)
-        for lag in config.lags_s
-    ]
-    now = surfaces[config.lags_s.index(0.0)]
+
+    def surface(part: slice, lag_s: float) -> FloatArray | None:
+        stamps_ns = track.stamps_ns[pairs[part]].ravel() - round(lag_s * 1e9)
+        return _surface(seen[part], joints.at(stamps_ns), small, robot, shapes, config)
+
+    now = surface(slice(None), 0.0)
     if now is None:
         return MotionResidual(reason='no link moves within the image')
     shift = _peak(now) * camera.width / small.width
@@ -127,7 +128,7 @@ def measure_residual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
-        lag_s=_best_lag(config.lags_s, surfaces),
+        lag_s=_best_lag([(lag, surface(slice(None, None, 3), lag)) for lag in config.lags_s]),
         num_pairs=len(pairs),
     )
 
@@ -157,7 +158,7 @@ def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, config: ResidualCon
 def _seen_motion(
     track: Track, pairs: np.ndarray, small: CameraModel, config: ResidualConfig
 ) -> list[FloatImage]:
-    """How much each pixel changed between the frames of a pair, 0 .. 1."""
+    """How much each pixel changed between the frames of a pair, 0 .. 1, with room to search."""
     grey = {int(i): _grey(track.frames[int(i)], small) for i in np.unique(pairs)}
     return [_softened(np.abs(grey[int(j)] - grey[int(i)]), config) for i, j in pairs]
 
@@ -169,24 +170,29 @@ def _grey(frame: NDArray[np.uint8], small: CameraModel) -> FloatImage:
 
 def _softened(change: FloatImage, config: ResidualConfig) -> FloatImage:
     blurred = cv2.GaussianBlur(change, (0, 0), config.blur_px)
-    return np.asarray(np.minimum(blurred / config.saturation, 1), np.float32)
+    moving = np.minimum(blurred / np.float32(config.saturation), 1)
+    rim = _radius(change.shape[1], config)
+    mean = float(moving.mean())
+    padded = cv2.copyMakeBorder(moving, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=mean)
+    return np.asarray(padded, np.float32)
+
+
+def _radius(width: int, config: ResidualConfig) -> int:
+    return max(2, round(config.reach * width))
 
 
 def _surface(
     seen: Sequence[FloatImage],
-    stamps_ns: NDArray[np.int64],
-    lag_s: float,
+    positions: FloatArray,
     small: CameraModel,
     robot: RobotModel,
     shapes: Sequence[LinkShape],
-    joints: JointTrack,
     config: ResidualConfig,
 ) -> FloatArray | None:
     """(2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
-    positions = joints.at(stamps_ns.ravel() - round(lag_s * 1e9))
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
-    radius = max(2, round(config.reach * small.width))
+    radius = _radius(small.width, config)
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
     for link in dict.fromkeys(shape.link for shape in shapes):
         parts = [
@@ -194,7 +200,7 @@ def _surface(
             for part in shapes
             if part.link == link
         ]
-        surface, count = _correlate(seen, _fill(parts, small), radius, config)
+        surface, count = _correlate(seen, _fill(parts, small), config, radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
     return total / weights if weights else None
@@ -230,42 +236,44 @@ def _fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]
 
 
 def _correlate(
-    seen: Sequence[FloatImage],
-    drawn: NDArray[np.uint8],
-    radius: int,
-    config: ResidualConfig,
+    seen: Sequence[FloatImage], drawn: NDArray[np.uint8], config: ResidualConfig, radius: int
 ) -> tuple[FloatArray, int]:
     """One link's normalised correlation over shifts, and the pairs in which it moves."""
     total = np.zeros((2 * radius + 1,) * 2)
     energy_seen = energy_drawn = 0.0
     count = 0
-    for index, change in enumerate(seen):
-        differs = (drawn[2 * index] != drawn[2 * index + 1]).astype(np.float32)
-        if differs.sum() < _LEAST_AREA_PX:
+    for change, before, after in zip(seen, drawn[::2], drawn[1::2], strict=True):
+        differs = cv2.absdiff(before, after)
+        if cv2.countNonZero(differs) < _LEAST_AREA_PX:
             continue
         template, window = _cut(differs, change, radius, config.blur_px)
         total += cv2.matchTemplate(window, template, cv2.TM_CCORR)
-        energy_seen += float((window**2).mean()) * template.size
-        energy_drawn += float((template**2).sum())
+        energy_seen += cv2.norm(window, cv2.NORM_L2SQR) * template.size / window.size
+        energy_drawn += cv2.norm(template, cv2.NORM_L2SQR)
         count += 1
     return total / np.sqrt(energy_seen * energy_drawn + 1e-12), count
 
 
 def _cut(
-    differs: FloatImage, change: FloatImage, radius: int, blur_px: float
+    differs: NDArray[np.uint8] | cv2.typing.MatLike,
+    change: FloatImage,
+    radius: int,
+    blur_px: float,
 ) -> tuple[FloatImage, FloatImage]:
-    """The drawn motion's surroundings and the window of the image to search, means removed."""
+    """The drawn motion's surroundings and the window of `change` to search, means removed."""
     rim = round(5 * blur_px)
-    rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
-    top, bottom = max(rows[0] - rim, 0), rows[-1] + rim + 1
-    left, right = max(columns[0] - rim, 0), columns[-1] + rim + 1
-    template = cv2.GaussianBlur(differs, (0, 0), blur_px)[top:bottom, left:right]
+    left, top, width, height = cv2.boundingRect(differs)
+    right, bottom = left + width + rim, top + height + rim
+    left, top = max(left - rim, 0), max(top - rim, 0)
+    part = np.asarray(differs[top:bottom, left:right], np.float32)
+    template = cv2.GaussianBlur(part, (0, 0), blur_px)
     height, width = template.shape
-    padded = cv2.copyMakeBorder(
-        change, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=float(change.mean())
-    )
-    window = padded[top : top + height + 2 * radius, left : left + width + 2 * radius]
-    return template - template.mean(), window - window.mean()
+    window = change[top : top + height + 2 * radius, left : left + width + 2 * radius]
+    return _centred(template), _centred(window)
+
+
+def _centred(image: NDArray[np.floating] | cv2.typing.MatLike) -> FloatImage:
+    return np.asarray(image - np.float32(cv2.mean(image)[0]), np.float32)
 
 
 def _peak(surface: FloatArray) -> FloatArray:
@@ -285,6 +293,6 @@ def _refined(line: FloatArray, at: int) -> float:
     return at + 0.5 * float(before - after) / bend if bend < 0 else float(at)
 
 
-def _best_lag(lags_s: Sequence[float], surfaces: Sequence[FloatArray | None]) -> float:
-    values = [-np.inf if surface is None else float(surface.max()) for surface in surfaces]
-    return lags_s[int(np.argmax(values))]
+def _best_lag(surfaces: Sequence[tuple[float, FloatArray | None]]) -> float:
+    peaks = {lag: -np.inf if s is None else float(s.max()) for lag, s in surfaces}
+    return max(peaks, key=peaks.__getitem__)

@@ -175,7 +175,7 @@ def _mesh(path: Path) -> FloatArray:
         raise FileNotFoundError(f"reader: '{path.name}' needs the module coal") from error
     try:
         mesh = coal.MeshLoader().load(str(path), np.ones(3))
-        points = np.array([mesh.vertices(i) for i in range(mesh.num_vertices)])
+        points = np.array([mesh.vertex(i) for i in range(mesh.num_vertices)])
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
     return points[np.unique((points @ _directions(_DIRECTIONS).T).argmax(axis=0))]

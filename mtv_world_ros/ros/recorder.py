@@ -49,6 +49,7 @@ class Recorder(Node):
         self._optional = [self.resolve_topic_name(topic) for topic in options.if_published]
         self._taken: list[Subscription] = []
         self._next_look_s = 0.0
+        self._end_s = float('inf')
         self._is_announced = False
         self._counts: Counter[str] = Counter()
         self._last_stamp_ns = 0
@@ -61,18 +62,19 @@ class Recorder(Node):
             signal.signal(number, self._on_signal)
 
     def record(self) -> None:
-        """Records until a signal comes and what is on its way has arrived.
+        """Records for the wanted time, or until a signal comes and what was sent has arrived.
 
         Raises:
             ConfigError: a topic has no publisher in time.
         """
         begin_s = time.monotonic()
         with self._writer:
-            while not self._stopping:
+            while not self._stopping and time.monotonic() < self._end_s:
                 self._connect()
                 self._check_patience(time.monotonic() - begin_s)
                 self._executor.spin_once(timeout_sec=0.05)
-            self._drain()
+            if self._stopping:
+                self._drain()
         counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
         self.get_logger().info(f"recorded '{self._options.out}': {counted or 'nothing'}")
 
@@ -101,6 +103,7 @@ class Recorder(Node):
         connected = (s.get_publisher_count() for s in self._taken)
         if not self._is_announced and all(connected):
             self._is_announced = True
+            self._end_s = time.monotonic() + self._options.duration
             self.get_logger().info('recording')
 
     def _check_patience(self, waited_s: float) -> None:
@@ -178,6 +181,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
         'at the time they are about); messages without a header take the last header seen',
     )
     add('--wait-timeout', type=float, default=60.0, help='wait for publishers this long [s]')
+    add('--duration', type=float, default=float('inf'), help='end after this long [s]')
     return parser.parse_args(arguments)
 
 
