@@ -26,6 +26,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _evaluate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.evaluation.evaluate import evaluate
+    from mtv_world_ros.evaluation.html_report import write_report
     from mtv_world_ros.training.run import find_episodes
 
     table = evaluate(
@@ -39,4 +40,6 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         num_inference_steps=arguments.steps,
     )
     print(table)
+    written = write_report([arguments.out], arguments.out / 'report.html')
+    print(f'written: {written}')
     return 0

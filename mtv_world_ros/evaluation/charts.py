@@ -65,7 +65,7 @@ class Bin:
 
 def dot_chart(title: str, dots: Sequence[Dot]) -> Markup:
     """Returns values in [0, 1] with their intervals, one below the other."""
-    left, right, top, row = 128.0, 124.0, 8.0, 30.0
+    left, right, top, row = 92.0, 130.0, 8.0, 30.0
     height = top + row * len(dots) + 26
 
     def x(value: float) -> float:
@@ -156,7 +156,7 @@ def _seconds_ticks(longest: float) -> list[float]:
     return [step * k for k in range(int(longest / step + 1e-6) + 1)]
 
 
-def reliability_chart(title: str, bins: Sequence[Bin]) -> Markup:
+def reliability_chart(title: str, bins: Sequence[Bin], style: str) -> Markup:
     """Returns how often it came true against what was said; the diagonal is honest."""
     left, top, size, height = 34.0, 22.0, 200.0, 262.0
 
@@ -178,10 +178,12 @@ def reliability_chart(title: str, bins: Sequence[Bin]) -> Markup:
     for found in bins:
         low, high = found.interval
         ends = (x(found.said), y(low)), (x(found.said), y(high))
-        parts.append(_line(*ends, 'interval imagined'))
+        parts.append(_line(*ends, f'interval {style}'))
         at = (x(found.said), y(found.came_true))
-        parts.append(element('circle', cx=at[0], cy=at[1], r=5.0, class_='mark imagined'))
-        parts.append(_text(f'n={found.count}', at[0] + 9, at[1] + 4, 'tick'))
+        parts.append(element('circle', cx=at[0], cy=at[1], r=5.0, class_=f'mark {style}'))
+        side = 'end' if found.said > 0.8 else 'start'
+        place = at[0] + (-9 if side == 'end' else 9)
+        parts.append(_text(f'n={found.count}', place, at[1] + 4, 'tick', side))
     return _svg(height, title, parts, width=left + size + 44)
 
 

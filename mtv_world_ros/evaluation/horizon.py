@@ -9,7 +9,7 @@ import numpy as np
 
 from mtv_world_ros.evaluation.scores import ScoreRow
 
-#: frames that fewer than this share of the rollouts reach are left out
+#: frames that fewer than this share of the rollouts reach are left out of pictures
 MIN_SHARE = 1 / 3
 
 
@@ -28,9 +28,10 @@ class Curve:
 
 def curve(
     episodes: Sequence[Sequence[ScoreRow]],
-    view: str,
+    view: str | None,
     field: str,
     *,
+    min_share: float = MIN_SHARE,
     seed: int = 0,
     num_resamples: int = 500,
 ) -> Curve:
@@ -38,18 +39,23 @@ def curve(
 
     Args:
         episodes: rows of each episode.
-        view: its name.
+        view: its name; None = all.
         field: one of `scores.FRAME_FIELDS`.
+        min_share: frames that fewer than this share of the rollouts reach are left out.
         seed: of the resampling.
         num_resamples: how often the episodes are drawn with replacement.
     """
     kept = [
-        [getattr(row, field) for row in rows if row.name and row.moving and row.view == view]
+        [
+            getattr(row, field)
+            for row in rows
+            if row.name and row.moving and view in (None, row.view)
+        ]
         for rows in episodes
     ]
     sums, counts = _sums(kept)
     total = counts.sum(0)
-    covered = int((total >= max(MIN_SHARE * total.max(initial=0), 1)).sum())
+    covered = int((total >= max(min_share * total.max(initial=0), 1)).sum())
     if not covered:
         return Curve(values=(), band=())
     sums, counts = sums[:, :covered], counts[:, :covered]

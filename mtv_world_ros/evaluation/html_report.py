@@ -155,8 +155,8 @@ def _videos(evaluations: Sequence[Evaluated]) -> Markup:
         element(
             'p',
             f'By J of the {words}. In each row: what was recorded, the trajectory video drawn '
-            'from the commands, what was imagined. Outlines: the masks that were scored; white over '
-            'imagined frames: where the recorded object is.',
+            'from the commands, what was imagined. Outlines: the masks that were scored; white '
+            'over imagined frames: where the recorded object is.',
             class_='faint',
         ),
         *(_episode(pick, evaluations, budget) for pick in chosen),
@@ -207,6 +207,7 @@ def _figure(
             controls=True,
             loop=True,
             muted=True,
+            autoplay=True,
             playsinline=True,
             preload='auto',
         ),

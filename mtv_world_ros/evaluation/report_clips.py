@@ -24,8 +24,8 @@ OUTLINES = (
 )
 #: of the recorded masks over imagined frames
 _TRUE, _SHADOW = (255, 255, 255), (0, 0, 0)
-#: width up to which small frames are enlarged [px]
-_TILE_WIDTH = 320
+#: widths up to which small frames are enlarged [px]
+_VIDEO_TILE, _SHEET_TILE = 320, 200
 #: qualities of x264 that are tried until a video is small enough
 _CRFS = (24, 30, 36, 42)
 
@@ -58,14 +58,15 @@ def make_clip(rollout: StoredRollout, *, max_bytes: int) -> Clip:
         rollout: what to show.
         max_bytes: the video's quality is lowered until it takes no more, down to a limit.
     """
-    shown = outlined(rollout)
+    shown = outlined(rollout, _VIDEO_TILE)
     frames = side_by_side(shown, tile_width=shown.real.shape[3])
     video = b''
     for crf in _CRFS:
         video = encode_video(frames, rollout.fps, crf=crf, preset='medium')
         if len(video) <= max_bytes:
             break
-    sheet = contact_sheet(shown, num_columns=6, tile_width=shown.real.shape[3])
+    small = outlined(rollout, _SHEET_TILE)
+    sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE)
     done, data = cv2.imencode('.webp', sheet[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])
     assert done
     return Clip(
@@ -80,13 +81,17 @@ def make_clip(rollout: StoredRollout, *, max_bytes: int) -> Clip:
     )
 
 
-def outlined(rollout: StoredRollout) -> Comparison:
+def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
     """Returns the frames, enlarged, with the masks' outlines drawn over and J as captions.
 
     Recorded frames carry the recorded masks in the objects' colours; imagined frames the masks
     found in them in the same colours, and the recorded ones in white.
+
+    Args:
+        rollout: what to show.
+        tile_width: width up to which frames are enlarged, by whole factors [px].
     """
-    factor = max(_TILE_WIDTH // rollout.real.shape[3], 1)
+    factor = max(tile_width // rollout.real.shape[3], 1)
     real, trajectory, imagined = (
         frames.repeat(factor, axis=2).repeat(factor, axis=3)
         for frames in (rollout.real, rollout.trajectory, rollout.imagined)
@@ -97,7 +102,7 @@ def outlined(rollout: StoredRollout) -> Comparison:
                 colour = OUTLINES[o % len(OUTLINES)]
                 true, found = rollout.true_masks[v, o, t], rollout.masks[v, o, t]
                 _outline(real[v, t], true, factor, colour)
-                _outline(imagined[v, t], true, factor, _TRUE)
+                _outline(imagined[v, t], true, factor, _TRUE, shadow=True)
                 _outline(imagined[v, t], found, factor, colour)
     mean = mean_of_known(rollout.j, axis=1)
     return Comparison(
@@ -114,11 +119,19 @@ def _caption(j: float) -> str:
     return f'J {j:.2f}' if np.isfinite(j) else 'J not scored'
 
 
-def _outline(image: ByteArray, mask: BoolArray, factor: int, colour: tuple[int, int, int]) -> None:
+def _outline(
+    image: ByteArray,
+    mask: BoolArray,
+    factor: int,
+    colour: tuple[int, int, int],
+    *,
+    shadow: bool = False,
+) -> None:
     """Draws the outline of an (H, W) mask over the enlarged image, in place."""
     if not mask.any():
         return
     large = mask.astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)
     contours, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, contours, -1, _SHADOW, 3)
-    cv2.drawContours(image, contours, -1, colour, 1)
+    if shadow:
+        cv2.drawContours(image, contours, -1, _SHADOW, 3)
+    cv2.drawContours(image, contours, -1, colour, 1 if shadow else 2)

@@ -11,7 +11,7 @@ import numpy as np
 from mtv_world_ros.evaluation.charts import Bin, reliability_chart
 from mtv_world_ros.evaluation.evaluated import Evaluated, scores
 from mtv_world_ros.evaluation.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.report_numbers import badge, letter, number
+from mtv_world_ros.evaluation.report_numbers import badge, hue, letter, number
 
 _NUM_BINS = 5
 _WILSON_Z = 1.959964
@@ -34,7 +34,7 @@ def success_section(evaluations: Sequence[Evaluated]) -> Markup | None:
     charts = [
         element('figure', element('h3', badge(index, evaluations), 'Reliability'), chart)
         for index, found in enumerate(evaluations)
-        if (chart := _reliability(found)) is not None
+        if (chart := _reliability(found, hue(index))) is not None
     ]
     return element(
         'section',
@@ -66,7 +66,7 @@ def _words(key: str) -> str:
     return key.removeprefix('num_').replace('_', ' ').capitalize()
 
 
-def _reliability(found: Evaluated) -> Markup | None:
+def _reliability(found: Evaluated, style: str) -> Markup | None:
     judged = [
         (result.probability, result.outcome == 'success')
         for result in found.results.values()
@@ -87,7 +87,7 @@ def _reliability(found: Evaluated) -> Markup | None:
         for k in range(_NUM_BINS)
         if (place == k).any()
     ]
-    return reliability_chart('Share of real successes against the estimate', bins)
+    return reliability_chart('Share of real successes against the estimate', bins, style)
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:

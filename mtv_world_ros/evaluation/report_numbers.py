@@ -17,6 +17,8 @@ _KEYS = (
     ('j_moving', 'j_copy_moving', 'j_shuffled_moving'),
     ('j_object_mean', 'j_copy_mean', 'j_shuffled_mean'),
 )
+#: shown where they were measured
+_MORE = {'j_zero_moving': 'joints still', 'j_mirrored_moving': 'mirrored'}
 _MARGINS = {
     'margin_moving': 'the first frame held',
     'margin_over_shuffled': "another episode's actions",
@@ -39,6 +41,12 @@ def with_interval(numbers: Mapping[str, Any], key: str) -> str:
     low, high = interval(numbers, key)
     text = number(numbers.get(key))
     return f'{text} [{low:.3f}, {high:.3f}]' if isfinite(low) and text != '–' else text
+
+
+def stacked(numbers: Mapping[str, Any], key: str) -> str:
+    """Returns the same with the interval below the number."""
+    text, bracket, rest = with_interval(numbers, key).partition(' [')
+    return join([text, element('small', f'[{rest}')]) if bracket else text
 
 
 def interval(numbers: Mapping[str, Any], key: str) -> tuple[float, float]:
@@ -110,7 +118,8 @@ def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
     text = (
         f'Not shown in every view ({"; ".join(doubts)}).'
         if doubts
-        else 'Yes, in every view: the intervals of the margins over both lie above 0.'
+        else 'Yes: in every view the intervals of the margins over the held frame and over '
+        'shuffled actions lie above 0.'
     )
     style = 'verdict doubt' if doubts else 'verdict'
     return element('p', badge(index, evaluations), text, class_=style)
@@ -125,15 +134,17 @@ def _dots(evaluations: Sequence[Evaluated], view: str, keys: tuple[str, str, str
             continue
         colour = hue(index)
         styles = (colour, 'held', 'alone shuffled' if alone else f'{colour} shuffled')
-        for key, word, style in zip(keys, ('imagined', 'held', 'shuffled'), styles, strict=True):
-            dots.append(
-                Dot(
-                    label=word if alone else f'{letter(index)} {word}',
-                    value=nan if numbers.get(key) is None else numbers[key],
-                    interval=interval(numbers, key),
-                    style=style,
-                )
+        shown = list(zip(keys, ('imagined', 'held', 'shuffled'), styles, strict=True))
+        more = [(key, word, 'held') for key, word in _MORE.items() if numbers.get(key) is not None]
+        dots += [
+            Dot(
+                label=word if alone else f'{letter(index)} {word}',
+                value=nan if numbers.get(key) is None else numbers[key],
+                interval=interval(numbers, key),
+                style=style,
             )
+            for key, word, style in [*shown, *more]
+        ]
     return dot_chart(f'J in view {view}', dots)
 
 
@@ -181,7 +192,9 @@ def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line
             continue
         style = _style(index, evaluations, word)
         label = f'{letter(index)} {word or "imagined"}'
-        values, band = _on_clock(drawn.values, clock), _on_clock(drawn.band, clock)
+        values = _on_clock(drawn.values, clock)
+        with_band = len(evaluations) == 1 or not word
+        band = _on_clock(drawn.band, clock) if with_band else ()
         lines.append(Line(label=label, values=values, band=band, style=style))
     return lines
 
@@ -282,7 +295,7 @@ def task_section(evaluations: Sequence[Evaluated]) -> Markup:
         groups = {**found.metrics['tasks'], 'all tasks': found.metrics}
         for task, group in groups.items():
             for view, numbers in {**group['views'], 'all views': group['overall']}.items():
-                cells = [with_interval(numbers, key) for key in COLUMNS]
+                cells = [stacked(numbers, key) for key in COLUMNS]
                 rows.append([task or 'no task', view, str(group['num_episodes']), *cells])
         tables.append(table(head, rows, num_labels=2, caption=_name(index, evaluations)))
     return element(
