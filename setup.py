@@ -63,6 +63,8 @@ setup(
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
         # PSNR and SSIM of `mtv-world evaluate --quality`
         'evaluate': ['torchmetrics>=1.8'],
+        # Wan 2.1: umT5, CLIP and LoRA adapters.
+        'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
