@@ -23,12 +23,14 @@ class Conditioning:
         start_control: (B, V, C, h, w) of its frame 0.
         start: (B, V, C, F, h, w) the start image in every frame's channel slot.
         reference: (B, V, C, h, w) of the start image.
+        actions: what `ActionEncoding` made of the commands, where they are not drawn.
     """
 
     control: Tensor
     start_control: Tensor
     start: Tensor
     reference: Tensor
+    actions: Tensor | None = None
 
 
 def encode_frames(autoencoder: SpaceToDepthAutoencoder, frames: Tensor) -> Tensor:
@@ -64,4 +66,28 @@ def condition(
         start_control=control[:, :, :, 0],
         start=reference.unsqueeze(3).expand(-1, -1, -1, num_frames, -1, -1),
         reference=reference,
+    )
+
+
+def condition_on_actions(
+    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, actions: Tensor, num_frames: int
+) -> Conditioning:
+    """Returns the latents to denoise under where actions are not drawn: no trajectory video.
+
+    Its latents are zero, so that the transformer keeps its shape, and with it public weights.
+
+    Args:
+        autoencoder: of the preset.
+        start_frame: (B, V, H, W, 3) uint8 RGB.
+        actions: what `ActionEncoding` gives, of the whole batch.
+        num_frames: T.
+    """
+    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
+    start = reference.unsqueeze(3).expand(-1, -1, -1, num_frames, -1, -1)
+    return Conditioning(
+        control=torch.zeros_like(start),
+        start_control=torch.zeros_like(reference),
+        start=start,
+        reference=reference,
+        actions=actions,
     )

@@ -63,6 +63,7 @@ def sample_latents(
             start=conditioning.start,
             reference=conditioning.reference,
             start_control=conditioning.start_control,
+            actions=conditioning.actions,
         ).float()
         flow = flow_of(transformer, out, latents, scheduler.sigmas[step].to(device))
         latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]

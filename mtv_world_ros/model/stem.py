@@ -79,6 +79,25 @@ class ConvStem(nn.Module):
         return tokens, [fine, half, coarse]
 
 
+class ReferenceStem(nn.Module):
+    """phi of the paper: reference latents to tokens, and to keys for copying."""
+
+    def __init__(self, in_channels: int, widths: tuple[int, int, int], dim: int) -> None:
+        super().__init__()
+        c1, c2, _ = widths
+        self.conv_in = nn.Conv2d(in_channels, c1, 3, padding=1)
+        self.block1 = ResBlock(c1, c1, dim)
+        self.down1 = nn.Conv2d(c1, c2, 3, stride=2, padding=1)
+        self.block2 = ResBlock(c2, c2, dim)
+        self.to_tokens = nn.Conv2d(c2, dim, 2, stride=2)
+
+    def forward(self, x: Tensor, temb: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns tokens (R, D, h4, w4) and keys (R, c2, h2, w2)."""
+        x = self.block1(self.conv_in(x), temb)
+        keys = self.block2(self.down1(x), temb)
+        return self.to_tokens(keys), keys
+
+
 class CopyAttention(nn.Module):
     """Lets every output patch point into its own view's reference image and copy from there."""
 

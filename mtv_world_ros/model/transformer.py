@@ -15,34 +15,10 @@ from torch import nn, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.context import fit_cross_attention
+from mtv_world_ros.model.control import build_control
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
-from mtv_world_ros.model.stem import ConvStem, ReferenceDecoder, ResBlock
-
-
-class _NoContext(nn.Module):
-    """Stands where cross-attention would, in presets without text or image context."""
-
-    def forward(self, hidden_states: Tensor, *_: Any) -> Tensor:
-        return torch.zeros_like(hidden_states)
-
-
-class _ReferenceStem(nn.Module):
-    """phi for the convolutional stem: reference latents to tokens, and to keys for copying."""
-
-    def __init__(self, in_channels: int, widths: tuple[int, int, int], dim: int) -> None:
-        super().__init__()
-        c1, c2, _ = widths
-        self.conv_in = nn.Conv2d(in_channels, c1, 3, padding=1)
-        self.block1 = ResBlock(c1, c1, dim)
-        self.down1 = nn.Conv2d(c1, c2, 3, stride=2, padding=1)
-        self.block2 = ResBlock(c2, c2, dim)
-        self.to_tokens = nn.Conv2d(c2, dim, 2, stride=2)
-
-    def forward(self, x: Tensor, temb: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns tokens (R, D, h4, w4) and keys (R, c2, h2, w2)."""
-        x = self.block1(self.conv_in(x), temb)
-        keys = self.block2(self.down1(x), temb)
-        return self.to_tokens(keys), keys
+from mtv_world_ros.model.stem import ConvStem, ReferenceDecoder, ReferenceStem
 
 
 class MultiViewWanTransformer(WanTransformer3DModel):
@@ -57,10 +33,15 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         num_views: views it has an embedding for.
         stem: `patch` (Wan's own) or `conv` (small preset).
         stem_widths: channels of the convolutional stem at full, half and quarter latent size.
-        frames_per_token: latent frames merged by the convolutional stem.
+        frames_per_token: latent frames merged by the convolutional stem; with patches, video
+            frames that the autoencoder merges.
         context: `text_image` (cross-attention as in Wan) or `none`.
         view_offset: see `MultiViewRotaryPosEmbed`.
         prediction: `flow` (noise - clean, Wan) or `sample` (the clean latents).
+        control: how actions enter, see `control.py`; but for `trajectory_video` blocks have
+            cross-attention also where `context` is `none`.
+        action_dim: numbers an action, for controls other than `trajectory_video`.
+        num_context_tokens: learned tokens in place of the text where `context` is `none`.
     """
 
     # number formats are chosen by whoever loads the model, in one place for all modules
@@ -93,6 +74,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         context: str = 'text_image',
         view_offset: str = 'width',
         prediction: str = 'flow',
+        control: str = 'trajectory_video',
+        action_dim: int = 0,
+        num_context_tokens: int = 8,
     ) -> None:
         super().__init__(
             patch_size=patch_size,
@@ -122,17 +106,24 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             )
         self.view_embedding = nn.Parameter(torch.zeros(num_views, dim))
         if context == 'none':
-            self._drop_context()
+            self.condition_embedder.text_embedder = nn.Identity()  # type: ignore[assignment]
         if stem == 'conv':
             self._build_conv_stem(in_channels, latent_channels, stem_widths, dim, frames_per_token)
         else:
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
-
-    def _drop_context(self) -> None:
-        self.condition_embedder.text_embedder = nn.Identity()  # type: ignore[assignment]
-        for block in self.blocks:
-            block.attn2 = _NoContext()
-            block.norm2 = nn.Identity()
+        self.with_text = context != 'none'
+        # last, so that a seed gives what all controls share the same weights
+        self.action_control = build_control(
+            control,
+            with_text=self.with_text,
+            num_context_tokens=num_context_tokens,
+            action_dim=action_dim,
+            dim=dim,
+            frames_per_token=frames_per_token,
+        )
+        fit_cross_attention(
+            self.blocks, with_actions=self.action_control is not None, with_text=self.with_text
+        )
 
     def _build_conv_stem(
         self,
@@ -143,7 +134,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         merge: int,
     ) -> None:
         self.patch_embedding = ConvStem(in_channels, widths, dim, merge)  # type: ignore[assignment]
-        self.ref_conv = _ReferenceStem(2 * channels, widths, dim)
+        self.ref_conv = ReferenceStem(2 * channels, widths, dim)
         self.proj_out = ReferenceDecoder(channels, widths, dim, merge, widths[1])  # type: ignore[assignment]
 
     def forward(  # type: ignore[override]
@@ -156,6 +147,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         start_control: Tensor | None = None,
         encoder_hidden_states: Tensor | None = None,
         encoder_hidden_states_image: Tensor | None = None,
+        actions: Tensor | None = None,
+        actions_kept: Tensor | None = None,
     ) -> Tensor:
         """Returns (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
 
@@ -168,6 +161,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             start_control: (B, V, C, H, W) latents of the control frame 0 (convolutional stem).
             encoder_hidden_states: (B, 512, text_dim) umT5 tokens.
             encoder_hidden_states_image: (B, V * 257, image_dim) CLIP tokens.
+            actions: what `ActionEncoding` gives, for controls other than `trajectory_video`.
+            actions_kept: (B,) bool, False = a sample without its actions; see `ActionControl`.
 
         Raises:
             CheckpointError: more views than the model has embeddings for.
@@ -180,16 +175,15 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             )
         if encoder_hidden_states is None:
             encoder_hidden_states = hidden_states.new_zeros(hidden_states.shape[0], 1, 1)
-        temb, time_proj, context, image = self.condition_embedder(
+        temb, time_proj, text, image = self.condition_embedder(
             timestep, encoder_hidden_states, encoder_hidden_states_image
         )
-        if image is not None:
-            context = torch.cat([image, context], dim=1)
         x = torch.cat([hidden_states, control, start], dim=2)
         tokens, skips = self._embed(x, temb)
         ref_tokens, keys = self._embed_reference(reference, start_control, temb)
         grid = torch.cat([ref_tokens, tokens], dim=2)
         grid = grid + self.view_embedding[:num_views, None, None, None]
+        context = self._context(text, image, actions, actions_kept, grid)
         rotary = self.rope(grid)
         sequence = grid.flatten(1, 4)
         time_proj = time_proj.unflatten(1, (6, -1))
@@ -204,6 +198,23 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
         kept = sequence.reshape(grid.shape)[:, :, 1:]
         return self._unembed(kept, skips, temb, keys, reference, hidden_states)
+
+    def _context(
+        self,
+        text: Tensor,
+        image: Tensor | None,
+        actions: Tensor | None,
+        kept: Tensor | None,
+        grid: Tensor,
+    ) -> Any:
+        """What the blocks' cross-attention looks at; grid (B, V, 1 + f, h, w, D)."""
+        if self.action_control is None:
+            return text if image is None else torch.cat([image, text], dim=1)
+        if actions is None:
+            raise CheckpointError(f"control '{self.config['control']}' needs actions, got none")
+        slots_views = (grid.shape[2], grid.shape[1])
+        text_or_none = text if self.with_text else None
+        return self.action_control(actions, kept, text_or_none, image, slots_views)
 
     def _embed(self, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W)."""

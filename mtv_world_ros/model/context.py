@@ -1,0 +1,94 @@
+"""What the blocks' cross-attention looks at: tokens for all, with padding, or of a time slot alone.
+
+Shape letters: B batch, V views, S time slots (the reference image and f token frames), n tokens
+of a view and slot, N context tokens, G of them a slot, M image tokens, D width.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn, Tensor
+import torch.nn.functional as F
+
+
+class Context(NamedTuple):
+    """What the cross-attention of a block looks at.
+
+    Attributes:
+        tokens: (B, N, D) for all tokens alike, or (B, S, G, D): each time slot has its own.
+        num_views: V, to find the time slots in the token sequence.
+        mask: (B, N) bool, False = padding; None = all count.
+        image: (B, M, D) tokens that the added image attention looks at, or None.
+    """
+
+    tokens: Tensor
+    num_views: int
+    mask: Tensor | None = None
+    image: Tensor | None = None
+
+
+class ContextAttnProcessor:
+    """Wan's cross-attention for a `Context`: any number of tokens, padding, slots of their own."""
+
+    def __call__(
+        self,
+        attn: Any,
+        hidden_states: Tensor,
+        encoder_hidden_states: Context,
+        attention_mask: None = None,
+        rotary_emb: None = None,
+    ) -> Tensor:
+        """Returns (B, V * S * n, D) for a token sequence of that shape."""
+        del attention_mask, rotary_emb
+        context = encoder_hidden_states
+        query = attn.norm_q(attn.to_q(hidden_states))
+        out = _attend_context(attn, query, context)
+        if context.image is not None:
+            key = attn.norm_added_k(attn.add_k_proj(context.image))
+            out = out + _attend(attn.heads, query, key, attn.add_v_proj(context.image))
+        return attn.to_out[1](attn.to_out[0](out))
+
+
+def _attend_context(attn: Any, query: Tensor, context: Context) -> Tensor:
+    tokens = context.tokens
+    if tokens.ndim == 3:
+        mask = None if context.mask is None else context.mask[:, None, None]
+        return _attend(attn.heads, query, *_keys_values(attn, tokens), mask)
+    batch, slots = tokens.shape[:2]
+    # time slots become part of the batch, so that none sees the actions of another
+    grid = query.unflatten(1, (context.num_views, slots, -1)).transpose(1, 2)
+    own = grid.flatten(2, 3).flatten(0, 1)
+    out = _attend(attn.heads, own, *_keys_values(attn, tokens.flatten(0, 1)))
+    out = out.unflatten(0, (batch, slots)).unflatten(2, (context.num_views, -1))
+    return out.transpose(1, 2).flatten(1, 3)
+
+
+def _keys_values(attn: Any, tokens: Tensor) -> tuple[Tensor, Tensor]:
+    return attn.norm_k(attn.to_k(tokens)), attn.to_v(tokens)
+
+
+def _attend(
+    heads: int, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None
+) -> Tensor:
+    parts = [x.unflatten(2, (heads, -1)).transpose(1, 2) for x in (query, key, value)]
+    out = F.scaled_dot_product_attention(*parts, attn_mask=mask)
+    return out.transpose(1, 2).flatten(2).type_as(query)
+
+
+class _NoContext(nn.Module):
+    """Stands where cross-attention would, where there is nothing to look at."""
+
+    def forward(self, hidden_states: Tensor, *_: Any) -> Tensor:
+        return torch.zeros_like(hidden_states)
+
+
+def fit_cross_attention(blocks: Any, *, with_actions: bool, with_text: bool) -> None:
+    """Lets the blocks' cross-attention look at a `Context`, or takes it out."""
+    for block in blocks:
+        if with_actions:
+            block.attn2.set_processor(ContextAttnProcessor())
+        elif not with_text:
+            block.attn2 = _NoContext()
+            block.norm2 = nn.Identity()
