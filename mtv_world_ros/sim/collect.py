@@ -119,7 +119,7 @@ class EpisodeMaker:
                 continue
             physics += take.physics_s
             rendering += take.rendering_s
-            if take.is_as_wanted(miss=job.miss):
+            if take.is_as_wanted():
                 writing = self._write(job, take, seed, attempt)
                 return Spent(physics_s=physics, rendering_s=rendering, writing_s=writing)
         raise SimulatorError(
