@@ -20,10 +20,9 @@ from mtv_world_ros.evaluation.report_numbers import (
     headline,
     horizon_section,
     number,
-    paper_tables,
-    task_section,
     with_interval,
 )
+from mtv_world_ros.evaluation.report_tables import paper_tables, task_section
 from mtv_world_ros.evaluation.tables import write_text
 from mtv_world_ros.resources import share_path
 

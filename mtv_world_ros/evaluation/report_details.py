@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
@@ -16,7 +16,8 @@ from mtv_world_ros.evaluation.report_numbers import badge, hue, letter, number
 _NUM_BINS = 5
 _WILSON_Z = 1.959964
 #: parts of metrics.json that have sections of their own
-_SHOWN = {'name', 'provenance', 'failed', 'episodes', 'views', 'overall', 'tasks', 'success'}
+_SHOWN = {'name', 'provenance', 'failed', 'notes', 'episodes', 'success'}
+_SHOWN |= {'views', 'overall', 'tasks', 'zero_shot'}
 
 
 def success_section(evaluations: Sequence[Evaluated]) -> Markup | None:
@@ -127,7 +128,16 @@ def _failures(index: int, evaluations: Sequence[Evaluated]) -> Markup:
     failed = evaluations[index].metrics['failed']
     heading = element('h3', badge(index, evaluations), f'Episodes that failed: {len(failed)}')
     items = [element('li', element('code', path), f' {why}') for path, why in failed.items()]
-    return join([heading, element('ul', *items, class_='failed') if items else None])
+    listed = element('ul', *items, class_='failed') if items else None
+    return join([heading, listed, _notes(evaluations[index].metrics.get('notes', {}))])
+
+
+def _notes(notes: Mapping[str, Sequence[str]]) -> Markup | None:
+    items = [
+        element('li', element('code', name), f' {note}') for name in notes for note in notes[name]
+    ]
+    summary = element('summary', f'Notes on recordings: {len(items)}')
+    return element('details', summary, element('ul', *items)) if items else None
 
 
 def episodes_section(evaluations: Sequence[Evaluated]) -> Markup:

@@ -1,4 +1,4 @@
-"""The report's numbers: headline, horizon, the paper's tables, tables by task."""
+"""The report's headline and horizon, and how it writes numbers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 from mtv_world_ros.evaluation.charts import Dot, dot_chart, Line, line_chart
 from mtv_world_ros.evaluation.evaluated import Evaluated
 from mtv_world_ros.evaluation.horizon import curve
-from mtv_world_ros.evaluation.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.tables import COLUMNS
+from mtv_world_ros.evaluation.markup import element, join, Markup
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
 _KEYS = (
@@ -18,7 +17,18 @@ _KEYS = (
     ('j_object_mean', 'j_copy_mean', 'j_shuffled_mean'),
 )
 #: shown where they were measured
-_MORE = {'j_zero_moving': 'joints still', 'j_mirrored_moving': 'mirrored'}
+_MORE = {
+    'j_zero_moving': 'joints held',
+    'j_mirrored_moving': 'mirrored',
+    'j_ceiling_moving': 'round trip',
+    'j_self_moving': 'recorded',
+}
+_MEANINGS = {
+    'j_zero_moving': 'Joints held: imagined with joints that stay where they are.',
+    'j_mirrored_moving': "Mirrored: imagined with the arms' actions mirrored.",
+    'j_ceiling_moving': 'Round trip: recorded frames through the autoencoder.',
+    'j_self_moving': 'Recorded: the recorded frames themselves, the ceiling of the segmenter.',
+}
 _MARGINS = {
     'margin_moving': 'the first frame held',
     'margin_over_shuffled': "another episode's actions",
@@ -92,7 +102,7 @@ def headline(evaluations: Sequence[Evaluated]) -> Markup:
             'p',
             f'Jaccard index J of the {words}, 1 = the masks agree in every pixel. Held: the '
             "first frame stands still. Shuffled: imagined with another episode's actions. "
-            'Whiskers: 95 % bootstrap over episodes.',
+            + ' '.join([*_meanings(evaluations), 'Whiskers: 95 % bootstrap over episodes.']),
             class_='faint',
         ),
         element('div', *panels, class_='panels'),
@@ -104,6 +114,15 @@ def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:
     moving, every = _KEYS
     measured = any(found.metrics['overall'].get(moving[0]) is not None for found in evaluations)
     return (moving, 'objects that really move') if measured else (every, 'objects')
+
+
+def _meanings(evaluations: Sequence[Evaluated]) -> list[str]:
+    overall = [found.metrics['overall'] for found in evaluations]
+    return [
+        words
+        for key, words in _MEANINGS.items()
+        if any(numbers.get(key) is not None for numbers in overall)
+    ]
 
 
 def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
@@ -225,88 +244,3 @@ def _key(evaluations: Sequence[Evaluated]) -> Markup:
             drawn = element('svg', stroke, viewBox='0 0 26 12', aria_hidden='true')
             items.append(element('li', drawn, f'{prefix}{word or "imagined"}'))
     return element('ul', *items, class_='key')
-
-
-def paper_tables(evaluations: Sequence[Evaluated]) -> Markup:
-    """Returns method by view and task by view in the form of the paper's tables 1 and 3."""
-    views = all_views(evaluations)
-    head = ['Method', *(f'{view} {what}' for view in views for what in ('FID ↓', 'FVD ↓', 'J ↑'))]
-    rows = [
-        [_name(index, evaluations), *_method_cells(found, views, 'j_union')]
-        for index, found in enumerate(evaluations)
-    ]
-    held = [f'{_name(0, evaluations)}: first frame held']
-    for view in views:
-        copy = evaluations[0].metrics['views'].get(view, {}).get('j_copy_union')
-        held += ['–', '–', number(copy)]
-    return element(
-        'section',
-        element('h2', "In the form of the paper's tables"),
-        element(
-            'p',
-            'J of the union of all objects, mean over frames and episodes (the paper prints it '
-            'times 100). FID and FVD need feature weights; a dash is not measured.',
-            class_='faint',
-        ),
-        table(head, [*rows, held], caption='Method × view'),
-        _task_by_view(evaluations, views),
-        id='paper',
-    )
-
-
-def _method_cells(found: Evaluated, views: Sequence[str], key: str) -> list[str]:
-    cells = []
-    for view in views:
-        numbers = found.metrics['views'].get(view, {})
-        cells += [number(numbers.get('fid'), 1), number(numbers.get('fvd'), 1)]
-        cells.append(number(numbers.get(key)))
-    return cells
-
-
-def _name(index: int, evaluations: Sequence[Evaluated]) -> str:
-    prefix = '' if len(evaluations) == 1 else f'{letter(index)} · '
-    return f'{prefix}{evaluations[index].name}'
-
-
-def _task_by_view(evaluations: Sequence[Evaluated], views: Sequence[str]) -> Markup:
-    tasks = list(dict.fromkeys(task for found in evaluations for task in found.metrics['tasks']))
-    alone = len(evaluations) == 1
-    head = ['Task'] + [
-        f'{"" if alone else letter(index) + " "}{view}'
-        for index in range(len(evaluations))
-        for view in views
-    ]
-    rows = []
-    for task in tasks:
-        cells = [task or 'no task']
-        for found in evaluations:
-            by_view = found.metrics['tasks'].get(task, {}).get('views', {})
-            cells += [number(by_view.get(view, {}).get('j_union')) for view in views]
-        rows.append(cells)
-    return table(head, rows, caption='J, task × view')
-
-
-def task_section(evaluations: Sequence[Evaluated]) -> Markup:
-    """Returns every number by task and view, with intervals."""
-    head = ['Task', 'View', 'Episodes', *COLUMNS.values()]
-    tables = []
-    for index, found in enumerate(evaluations):
-        rows = []
-        groups = {**found.metrics['tasks'], 'all tasks': found.metrics}
-        for task, group in groups.items():
-            for view, numbers in {**group['views'], 'all views': group['overall']}.items():
-                cells = [stacked(numbers, key) for key in COLUMNS]
-                rows.append([task or 'no task', view, str(group['num_episodes']), *cells])
-        tables.append(table(head, rows, num_labels=2, caption=_name(index, evaluations)))
-    return element(
-        'section',
-        element('h2', 'By task'),
-        element(
-            'p',
-            'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: '
-            'of the objects that really move. Skill: (J − J held) / (1 − J held).',
-            class_='faint',
-        ),
-        join(tables),
-        id='tasks',
-    )
