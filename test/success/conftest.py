@@ -1,0 +1,14 @@
+from pathlib import Path
+
+import pytest
+from tiny_vision import save_dino, save_sam2, save_sam3
+
+
+@pytest.fixture(scope='session')
+def weights(tmp_path_factory) -> Path:
+    """A folder with one tiny model of each kind, in subfolders of arbitrary names."""
+    root = tmp_path_factory.mktemp('weights')
+    save_dino(root / 'some org' / 'detector')
+    save_sam2(root / 'tracker')
+    save_sam3(root / 'third')
+    return root
