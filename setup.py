@@ -65,6 +65,8 @@ setup(
         'evaluate': ['torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
+        # LeRobot datasets are read with it (mtv-world import-dataset).
+        'import': ['pyarrow>=17'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
