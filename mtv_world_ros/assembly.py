@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
@@ -84,7 +85,12 @@ def load_pipeline(
 
     set_num_threads(num_threads)
     loaded = load_checkpoint(checkpoint_path(checkpoint))
-    world_model = DiffusionWorldModel(loaded, device=device, dtype=choose_dtype(dtype, device))
+    world_model = DiffusionWorldModel(
+        loaded,
+        device=device,
+        dtype=choose_dtype(dtype, device),
+        robot=_robot_of(loaded.card, robot),
+    )
     return assemble(
         loaded.card,
         world_model,
@@ -109,14 +115,8 @@ def assemble(
     Raises:
         CheckpointError: the robot is not the one the model was trained with.
     """
-    model = load_robot(robot_path(robot or card['robot']))
-    if model.name != card['robot']:
-        raise CheckpointError(
-            f"the checkpoint was trained with robot '{card['robot']}', 'robot_file' describes "
-            f"'{model.name}'; use the trained one or train on this robot's episodes"
-        )
     return Pipeline(
-        robot=model,
+        robot=_robot_of(card, robot),
         world_model=world_model,
         segmenter=segmenter or assemble_segmenter(),
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task),
@@ -124,6 +124,17 @@ def assemble(
         object_mask=card['object_mask'],
         objects=objects,
     )
+
+
+def _robot_of(card: Any, robot: str | Path | None) -> RobotModel:
+    """The checkpoint's robot, or the file given if it describes the same one."""
+    model = load_robot(robot_path(robot or card['robot']))
+    if model.name != card['robot']:
+        raise CheckpointError(
+            f"the checkpoint was trained with robot '{card['robot']}', 'robot_file' describes "
+            f"'{model.name}'; use the trained one or train on this robot's episodes"
+        )
+    return model
 
 
 def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:

@@ -50,6 +50,7 @@ class WorldModel(Protocol):
         start_frame: ByteArray,
         trajectory_frames: ByteArray,
         *,
+        positions: FloatArray,
         seed: int,
         num_inference_steps: int,
         should_stop: Callable[[], bool],
@@ -60,6 +61,8 @@ class WorldModel(Protocol):
             start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
             trajectory_frames: (V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
                 command k, frame 0 the start.
+            positions: (1 + T, J) what was drawn: row 0 where the robot stands, row k command k
+                [rad or m]; for models that take actions as numbers.
             seed: seed of the noise.
             num_inference_steps: denoising steps.
             should_stop: asked between steps.
@@ -185,6 +188,7 @@ class Pipeline:
         frames = self.world_model.predict(
             start.frames,
             control.frames,
+            positions=positions,
             seed=seed,
             num_inference_steps=request.num_inference_steps,
             should_stop=request.should_stop,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mtv_world_ros.data_types import ByteArray, WorldModelSpec
+from mtv_world_ros.data_types import ByteArray, FloatArray, WorldModelSpec
 
 
 class PersistenceWorldModel:
@@ -20,11 +20,12 @@ class PersistenceWorldModel:
         start_frame: ByteArray,
         trajectory_frames: ByteArray,
         *,
+        positions: FloatArray,
         seed: int,
         num_inference_steps: int,
         should_stop: Callable[[], bool],
     ) -> ByteArray:
         """Returns the start frame T times; see `pipeline.WorldModel.predict`."""
-        del seed, num_inference_steps, should_stop
+        del positions, seed, num_inference_steps, should_stop
         num_frames = trajectory_frames.shape[1] - 1
         return np.repeat(start_frame[:, None], num_frames, axis=1)

@@ -9,6 +9,7 @@ from typing import Any
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.model.action_features import CONTROLS
 
 CARD = 'world_model.json'
 _CARD_KEYS = {
@@ -71,3 +72,7 @@ def check_card(card: Mapping[str, Any], path: Path) -> None:
             raise CheckpointError(f"'{path}': key '{key}' is missing")
         if not isinstance(card[key], kind):
             raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
+    if card['control'] not in CONTROLS:
+        raise CheckpointError(
+            f"'{path}': control '{card['control']}' is not one of {', '.join(CONTROLS)}"
+        )

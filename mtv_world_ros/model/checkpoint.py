@@ -15,6 +15,8 @@ from safetensors.torch import load_file
 import torch
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
+from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CARD, check_card, read_card
 from mtv_world_ros.model.runtime import place
@@ -34,12 +36,14 @@ class Checkpoint:
         scheduler: noise levels and the step rule.
         card: `world_model.json`: views, fps, num_frames (T), width, height, robot, control,
             object_mask, rendering, trained_on.
+        actions: how positions become the transformer's actions; None where they are drawn.
     """
 
     transformer: MultiViewWanTransformer
     autoencoder: SpaceToDepthAutoencoder
     scheduler: FlowMatchEulerDiscreteScheduler
     card: Mapping[str, Any]
+    actions: ActionEncoding | None = None
 
 
 def save_checkpoint(
@@ -54,6 +58,8 @@ def save_checkpoint(
     stored.save_pretrained(partial / 'transformer', safe_serialization=True)
     checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
     checkpoint.scheduler.save_pretrained(partial / 'scheduler')
+    if checkpoint.actions is not None:
+        checkpoint.actions.save(partial)
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
     if folder.exists():
         old = folder.with_name(folder.name + '.old')
@@ -82,12 +88,15 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
             f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
             'loaded: convert them and remove these'
         )
+    control = card['control']
+    drawn = control == TRAJECTORY_VIDEO
     scheduler: Any = FlowMatchEulerDiscreteScheduler.from_pretrained(folder / 'scheduler')
     return Checkpoint(
         transformer=_load_part(MultiViewWanTransformer, folder / 'transformer', dtype),
         autoencoder=_load_part(SpaceToDepthAutoencoder, folder / 'autoencoder', dtype),
         scheduler=scheduler,
         card=card,
+        actions=None if drawn else ActionEncoding.load(folder, control),
     )
 
 

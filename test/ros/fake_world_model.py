@@ -35,8 +35,18 @@ class FakeWorldModel:
         robot='yam_bimanual',
     )
 
-    def predict(self, start_frame, trajectory_frames, *, seed, num_inference_steps, should_stop):
+    def predict(
+        self,
+        start_frame,
+        trajectory_frames,
+        *,
+        positions,
+        seed,
+        num_inference_steps,
+        should_stop,
+    ):
         assert trajectory_frames.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
+        assert positions.shape == (1 + NUM_FRAMES, 14)
         if seed == OUT_OF_MEMORY:
             raise ModelMemoryError('the device ran out of memory (fake)')
         if seed == CRASHES:
