@@ -3,43 +3,205 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
+import os
 from pathlib import Path
+import re
+from typing import NamedTuple, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, pipeline_of
+from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter
 from mtv_world_ros.cli.provenance import provenance
+from mtv_world_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.evaluation.dataset import Selection
+    from mtv_world_ros.evaluation.summary import Summary
+    from mtv_world_ros.pipeline import Pipeline
+
+_EPILOG = """\
+DIR gets metrics.json, rows.csv, tables.md, numbers.csv, paper_tables.md and report.html. Several
+checkpoints share the last three; the others of each are in DIR/NAME. Running the same command again
+goes on where it was stopped.
+"""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
-    parser = commands.add_parser('evaluate', help='score a checkpoint on recorded episodes')
-    parser.add_argument('checkpoint', help="folder, or 'bundled'")
-    parser.add_argument('dataset', type=Path)
-    parser.add_argument('--out', type=Path, required=True)
+    parser = commands.add_parser(
+        'evaluate', help='score checkpoints on recorded episodes', epilog=_EPILOG
+    )
+    parser.add_argument(
+        'checkpoints',
+        nargs='+',
+        metavar='CHECKPOINT',
+        help="folder, or 'bundled'; NAME=FOLDER names its row in the tables",
+    )
+    parser.add_argument('dataset', type=Path, help='folder of episodes')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
     parser.add_argument('--mode', choices=('observe', 'imagine'), default='observe')
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: test where there is one"
+    )
     parser.add_argument('--episodes', type=int, help='use only the first so many')
+    parser.add_argument('--workers', type=int, default=1, help='processes that score episodes')
+    parser.add_argument(
+        '--actions',
+        type=_names,
+        default=('true', 'shuffled'),
+        metavar='LIST',
+        help='what is imagined, of true,shuffled,zero,mirrored; default: true,shuffled',
+    )
+    parser.add_argument(
+        '--no-ceiling',
+        dest='ceiling',
+        action='store_false',
+        help='do not score the recorded frames themselves and through the autoencoder',
+    )
+    parser.add_argument(
+        '--truth',
+        choices=('segmenter', 'simulator'),
+        default='segmenter',
+        help='whose masks of the recorded frames are the truth',
+    )
+    parser.add_argument(
+        '--quality', type=_names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
+    )
+    parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
+    parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
+    parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_dtype(parser)
     add_model_options(parser)
     add_segmenter(parser)
     parser.set_defaults(handler=_evaluate)
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import fingerprint
-    from mtv_world_ros.evaluation.evaluate import evaluate
-    from mtv_world_ros.evaluation.html_report import write_report
-    from mtv_world_ros.training.run import find_episodes
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(',') if name.strip())
 
-    table = evaluate(
-        pipeline_of(arguments),
-        find_episodes(arguments.dataset)[: arguments.episodes],
-        arguments.out,
-        name=fingerprint(arguments.checkpoint),
-        provenance={**provenance(arguments), 'dataset': str(arguments.dataset)},
+
+class Entry(NamedTuple):
+    """A checkpoint and its row in the tables.
+
+    Attributes:
+        path: folder, or `bundled`.
+        label: name of the row.
+        is_named: the user named it; else what it is trained on and with is added.
+    """
+
+    path: str
+    label: str
+    is_named: bool = False
+
+
+def parse_entries(texts: list[str]) -> list[Entry]:
+    """Returns checkpoints by name; `NAME=FOLDER` gives the name, else the folder does.
+
+    Raises:
+        ConfigError: two are called alike.
+    """
+    entries = []
+    for text in texts:
+        label, mark, path = text.partition('=')
+        is_named = bool(mark) and not Path(text).is_dir()
+        entries.append(Entry(path, label, True) if is_named else Entry(text, _label(text)))
+    labels = [entry.label for entry in entries]
+    doubled = [label for label in labels if labels.count(label) > 1]
+    if doubled or '' in labels:
+        raise ConfigError(
+            f'checkpoints {", ".join(texts)}: {"two are" if doubled else "one is"} called '
+            f"'{(doubled or [''])[0]}'; name them: NAME=FOLDER"
+        )
+    return entries
+
+
+def _label(path: str) -> str:
+    folder = Path(path)
+    return folder.resolve().parent.name if folder.name == 'checkpoint' else folder.name
+
+
+def _row(entry: Entry, pipeline: Pipeline) -> str:
+    """Name of the row; an ablation of the paper says so."""
+    kinds = []
+    if len(pipeline.spec.views) == 1:
+        kinds.append('Single-View')
+    if not pipeline.object_mask:
+        kinds.append('w/o Mask')
+    if entry.is_named or not kinds:
+        return entry.label
+    return f'{entry.label} ({", ".join(kinds)})'
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.evaluation.comparison import write_comparison
+    from mtv_world_ros.evaluation.dataset import select
+
+    entries = parse_entries(arguments.checkpoints)
+    selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    print(f'{arguments.dataset}: {selection}')
+    alone = len(entries) == 1
+    folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]
+    summaries = [
+        _score(arguments, entry, selection, folder)
+        for entry, folder in zip(entries, folders, strict=True)
+    ]
+    text = write_comparison(summaries, arguments.out)
+    if alone:
+        print(summaries[0].markdown())
+    print(text)
+    if arguments.report:
+        from mtv_world_ros.evaluation.html_report import write_report
+
+        print(f'report: {write_report(folders, arguments.out / "report.html")}')
+    return 0
+
+
+def _slug(label: str) -> str:
+    return re.sub(r'[^\w.-]+', '_', label).strip('.') or '_'
+
+
+def _score(
+    arguments: argparse.Namespace, entry: Entry, selection: Selection, out: Path
+) -> Summary:
+    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+
+    load = partial(
+        load_pipeline,
+        entry.path,
+        robot=arguments.robot,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        segmenter=arguments.segmenter,
+    )
+    pipeline = load(num_threads=arguments.threads)
+    threads = arguments.threads or max(_usable_cores() // max(arguments.workers, 1), 1)
+    return evaluate(
+        pipeline,
+        selection.paths,
+        out,
+        name=fingerprint(entry.path),
+        label=_row(entry, pipeline),
+        zero_shot=selection.zero_shot,
+        provenance={
+            **provenance(arguments),
+            'dataset': f'{arguments.dataset}: {selection}',
+        },
+        parallel=Parallel(
+            workers=arguments.workers,
+            make_pipeline=partial(load, num_threads=threads),
+            threads=threads,
+        ),
         mode=arguments.mode,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
+        actions=arguments.actions,
+        ceiling=arguments.ceiling,
+        use_ids=arguments.truth == 'simulator',
+        quality=arguments.quality,
+        fid_weights=arguments.fid_weights,
+        fvd_weights=arguments.fvd_weights,
     )
-    print(table)
-    written = write_report([arguments.out], arguments.out / 'report.html')
-    print(f'written: {written}')
-    return 0
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0))

@@ -47,6 +47,7 @@ class Recording:
         positions: (N, J) measured joint positions at `times`.
         commands: what the policy commanded; times on the same clock.
         stamp_ns: stamp of the first frame.
+        warnings: what was wrong with it and how the reader dealt with that.
     """
 
     path: Path
@@ -61,6 +62,7 @@ class Recording:
     positions: FloatArray
     commands: JointTrajectory
     stamp_ns: int
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,6 +153,7 @@ def load_recording(
         positions=_measured(episode, robot, stamps),
         commands=stitch(matched, origin),
         stamp_ns=origin,
+        warnings=episode.warnings,
     )
 
 

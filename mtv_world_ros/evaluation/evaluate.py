@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import partial
 import json
+import os
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,63 +15,43 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.data.clips import load_recording, Recording
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
+from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation import tables
-from mtv_world_ros.evaluation.results import EpisodeResult, Summary
-from mtv_world_ros.evaluation.rollout_store import (
-    join,
-    rollout_path,
-    save_rollout,
-    stored_stretch,
-    StoredRollout,
+from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
+from mtv_world_ros.evaluation.feature_store import (
+    distances,
+    feature_path,
+    FeatureTaker,
+    load_features,
 )
-from mtv_world_ros.evaluation.rollouts import (
-    check_mode,
-    imagine_stretch,
-    predicted_frames,
-    Stretch,
-    stretches,
-)
-from mtv_world_ros.evaluation.scores import (
-    find_masks,
-    score_frames,
-    score_rows,
-    ScoreRow,
-    true_masks,
-)
-from mtv_world_ros.evaluation.statistics import episode_means
+from mtv_world_ros.evaluation.features import clip_features, frame_features
+from mtv_world_ros.evaluation.image_quality import image_quality
+from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.evaluation.round_trip import round_trip
+from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
+from mtv_world_ros.evaluation.statistics import Estimate
+from mtv_world_ros.evaluation.summary import Group, Summary
+from mtv_world_ros.evaluation.workers import score_all
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.success.describer import objects_from_instruction
-from mtv_world_ros.success.jaccard import mean_of_known, object_scores
+from mtv_world_ros.success.jaccard import mean_of_known
 
-#: sends (V, T, H, W, 3) frames through the model's autoencoder and back
-Reconstruct = Callable[[ByteArray], ByteArray]
+#: makes the pipeline anew, in another process
+MakePipeline = Callable[[], Pipeline]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluationConfig:
-    """What is imagined and how it is scored.
+class Parallel:
+    """How many processes score episodes.
 
     Attributes:
-        mode: `observe`: every chunk from the real frames at its start; `imagine`: chunks chained
-            from the episode's first frame.
-        seed: of the noise, of the choice of shuffled actions, of the bootstrap.
-        num_inference_steps: denoising steps.
-        shuffle: imagine everything a second time with the actions of another episode.
-        use_ids: score against the recorded identities instead of the segmenter's masks of the
-            recorded frames.
-        num_resamples: of the bootstrap.
+        workers: processes.
+        make_pipeline: makes the same pipeline in each of them; has to be picklable.
+        threads: of each process; 0 = the cores shared evenly.
     """
 
-    mode: str = 'observe'
-    seed: int = 0
-    num_inference_steps: int = 4
-    shuffle: bool = True
-    use_ids: bool = False
-    num_resamples: int = 2000
+    workers: int
+    make_pipeline: MakePipeline
+    threads: int = 0
 
 
 def evaluate(
@@ -78,11 +60,13 @@ def evaluate(
     out: Path,
     *,
     name: str = '',
-    reconstruct: Reconstruct | None = None,
+    label: str = '',
+    zero_shot: Mapping[Path, str] = MappingProxyType({}),
     provenance: Mapping[str, str] = MappingProxyType({}),
+    parallel: Parallel | None = None,
     show_progress: bool = True,
     **options: Any,
-) -> str:
+) -> Summary:
     """Scores a pipeline and writes `metrics.json`, `rows.csv` and `tables.md`.
 
     Episodes that were scored before with the same settings are taken from `out/episodes`.
@@ -92,57 +76,99 @@ def evaluate(
         pipeline: imagines and segments.
         episode_paths: recorded episodes.
         out: folder for the results.
-        name: identifies the checkpoint in the tables; only results of the same name are taken
-            over, and none without a name.
-        reconstruct: the autoencoder's round trip, for the ceiling.
+        name: identifies the checkpoint; only results of the same name are taken over, and none
+            without a name.
+        label: of its rows in tables that compare checkpoints.
+        zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
         provenance: what the results were made with, by heading; goes into metrics.json.
+        parallel: processes to score with; None = this one.
         show_progress: draw a progress bar.
         **options: fields of `EvaluationConfig`.
 
     Returns:
-        The tables, as Markdown.
+        What was found.
 
     Raises:
-        ConfigError: unknown option or mode.
+        ConfigError: unknown option or mode, or weights that are not there.
         EpisodeError: no episode can be used.
     """
-    config = _config(options)
-    run = _Run(pipeline, list(episode_paths), Path(out), name, config, reconstruct)
+    config, out = config_from(options), Path(out)
+    run = _Run(pipeline, out, name, config, parallel)
+    jobs = make_jobs(episode_paths, zero_shot, config.seed)
     results, failed = [], {}
-    bar = tqdm(run.results(), total=len(run.paths), unit='ep', disable=not show_progress)
-    for path, result in bar:
+    bar = tqdm(run.results(jobs), total=len(jobs), unit='ep', disable=not show_progress)
+    for job, result in bar:
         if isinstance(result, EpisodeResult):
             results.append(result)
             bar.set_postfix_str(_progress(results))
         else:
-            failed[str(path)] = str(result)
+            failed[str(job.path)] = result
     if not results:
         reason = next(iter(failed.items()), ('', 'none was given'))
         raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
+    results.sort(key=lambda result: result.episode)
     summary = Summary(
         name=name,
+        label=label,
         spec=pipeline.spec,
-        settings={**asdict(config), 'segmenter': pipeline.segmenter.name},
+        settings={**config.as_json(), 'segmenter': pipeline.segmenter.name},
         provenance=provenance,
-        results=sorted(results, key=lambda result: result.episode),
-        failed=failed,
+        results=results,
+        failed=dict(sorted(failed.items())),
         seed=config.seed,
         num_resamples=config.num_resamples,
     )
-    return summary.write(run.out)
+    summary = summary.with_distances(_distances(summary, out, config))
+    summary.write(out)
+    return summary
 
 
-def _config(options: dict[str, Any]) -> EvaluationConfig:
-    try:
-        config = EvaluationConfig(**options)
-    except TypeError as error:
-        raise ConfigError(f'evaluation: {error}') from error
-    check_mode(config.mode)
-    return config
+def make_jobs(paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int) -> list[Job]:
+    """Returns the episodes in an order in which each lends its actions to the next.
+
+    Results are called like the episode's folder, or by the whole path where two are called alike.
+    """
+    order = np.random.default_rng(seed).permutation(len(paths))
+    shuffled = [Path(paths[index]) for index in order]
+    count = Counter(path.name for path in shuffled)
+    return [
+        Job(
+            path=path,
+            name=path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/'),
+            donor=shuffled[index - 1] if len(shuffled) > 1 else None,
+            zero_shot=zero_shot.get(path, ''),
+        )
+        for index, path in enumerate(shuffled)
+    ]
+
+
+def make_scorer(make_pipeline: MakePipeline, config: EvaluationConfig, out: Path) -> EpisodeScorer:
+    """Returns what scores episodes, with everything that the configuration asks to measure.
+
+    Raises:
+        ConfigError, CheckpointError: weights or packages for that are missing.
+    """
+    pipeline = make_pipeline()
+    device = str(getattr(pipeline.world_model, 'device', 'cpu'))
+    features = None
+    if config.fid_weights is not None or config.fvd_weights is not None:
+        features = FeatureTaker(
+            views=pipeline.spec.views,
+            num_frames=pipeline.spec.num_frames,
+            frames=config.fid_weights and frame_features(config.fid_weights, device),
+            clips=config.fvd_weights and clip_features(config.fvd_weights, device),
+        )
+    instruments = Instruments(
+        pipeline=pipeline,
+        reconstruct=round_trip(pipeline.world_model) if config.ceiling else None,
+        quality=image_quality(config.quality, device),
+        features=features,
+    )
+    return EpisodeScorer(instruments, config, out)
 
 
 def _progress(results: Sequence[EpisodeResult]) -> str:
-    means = [episode_means(result.rows, None) for result in results]
+    means = [result.means(None) for result in results]
     moving, copy = (
         float(mean_of_known(np.array([found[key] for found in means])))
         for key in ('j_moving', 'j_copy_moving')
@@ -150,134 +176,94 @@ def _progress(results: Sequence[EpisodeResult]) -> str:
     return f'J moving {moving:.3f}, persistence {copy:.3f}'
 
 
+def _distances(
+    summary: Summary, out: Path, config: EvaluationConfig
+) -> dict[tuple[str | None, str], dict[str, Estimate]]:
+    """FID and FVD by (zero-shot set, view), the set None for all episodes."""
+    if config.fid_weights is None and config.fvd_weights is None:
+        return {}
+    return {
+        (group, view): distances(
+            [
+                load_features(feature_path(out, result.episode))
+                for result in summary.chosen(Group(zero_shot=group))
+            ],
+            view,
+        )
+        for group in (None, *summary.zero_shot_sets)
+        for view in summary.spec.views
+    }
+
+
 class _Run:
-    """Scores episodes one by one, in an order in which each lends its actions to the next."""
+    """Takes results from earlier runs where they are of the same settings, else scores."""
 
     def __init__(
         self,
         pipeline: Pipeline,
-        paths: list[Path],
         out: Path,
         name: str,
         config: EvaluationConfig,
-        reconstruct: Reconstruct | None,
+        parallel: Parallel | None,
     ) -> None:
         self.pipeline, self.out, self.name, self.config = pipeline, out, name, config
-        self.reconstruct = reconstruct
-        order = np.random.default_rng(config.seed).permutation(len(paths))
-        self.paths = [paths[index] for index in order]
-        self._load = lru_cache(maxsize=2)(self._read)
+        self.parallel = parallel
         spec = pipeline.spec
         self.settings = {
-            **asdict(config),
+            **config.as_json(),
             'name': name,
             'spec': [list(spec.views), spec.fps, spec.num_frames, spec.width, spec.height],
-            'ceiling': reconstruct is not None,
             'segmenter': pipeline.segmenter.name,
         }
         self.settings.pop('num_resamples')
 
-    def results(self) -> Iterator[tuple[Path, EpisodeResult | MtvWorldError]]:
-        for index, path in enumerate(self.paths):
-            donor = self.paths[index - 1] if len(self.paths) > 1 else None
-            try:
-                yield path, self._cached(path, donor)
-            except MtvWorldError as error:
-                yield path, error
+    def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, EpisodeResult | str]]:
+        """Yields jobs with their result, or why there is none."""
+        left = []
+        for job in jobs:
+            stored = self._stored(job)
+            if stored is None:
+                left.append(job)
+            else:
+                yield job, stored
+        for job, outcome in self._scored(left):
+            if isinstance(outcome, str):
+                yield job, outcome
+                continue
+            values = {'settings': self._settings_of(job), 'result': outcome}
+            tables.write_json(self._file(job), values)
+            yield job, EpisodeResult.from_json(outcome)
 
-    def _read(self, path: Path) -> Recording:
-        return load_recording(path, self.pipeline.spec, self.pipeline.robot)
+    def _scored(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, dict[str, Any] | str]]:
+        if self.parallel is None or self.parallel.workers == 1:
+            here = partial(make_scorer, lambda: self.pipeline, self.config, self.out)
+            return score_all(jobs, here, 1, 1)
+        there = partial(make_scorer, self.parallel.make_pipeline, self.config, self.out)
+        workers = self.parallel.workers
+        usable = len(os.sched_getaffinity(0))
+        threads = self.parallel.threads or max(usable // max(workers, 1), 1)
+        return score_all(jobs, there, workers, threads)
 
-    def _cached(self, path: Path, donor: Path | None) -> EpisodeResult:
-        file = self.out / 'episodes' / f'{Path(path).name}.json'
-        settings = {**self.settings, 'path': str(path), 'donor': str(donor)}
+    def _file(self, job: Job) -> Path:
+        return self.out / 'episodes' / f'{job.name}.json'
+
+    def _settings_of(self, job: Job) -> dict[str, Any]:
+        return {
+            **self.settings,
+            'path': str(job.path),
+            'donor': str(job.donor),
+            'zero_shot': job.zero_shot,
+        }
+
+    def _stored(self, job: Job) -> EpisodeResult | None:
+        """The result of an earlier run; None if it is of other settings or another version."""
+        features = self.config.fid_weights or self.config.fvd_weights
+        if not self.name or (features and not feature_path(self.out, job.name).is_file()):
+            return None
         try:
-            stored = json.loads(file.read_text(encoding='utf-8'))
-            if self.name and stored['settings'] == tables.plain(settings):
+            stored = json.loads(self._file(job).read_text(encoding='utf-8'))
+            if stored['settings'] == tables.plain(self._settings_of(job)):
                 return EpisodeResult.from_json(stored['result'])
         except (OSError, ValueError, KeyError, TypeError):
-            pass  # not there, or of other settings or another version: score it again
-        result = tables.plain(self._score(path, donor).as_json())
-        tables.write_json(file, {'settings': settings, 'result': result})
-        return EpisodeResult.from_json(result)
-
-    def _score(self, path: Path, donor: Path | None) -> EpisodeResult:
-        recording = self._load(path)
-        actions = self._actions(donor)
-        rows: list[ScoreRow] = []
-        chunks: list[Prediction] = []
-        shown: list[StoredRollout] = []
-        for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
-            chunks = self._imagine(recording, stretch, recording)
-            found, stored = self._rows(recording, stretch, chunks, actions)
-            rows += found
-            shown.append(stored)
-        save_rollout(rollout_path(self.out, Path(path).name), join(shown))
-        seconds = [sum(chunk.seconds.values()) for chunk in chunks]
-        return EpisodeResult(
-            episode=Path(path).name,
-            task=recording.task,
-            outcome=recording.outcome,
-            rows=tuple(rows),
-            probability=chunks[-1].success.probability,
-            reasons=chunks[-1].success.reasons,
-            seconds_per_chunk=float(np.mean(seconds)),
-            has_ids=recording.object_ids is not None,
-        )
-
-    def _actions(self, donor: Path | None) -> Recording | None:
-        """The episode that lends its actions; None if there is none that can be read."""
-        if donor is None or not self.config.shuffle:
-            return None
-        try:
-            return self._load(donor)
-        except MtvWorldError:  # listed with its reason when its own turn comes
-            return None
-
-    def _imagine(
-        self, recording: Recording, stretch: Stretch, actions: Recording
-    ) -> list[Prediction]:
-        return imagine_stretch(
-            self.pipeline,
-            recording,
-            stretch,
-            actions=actions,
-            seed=self.config.seed + 1000 * stretch.index,
-            num_inference_steps=self.config.num_inference_steps,
-        )
-
-    def _rows(
-        self,
-        recording: Recording,
-        stretch: Stretch,
-        chunks: list[Prediction],
-        actions: Recording | None,
-    ) -> tuple[list[ScoreRow], StoredRollout]:
-        segmenter = self.pipeline.segmenter
-        names = self.pipeline.objects or recording.objects
-        truth = true_masks(
-            stretch,
-            segmenter,
-            names or objects_from_instruction(recording.instruction),
-            recording.objects,
-            use_ids=self.config.use_ids,
-        )
-        shuffled = ceiling = None
-        if actions is not None and truth.moving.any():
-            frames = predicted_frames(self._imagine(recording, stretch, actions))
-            shuffled = score_frames(frames, truth, segmenter)
-        if self.reconstruct is not None:
-            ceiling = score_frames(self.reconstruct(stretch.frames[:, 1:]), truth, segmenter)
-        masks = find_masks(predicted_frames(chunks), truth, segmenter)
-        predicted = object_scores(masks, truth.masks)
-        rows = score_rows(stretch, self.pipeline.spec.views, truth, predicted, shuffled, ceiling)
-        stored = stored_stretch(
-            chunks,
-            stretch,
-            start_seconds=float(recording.times[stretch.start]),
-            fps=self.pipeline.spec.fps,
-            true_masks=truth.masks,
-            masks=masks,
-            j=predicted.frames,
-        )
-        return rows, stored
+            pass  # not there, half written, or of another version: score it again
+        return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -43,7 +44,10 @@ class ScoreRow:
         j_visible: mean over the frames that really show it.
         j_copy: of the first frame held.
         j_shuffled: with the actions of another episode.
+        j_zero: with the joints held where they were.
+        j_mirrored: with the arms' actions mirrored.
         j_ceiling: of recorded frames that went through the autoencoder.
+        j_self: of the recorded frames themselves, through the same path.
         j_frames: (T,) J per frame.
         j_copy_frames: the same of the first frame held.
         j_shuffled_frames: the same with the actions of another episode; empty = not imagined.
@@ -59,7 +63,10 @@ class ScoreRow:
     j_visible: float
     j_copy: float
     j_shuffled: float
+    j_zero: float
+    j_mirrored: float
     j_ceiling: float
+    j_self: float
     j_frames: tuple[float, ...]
     j_copy_frames: tuple[float, ...]
     j_shuffled_frames: tuple[float, ...]
@@ -148,8 +155,13 @@ def true_masks(
 
 
 def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectMasks:
-    """Segments (V, T, H, W, 3) frames, starting from the recorded first masks."""
-    return segmenter.segment(frames, truth.names, first_masks=truth.first.masks[:, :, 0])
+    """Segments (V, T, H, W, 3) frames, starting from the recorded first frame and masks."""
+    return segmenter.segment(
+        frames,
+        truth.names,
+        first_masks=truth.first.masks[:, :, 0],
+        first_frames=truth.first_frames,
+    )
 
 
 def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectScores:
@@ -157,16 +169,27 @@ def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> Objec
     return object_scores(find_masks(frames, truth, segmenter), truth.masks)
 
 
+#: videos beside the prediction that are scored like it; each is `j_<name>` of a row
+OTHERS = ('shuffled', 'zero', 'mirrored', 'ceiling', 'self')
+
+
 def score_rows(
     stretch: Stretch,
     views: tuple[str, ...],
     truth: Truth,
     predicted: ObjectScores,
-    shuffled: ObjectScores | None,
-    ceiling: ObjectScores | None,
+    others: Mapping[str, ObjectScores],
 ) -> list[ScoreRow]:
-    """Returns a row per view and object, and one per view for the union of objects."""
-    copy = persistence_scores(truth.first.masks[:, :, 0], truth.masks)
+    """Returns a row per view and object, and one per view for the union of objects.
+
+    Args:
+        stretch: that was imagined.
+        views: V names.
+        truth: what it is scored against.
+        predicted: scores of the prediction.
+        others: scores by name, of `OTHERS`; those that are missing were not measured.
+    """
+    scores = {**others, 'copy': persistence_scores(truth.first.masks[:, :, 0], truth.masks)}
     rows = []
     for v, view in enumerate(views):
         for o, name in enumerate(truth.names):
@@ -180,15 +203,13 @@ def score_rows(
                     moving=bool(truth.moving[v, o]),
                     j=float(predicted.objects[v, o]),
                     j_visible=float(predicted.visible[v, o]),
-                    j_copy=float(copy.objects[v, o]),
-                    j_shuffled=_value(shuffled, v, o),
-                    j_ceiling=_value(ceiling, v, o),
                     j_frames=_frames(predicted, v, o),
-                    j_copy_frames=_frames(copy, v, o),
-                    j_shuffled_frames=_frames(shuffled, v, o),
+                    j_copy_frames=_frames(scores['copy'], v, o),
+                    j_shuffled_frames=_frames(scores.get('shuffled'), v, o),
+                    **_values(scores, lambda found, v=v, o=o: found.objects[v, o]),
                 )
             )
-        rows.append(_union_row(stretch, view, v, predicted, copy, shuffled, ceiling))
+        rows.append(_union_row(stretch, view, predicted.union[v], scores, v))
     return rows
 
 
@@ -196,33 +217,30 @@ def _frames(scores: ObjectScores | None, view: int, item: int) -> tuple[float, .
     return () if scores is None else tuple(scores.frames[view, item].tolist())
 
 
-def _value(scores: ObjectScores | None, view: int, item: int) -> float:
-    return float('nan') if scores is None else float(scores.objects[view, item])
+def _values(
+    scores: Mapping[str, ObjectScores], value: Callable[[ObjectScores], float]
+) -> dict[str, float]:
+    """`j_<name>` of every video beside the prediction, NaN where it was not scored."""
+    return {
+        f'j_{name}': float(value(scores[name])) if name in scores else np.nan
+        for name in ('copy', *OTHERS)
+    }
 
 
 def _union_row(
-    stretch: Stretch,
-    view: str,
-    v: int,
-    predicted: ObjectScores,
-    copy: ObjectScores,
-    shuffled: ObjectScores | None,
-    ceiling: ObjectScores | None,
+    stretch: Stretch, view: str, j: float, scores: Mapping[str, ObjectScores], v: int
 ) -> ScoreRow:
-    nan = float('nan')
     return ScoreRow(
         stretch=stretch.index,
         num_frames=stretch.num_frames,
         view=view,
         name='',
-        status='ok' if np.isfinite(predicted.union[v]) else 'no object is scored',
+        status='ok' if np.isfinite(j) else 'no object is scored',
         moving=False,
-        j=float(predicted.union[v]),
-        j_visible=nan,
-        j_copy=float(copy.union[v]),
-        j_shuffled=nan if shuffled is None else float(shuffled.union[v]),
-        j_ceiling=nan if ceiling is None else float(ceiling.union[v]),
+        j=float(j),
+        j_visible=np.nan,
         j_frames=(),
         j_copy_frames=(),
         j_shuffled_frames=(),
+        **_values(scores, lambda found: found.union[v]),
     )

@@ -17,19 +17,27 @@ Interval = tuple[float, float]
 #: means over rows of one episode: name -> (field of the row, which rows)
 MEANS = {
     'j_object_mean': ('j', 'object'),
-    'j_visible_mean': ('j_visible', 'object'),
+    'j_visible': ('j_visible', 'object'),
     'j_copy_mean': ('j_copy', 'object'),
     'j_ceiling': ('j_ceiling', 'object'),
+    'j_self': ('j_self', 'object'),
     'j_union': ('j', 'union'),
     'j_copy_union': ('j_copy', 'union'),
     'j_moving': ('j', 'moving'),
     'j_copy_moving': ('j_copy', 'moving'),
     'j_shuffled_moving': ('j_shuffled', 'moving'),
+    'j_zero_moving': ('j_zero', 'moving'),
+    'j_mirrored_moving': ('j_mirrored', 'moving'),
+    'j_ceiling_moving': ('j_ceiling', 'moving'),
+    'j_self_moving': ('j_self', 'moving'),
 }
+#: means over frames of one episode that are not of objects
+QUALITY = ('psnr', 'ssim', 'lpips')
 #: functions of the means: name -> (minuend, subtrahend); paired within each episode
 MARGINS = {
     'margin_moving': ('j_moving', 'j_copy_moving'),
     'margin_over_shuffled': ('j_moving', 'j_shuffled_moving'),
+    'margin_of_shuffled': ('j_shuffled_moving', 'j_copy_moving'),
 }
 #: (J - J_copy) / (1 - J_copy) of two means
 SKILLS = {
@@ -89,12 +97,12 @@ def summarise(
     All numbers share the resamples, so the interval of a margin is that of paired differences.
 
     Args:
-        episodes: `episode_means` of each episode.
+        episodes: `episode_means` of each episode, and its `QUALITY` where measured.
         seed: of the resampling.
         num_resamples: how often the episodes are drawn with replacement.
     """
-    names = [*MEANS, *MARGINS]
-    table = np.array([[means[name] for name in names] for means in episodes], np.float64)
+    names = [*MEANS, *MARGINS, *QUALITY]
+    table = np.array([[means.get(n, np.nan) for n in names] for means in episodes], np.float64)
     table = table.reshape(len(episodes), len(names))
     generator = np.random.default_rng(seed)
     draws = generator.integers(0, max(len(table), 1), (num_resamples, len(table)))
@@ -127,21 +135,3 @@ def _percentiles(values: FloatArray) -> Interval:
         return (np.nan, np.nan)
     low, high = np.percentile(known, [2.5, 97.5])
     return (float(low), float(high))
-
-
-def horizon(
-    rows: Sequence[ScoreRow], field: str = 'j_frames', *, moving: bool = True
-) -> list[float]:
-    """Returns the mean J of each predicted frame, 1..T, over rows of (moving) objects.
-
-    Args:
-        rows: scores.
-        field: one of `scores.FRAME_FIELDS`.
-        moving: only objects that really move.
-    """
-    kept = [getattr(row, field) for row in rows if row.name and (row.moving or not moving)]
-    longest = max(map(len, kept), default=0)
-    table = np.full((len(kept), longest), np.nan)
-    for index, frames in enumerate(kept):
-        table[index, : len(frames)] = frames
-    return _column_means(table[None])[0].tolist() if len(kept) else []

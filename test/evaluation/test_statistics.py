@@ -3,12 +3,12 @@ import pytest
 
 from mtv_world_ros.evaluation.outcomes import agreement, Judgement
 from mtv_world_ros.evaluation.scores import ScoreRow
-from mtv_world_ros.evaluation.statistics import episode_means, horizon, summarise
+from mtv_world_ros.evaluation.statistics import episode_means, summarise
 
 NAN = float('nan')
 
 
-def row(j, copy, *, name='red block', view='low', moving=True, frames=4, shuffled=NAN):
+def row(j, copy, *, name='red block', view='low', moving=True, frames=4, shuffled=NAN, zero=NAN):
     return ScoreRow(
         stretch=0,
         num_frames=frames,
@@ -20,7 +20,10 @@ def row(j, copy, *, name='red block', view='low', moving=True, frames=4, shuffle
         j_visible=j,
         j_copy=copy,
         j_shuffled=shuffled,
+        j_zero=zero,
+        j_mirrored=NAN,
         j_ceiling=NAN,
+        j_self=1.0,
         j_frames=(j,) * frames,
         j_copy_frames=(copy,) * frames,
         j_shuffled_frames=(shuffled,) * frames,
@@ -87,12 +90,6 @@ def test_same_seed_gives_the_same_interval():
 def test_nothing_measured_is_nan():
     found = summarise([episode_means([row(NAN, NAN)], None)], num_resamples=10)
     assert np.isnan(found['j_moving'].value) and np.isnan(found['j_moving'].interval).all()
-
-
-def test_horizon_is_the_mean_of_each_frame_of_moving_objects():
-    rows = [row(0.8, 0, frames=2), row(0.4, 0, frames=1), row(0.1, 0, moving=False)]
-    assert horizon(rows) == pytest.approx([0.6, 0.8])
-    assert horizon([]) == []
 
 
 def test_agreement_counts_abstentions_apart():

@@ -1,0 +1,287 @@
+"""Scores one episode: imagines its stretches, segments, compares, keeps what reports need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+import time
+
+import numpy as np
+
+from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.evaluation.controls import with_actions
+from mtv_world_ros.evaluation.feature_store import feature_path, FeatureTaker
+from mtv_world_ros.evaluation.image_quality import ImageQuality
+from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.evaluation.rollout_store import (
+    join,
+    rollout_path,
+    save_rollout,
+    stored_stretch,
+    StoredRollout,
+)
+from mtv_world_ros.evaluation.rollouts import (
+    imagine_stretch,
+    predicted_frames,
+    Stretch,
+    stretches,
+)
+from mtv_world_ros.evaluation.round_trip import Reconstruct
+from mtv_world_ros.evaluation.scores import (
+    find_masks,
+    score_frames,
+    score_rows,
+    ScoreRow,
+    true_masks,
+    Truth,
+)
+from mtv_world_ros.evaluation.settings import EvaluationConfig
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.success.jaccard import object_scores, ObjectScores
+
+#: what the time of an episode goes into
+STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One episode to score.
+
+    Attributes:
+        path: its folder.
+        name: of its results, unique in the evaluation.
+        donor: the episode that lends its actions, if there is one.
+        zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+    """
+
+    path: Path
+    name: str
+    donor: Path | None = None
+    zero_shot: str = ''
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instruments:
+    """What episodes are measured with.
+
+    Attributes:
+        pipeline: imagines and segments.
+        reconstruct: the autoencoder's round trip, for the ceiling; None = not measured.
+        quality: PSNR and the like; None = not measured.
+        features: for FID and FVD; None = not measured.
+    """
+
+    pipeline: Pipeline
+    reconstruct: Reconstruct | None = None
+    quality: ImageQuality | None = None
+    features: FeatureTaker | None = None
+
+
+@dataclass(slots=True)
+class _Found:
+    """What is gathered over the stretches of an episode."""
+
+    rows: list[ScoreRow] = field(default_factory=list)
+    shown: list[StoredRollout] = field(default_factory=list)
+    quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+    chunk_seconds: list[float] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - begun
+
+
+class EpisodeScorer:
+    """Scores episodes with the same instruments; keeps the last episodes that it read.
+
+    Args:
+        instruments: what is measured with.
+        config: what is imagined and scored.
+        out: folder of the evaluation; rollouts and features go into `episodes/`.
+    """
+
+    def __init__(self, instruments: Instruments, config: EvaluationConfig, out: Path) -> None:
+        self.instruments, self.config, self.out = instruments, config, out
+        self.pipeline = instruments.pipeline
+        self._load = lru_cache(maxsize=2)(self._read)
+
+    def score(self, job: Job) -> EpisodeResult:
+        """Imagines and scores an episode.
+
+        Raises:
+            MtvWorldError: it cannot be read or imagined.
+        """
+        found = _Found()
+        with found.timed('reading'):
+            recording, donor = self._load(job.path), self._donor(job)
+        found.notes.update(dict.fromkeys(recording.warnings))
+        features = self.instruments.features and self.instruments.features.start()
+        probability, reasons = np.nan, ()
+        for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
+            chunks = self._stretch(recording, stretch, donor, found)
+            probability, reasons = chunks[-1].success.probability, chunks[-1].success.reasons
+            if features:
+                with found.timed('features'):
+                    features.add(predicted_frames(chunks), stretch.frames[:, 1:])
+        with found.timed('storing'):
+            save_rollout(rollout_path(self.out, job.name), join(found.shown))
+            if features:
+                features.save(feature_path(self.out, job.name))
+        return EpisodeResult(
+            episode=job.name,
+            task=recording.task,
+            zero_shot=job.zero_shot,
+            outcome=recording.outcome,
+            rows=tuple(found.rows),
+            quality=_mean_quality(found.quality),
+            probability=probability,
+            reasons=reasons,
+            notes=tuple(found.notes),
+            seconds_per_chunk=float(np.mean(found.chunk_seconds)),
+            seconds=found.seconds,
+            has_ids=recording.object_ids is not None,
+        )
+
+    def _read(self, path: Path) -> Recording:
+        return load_recording(path, self.pipeline.spec, self.pipeline.robot)
+
+    def _donor(self, job: Job) -> Recording | None:
+        """The episode that lends its actions; None if there is none that can be read."""
+        if job.donor is None or 'shuffled' not in self.config.actions:
+            return None
+        try:
+            return self._load(job.donor)
+        except MtvWorldError:  # listed with its reason when its own turn comes
+            return None
+
+    def _stretch(
+        self, recording: Recording, stretch: Stretch, donor: Recording | None, found: _Found
+    ) -> list[Prediction]:
+        """Imagines and scores one stretch; returns its chunks."""
+        chunks = self._imagine(recording, stretch, recording, found)
+        found.chunk_seconds += [sum(chunk.seconds.values()) for chunk in chunks]
+        frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
+        with found.timed('segmenting'):
+            truth = self._truth(recording, stretch)
+            masks = find_masks(frames, truth, self.pipeline.segmenter)
+        with found.timed('scoring'):
+            predicted = object_scores(masks, truth.masks)
+        others = self._controls(recording, stretch, donor, truth, found)
+        others |= self._ceilings(real, truth, found)
+        views = self.pipeline.spec.views
+        with found.timed('scoring'):
+            found.rows += score_rows(stretch, views, truth, predicted, others)
+        with found.timed('features'):
+            found.quality.append((stretch.num_frames, self._quality(frames, real)))
+        stored = stored_stretch(
+            chunks,
+            stretch,
+            start_seconds=float(recording.times[stretch.start]),
+            fps=self.pipeline.spec.fps,
+            true_masks=truth.masks,
+            masks=masks,
+            j=predicted.frames,
+        )
+        found.shown.append(stored)
+        return chunks
+
+    def _imagine(
+        self, recording: Recording, stretch: Stretch, actions: Recording, found: _Found
+    ) -> list[Prediction]:
+        with found.timed('imagining'):
+            chunks = imagine_stretch(
+                self.pipeline,
+                recording,
+                stretch,
+                actions=actions,
+                seed=self.config.seed + 1000 * stretch.index,
+                num_inference_steps=self.config.num_inference_steps,
+            )
+        masks = sum(
+            chunk.seconds.get(s, 0.0) for chunk in chunks for s in ('start masks', 'masks')
+        )
+        found.seconds['imagining'] -= masks
+        found.seconds['segmenting'] += masks
+        return chunks
+
+    def _truth(self, recording: Recording, stretch: Stretch) -> Truth:
+        names = self.pipeline.objects or recording.objects
+        return true_masks(
+            stretch,
+            self.pipeline.segmenter,
+            names or objects_from_instruction(recording.instruction),
+            recording.objects,
+            use_ids=self.config.use_ids,
+        )
+
+    def _controls(
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        donor: Recording | None,
+        truth: Truth,
+        found: _Found,
+    ) -> dict[str, ObjectScores]:
+        """Scores under other actions, where anything moves; what the robot cannot do is noted."""
+        scores: dict[str, ObjectScores] = {}
+        for name in self.config.actions if truth.moving.any() else ():
+            try:
+                actions = with_actions(name, recording, stretch, donor, self.pipeline.robot)
+                if name == 'true' or actions is None:
+                    continue
+                chunks = self._imagine(recording, stretch, actions, found)
+            except MtvWorldError as error:
+                found.notes[f'{name} actions were not imagined: {error}'] = None
+                continue
+            scores[name] = self._scored(predicted_frames(chunks), truth, found)
+        return scores
+
+    def _ceilings(self, real: ByteArray, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
+        """Scores of the recorded frames: as they are, and through the autoencoder."""
+        if not self.config.ceiling:
+            return {}
+        scores = {'self': self._scored(real, truth, found)}
+        if self.instruments.reconstruct is not None:
+            with found.timed('imagining'):
+                back = self.instruments.reconstruct(real)
+            scores['ceiling'] = self._scored(back, truth, found)
+        return scores
+
+    def _scored(self, frames: ByteArray, truth: Truth, found: _Found) -> ObjectScores:
+        with found.timed('segmenting'):
+            return score_frames(frames, truth, self.pipeline.segmenter)
+
+    def _quality(self, frames: ByteArray, real: ByteArray) -> dict[str, dict[str, float]]:
+        measure = self.instruments.quality
+        if measure is None:
+            return {}
+        views = self.pipeline.spec.views
+        return {view: measure(frames[v], real[v]) for v, view in enumerate(views)}
+
+
+def _mean_quality(
+    stretches: Sequence[tuple[int, dict[str, dict[str, float]]]],
+) -> dict[str, dict[str, float]]:
+    """Means over the stretches of an episode by view; frames weigh equally."""
+    total = sum(count for count, _ in stretches)
+    _, first = stretches[0]
+    return {
+        view: {
+            name: sum(count * found[view][name] for count, found in stretches) / total
+            for name in names
+        }
+        for view, names in first.items()
+    }
