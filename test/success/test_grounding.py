@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 from PIL import Image
 import pytest
@@ -96,7 +98,7 @@ def test_box_is_the_one_that_the_published_processor_gives(weights):
     folder = weights / 'some org' / 'detector'
     frame = np.random.default_rng(3).integers(0, 256, (60, 100, 3), dtype=np.uint8)
     images = GroundingDinoImageProcessorPil.from_pretrained(folder)
-    processor = GroundingDinoProcessor(images, AutoTokenizer.from_pretrained(folder))
+    processor: Any = GroundingDinoProcessor(images, AutoTokenizer.from_pretrained(folder))
     inputs = processor(images=Image.fromarray(frame), text='blue cup.', return_tensors='pt')
     model = MMGroundingDinoForObjectDetection.from_pretrained(folder).eval()
     with torch.inference_mode():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -175,7 +176,7 @@ def save_dino(folder: Path) -> Path:
         disable_custom_kernels=True,
     )
     torch.manual_seed(0)
-    model = MMGroundingDinoForObjectDetection(config).eval()
+    model: Any = MMGroundingDinoForObjectDetection(config).eval()
     with torch.no_grad():  # boxes that differ in size and place, scores that differ
         for parameter in model.bbox_embed[-1].layers[-1].parameters():
             parameter.normal_(std=0.5)
@@ -194,7 +195,7 @@ def save_dino(folder: Path) -> Path:
     return folder
 
 
-def _enliven(model: torch.nn.Module, decoder: torch.nn.Module, present: float) -> None:
+def _enliven(model: Any, decoder: Any, present: float) -> None:
     """Fresh weights are so small that every mask is the same; and objects are to be seen."""
     with torch.no_grad():
         for parameter in model.parameters():
@@ -203,7 +204,7 @@ def _enliven(model: torch.nn.Module, decoder: torch.nn.Module, present: float) -
         decoder.pred_obj_score_head.proj_out.bias.fill_(present)
 
 
-def _save(model: torch.nn.Module, folder: Path) -> Path:
+def _save(model: Any, folder: Path) -> Path:
     from transformers.utils import logging
 
     logging.disable_progress_bar()
