@@ -59,14 +59,21 @@ def condition(
             command k.
     """
     control = encode_frames(autoencoder, trajectory_frames)
-    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
-    num_frames = control.shape[3] - 1
+    reference, start = _start(autoencoder, start_frame, control.shape[3] - 1)
     return Conditioning(
         control=control[:, :, :, 1:],
         start_control=control[:, :, :, 0],
-        start=reference.unsqueeze(3).expand(-1, -1, -1, num_frames, -1, -1),
+        start=start,
         reference=reference,
     )
+
+
+def _start(
+    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, num_latent_frames: int
+) -> tuple[Tensor, Tensor]:
+    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot."""
+    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
+    return reference, reference.unsqueeze(3).expand(-1, -1, -1, num_latent_frames, -1, -1)
 
 
 def condition_on_actions(
@@ -82,8 +89,7 @@ def condition_on_actions(
         actions: what `ActionEncoding` gives, of the whole batch.
         num_frames: T.
     """
-    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
-    start = reference.unsqueeze(3).expand(-1, -1, -1, num_frames, -1, -1)
+    reference, start = _start(autoencoder, start_frame, num_frames)
     return Conditioning(
         control=torch.zeros_like(start),
         start_control=torch.zeros_like(reference),
