@@ -195,14 +195,38 @@ class SimEpisode:
         for camera in self.scene.cameras:
             self._renderer.update_scene(self._data, camera.view)
             images[camera.view] = self._renderer.render()
-            self._renderer.enable_segmentation_rendering()
-            geoms = self._renderer.render()[..., 0]
-            self._renderer.disable_segmentation_rendering()
-            masks[camera.view] = self._instance_of[geoms]
+            masks[camera.view] = self._render_instances()
         return images, masks
 
+    def _render_instances(self) -> ByteArray:
+        """Draws the same scene with every geom in the colour of its number.
+
+        The renderer's own segmentation looks all geoms up again in every frame, which takes
+        as long as drawing them.
+        """
+        flag, scene = self._mujoco.mjtRndFlag, self._renderer.scene
+        by_number = [int(flag.mjRND_SEGMENT), int(flag.mjRND_IDCOLOR)]
+        scene.flags[by_number] = 1
+        colours = self._renderer.render()
+        scene.flags[by_number] = 0
+        if len(self._instance_of) != scene.ngeom + 1:
+            self._instance_of = self._instances(scene)
+        return self._instance_of[colours[..., 0] | colours[..., 1].astype(np.uint16) << 8]
+
+    def _instances(self, scene: Any) -> ByteArray:
+        """Instance id by the number of a drawn geom, from 1; nothing drawn is 0."""
+        owners = {
+            self._model.body(item.role).id: i for i, item in enumerate(self.scene.objects, 1)
+        }
+        instances = np.zeros(scene.ngeom + 1, dtype=np.uint8)
+        for drawn in scene.geoms[: scene.ngeom]:
+            if drawn.objtype == self._mujoco.mjtObj.mjOBJ_GEOM and drawn.segid >= 0:
+                body = int(self._model.geom_bodyid[drawn.objid])
+                instances[drawn.segid + 1] = owners.get(body, 0)
+        return instances
+
     def _index_model(self) -> None:
-        """Finds where the joints stand in qpos, and which geom belongs to which object."""
+        """Finds where the joints stand in qpos; which geom is whose is asked when it is drawn."""
         joints = [
             name
             for arm in ARMS
@@ -213,11 +237,7 @@ class SimEpisode:
             )
         ]
         self._arm_qpos = np.array([self._model.joint(name).qposadr[0] for name in joints])
-        # geom -1 (nothing hit) reads the last entry, which is 0
-        self._instance_of = np.zeros(self._model.ngeom + 1, dtype=np.uint8)
-        for number, item in enumerate(self.scene.objects, 1):
-            body = self._model.body(item.role)
-            self._instance_of[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]] = number
+        self._instance_of = np.zeros(0, dtype=np.uint8)
 
     @staticmethod
     def _spread(positions: FloatArray) -> FloatArray:
