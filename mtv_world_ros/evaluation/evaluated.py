@@ -109,7 +109,7 @@ def picks(evaluations: Sequence[Evaluated]) -> tuple[str, list[Pick]]:
     Ranked by J of the objects that move, where any episode has it, else by J of all objects;
     by the mean over the evaluations that scored the episode.
     """
-    words, found = 'objects that move', [scores(item, 'j_moving') for item in evaluations]
+    words, found = 'the objects that move', [scores(item, 'j_moving') for item in evaluations]
     if not any(found):
         words, found = 'all objects', [scores(item, 'j_object_mean') for item in evaluations]
     names = sorted({name for part in found for name in part})
@@ -118,11 +118,9 @@ def picks(evaluations: Sequence[Evaluated]) -> tuple[str, list[Pick]]:
         for name in names
     }
     ranked = sorted(names, key=lambda name: (-means[name], name))
-    chosen = {0: 'Best'} if ranked else {}
-    if len(ranked) > 2:
-        chosen[len(ranked) // 2] = 'Median'
-    if len(ranked) > 1:
-        chosen[len(ranked) - 1] = 'Worst'
+    chosen = {0: 'Best', len(ranked) // 2: 'Median', len(ranked) - 1: 'Worst'}
+    if len(ranked) < 3:
+        chosen = ({}, {0: 'The only one'}, {0: 'Best', 1: 'Worst'})[len(ranked)]
     return words, [
         Pick(title=title, episode=ranked[place], score=means[ranked[place]])
         for place, title in chosen.items()

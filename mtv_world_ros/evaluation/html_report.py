@@ -153,7 +153,7 @@ def _videos(evaluations: Sequence[Evaluated]) -> Markup:
         element('h2', 'Best, median and worst episode'),
         element(
             'p',
-            f'By J of the {words}. In each row: what was recorded, the trajectory video drawn '
+            f'By J of {words}. In each row: what was recorded, the trajectory video drawn '
             'from the commands, what was imagined. Outlines: the masks that were scored; white '
             'over imagined frames: where the recorded object is.',
             class_='faint',

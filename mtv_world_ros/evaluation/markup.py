@@ -75,7 +75,11 @@ def table(
         )
         for row in rows
     ]
-    heading = element('tr', *(element('th', cell, scope='col') for cell in head))
+    styles = ['label' if i < num_labels else None for i in range(len(head))]
+    heading = element(
+        'tr',
+        *(element('th', c, scope='col', class_=s) for c, s in zip(head, styles, strict=True)),
+    )
     whole = element(
         'table',
         element('caption', caption) if caption else None,

@@ -62,7 +62,7 @@ def make_clip(rollout: StoredRollout, *, max_bytes: int) -> Clip:
     frames = side_by_side(shown, tile_width=shown.real.shape[3])
     video = b''
     for crf in _CRFS:
-        video = encode_video(frames, rollout.fps, crf=crf, preset='medium')
+        video = encode_video(frames, rollout.fps, crf=crf)
         if len(video) <= max_bytes:
             break
     small = outlined(rollout, _SHEET_TILE)

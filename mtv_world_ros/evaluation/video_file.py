@@ -18,7 +18,6 @@ def encode_video(
     *,
     crf: int = 20,
     full_colour: bool = False,
-    preset: str = 'veryfast',
 ) -> bytes:
     """Returns an MP4 file of (T, H, W, 3) uint8 RGB frames.
 
@@ -27,10 +26,9 @@ def encode_video(
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
         full_colour: keep colour at every pixel (4:4:4), which not every browser plays.
-        preset: of x264: slower gives smaller files.
     """
     rate = Fraction(fps).limit_denominator(1000)
-    options = {'crf': str(crf), 'preset': preset}
+    options = {'crf': str(crf), 'preset': 'veryfast'}
     file = io.BytesIO()
     with av.open(file, 'w', format='mp4') as container:
         stream = container.add_stream('libx264', rate=rate, options=options)
