@@ -5,10 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 
-from mtv_world_ros.cli import collect, demo, doctor, evaluate, replay, report, train
+from mtv_world_ros.cli import (
+    collect,
+    demo,
+    doctor,
+    evaluate,
+    import_dataset,
+    replay,
+    report,
+    train,
+)
 from mtv_world_ros.errors import MtvWorldError
 
-COMMANDS = (demo, replay, collect, train, evaluate, report, doctor)
+COMMANDS = (demo, replay, collect, train, evaluate, report, doctor, import_dataset)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -52,7 +52,7 @@ class InspectionConfig:
 
     suspicious_residual: float = 0.012
     broken_residual: float = 0.03
-    rods_factor: float = 3.0
+    rods_factor: float = 6.0
     min_match: float = 0.12
     max_lag_s: float = 0.1
     residual: ResidualConfig = field(default_factory=ResidualConfig)

@@ -158,7 +158,7 @@ def test_rods_are_judged_less_strictly(episode, inspector):
     robot = inspector.robot
     lenient = Inspector(robot, rods(robot, 'for a test'), QUICK)
     assert lenient.inspect(changed(episode, 'low')).verdict == 'ok'
-    assert lenient.inspect(shifted_k(episode, 'low', 25, 0)).views[0].verdict != 'ok'
+    assert lenient.inspect(shifted_k(episode, 'low', 45, 0)).views[0].verdict == 'broken'
 
 
 ROBOT = """

@@ -1,0 +1,262 @@
+"""Where a view's images and calibration are from: a calibration file, JSON, or features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
+from mtv_world_ros.importing.joint_columns import UNITS
+from mtv_world_ros.importing.yaml_keys import check_keys, numbers, text, word
+
+_VIEW_KEYS = ('feature', 'calibration', 'camera')
+_CAMERA_KEYS = ('file', 'intrinsics', 'extrinsics', 'rotation', 'translation', 'pose', 'axes',
+                'quaternion', 'unit', 'distortion', 'distortion_model', 'size',
+                'mount_link')  # fmt: skip
+_POSES = ('camera_in_mount', 'mount_in_camera')
+_AXES = ('opencv', 'opengl')
+_ORDERS = ('xyzw', 'wxyz')
+#: names that a camera's four numbers go by
+_FOCAL_NAMES = (('fx', 'fy', 'cx', 'cy'), ('fx', 'fy', 'ppx', 'ppy'))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSource:
+    """Where a view is from.
+
+    Attributes:
+        view: its name.
+        feature: of its images.
+        calibration_file: YAML with this view, or None.
+        parameters: keys of the mapping's `camera`, or None.
+        where: the place in the mapping file, for error texts.
+    """
+
+    view: str
+    feature: str
+    calibration_file: Path | None
+    parameters: Mapping[str, Any] | None
+    where: str
+
+    def features(self) -> list[str]:
+        """Features that the camera parameters are read from."""
+        if self.parameters is None or 'file' in self.parameters:
+            return []
+        keys = ('intrinsics', 'extrinsics', 'rotation', 'translation', 'distortion')
+        return [self.parameters[key] for key in keys if key in self.parameters]
+
+
+def parse_camera(view: str, row: Any, folder: Path, where: str) -> CameraSource:
+    """Reads one view of the mapping.
+
+    Raises:
+        ConfigError: unknown, missing or wrong values.
+    """
+    check_keys(row, _VIEW_KEYS, ('feature',), where)
+    if ('calibration' in row) == ('camera' in row):
+        raise ConfigError(
+            f"{where}: give either 'calibration' (a calibration YAML) or 'camera' (keys of the "
+            "dataset's own camera parameters)"
+        )
+    feature = text(row, 'feature', '', where)
+    if 'calibration' in row:
+        file = folder / text(row, 'calibration', '', where)
+        if not file.is_file():
+            raise ConfigError(f"{where}: calibration file '{file}' does not exist")
+        return CameraSource(
+            view=view, feature=feature, calibration_file=file, parameters=None, where=where
+        )
+    where = f'{where}: camera'
+    camera = check_keys(row['camera'], _CAMERA_KEYS, ('intrinsics', 'mount_link'), where)
+    if ('extrinsics' in camera) == ({'rotation', 'translation'} <= set(camera)):
+        raise ConfigError(f"{where}: give either 'extrinsics', or 'rotation' and 'translation'")
+    for key, known in (('pose', _POSES), ('axes', _AXES), ('quaternion', _ORDERS),
+                       ('unit', ('m', *UNITS))):  # fmt: skip
+        word(camera, key, known, where)
+    if 'size' in camera:
+        numbers(camera, 'size', 2, where)
+    return CameraSource(
+        view=view, feature=feature, calibration_file=None, parameters=camera, where=where
+    )
+
+
+def camera_model(
+    source: CameraSource,
+    dataset: Path,
+    episode_index: int,
+    values: Mapping[str, FloatArray],
+    size: tuple[int, int],
+) -> CameraModel:
+    """Returns the view's camera for images of `size`.
+
+    Args:
+        source: of the view.
+        dataset: root of the dataset.
+        episode_index: for file names that hold `{episode_index}`.
+        values: (T, ...) values of the features that the source names.
+        size: width and height of the images [px].
+
+    Raises:
+        CalibrationError: the parameters are missing or wrong, or change within the episode.
+    """
+    if source.calibration_file is not None:
+        cameras = load_calibration(source.calibration_file)
+        if source.view not in cameras:
+            raise CalibrationError(
+                f"'{source.calibration_file}' has no view '{source.view}'"
+                f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
+            )
+        return scaled(cameras[source.view], *size)
+    row = source.parameters
+    assert row is not None
+    look_up = _Lookup(source, dataset, episode_index, values)
+    model = str(row.get('distortion_model', 'plumb_bob' if 'distortion' in row else 'none'))
+    width, height = (int(n) for n in row.get('size', size))
+    camera = CameraModel(
+        view=source.view,
+        width=width,
+        height=height,
+        K=_intrinsics(look_up('intrinsics'), source.where),
+        distortion_model=model,
+        distortion=np.ravel(look_up('distortion')) if 'distortion' in row else np.zeros(0),
+        mount_link=str(row['mount_link']),
+        T_mount_camera=_pose(row, look_up, source.where),
+    )
+    return scaled(camera, *size)
+
+
+class _Lookup:
+    """Values of the camera parameters, by the keys of the mapping."""
+
+    def __init__(
+        self,
+        source: CameraSource,
+        dataset: Path,
+        episode_index: int,
+        values: Mapping[str, FloatArray],
+    ) -> None:
+        assert source.parameters is not None
+        self._source, self._row, self._values = source, source.parameters, values
+        self._file: Path | None = None
+        self._document: Any = None
+        if 'file' in self._row:
+            self._file = dataset / _formatted(str(self._row['file']), episode_index, source.where)
+            self._document = _read_json(self._file, source.where)
+
+    def __call__(self, key: str) -> Any:
+        path = str(self._row[key])
+        if self._file is None:
+            return self._constant(path)
+        found = self._document
+        for part in path.split('.'):
+            found = self._step(found, part, path)
+        return found
+
+    def _step(self, found: Any, part: str, path: str) -> Any:
+        if isinstance(found, list) and part.isdigit() and int(part) < len(found):
+            return found[int(part)]
+        if isinstance(found, Mapping) and part in found:
+            return found[part]
+        known = list(found) if isinstance(found, Mapping) else []
+        raise CalibrationError(
+            f"{self._source.where}: '{self._file}' has no '{path}': '{part}' is not there"
+            f'{nearest(part, map(str, known))}; there are {known or type(found).__name__}'
+        )
+
+    def _constant(self, feature: str) -> FloatArray:
+        values = self._values[feature]
+        differs = ~np.isclose(values, values[0], atol=1e-5).reshape(len(values), -1).all(axis=1)
+        if differs.any():
+            frame = int(np.argmax(differs))
+            raise CalibrationError(
+                f"{self._source.where}: feature '{feature}' changes at frame {frame}; a camera "
+                'that moves needs its pose in the link that carries it (mount_link)'
+            )
+        return values[0]
+
+
+def _formatted(name: str, episode_index: int, where: str) -> str:
+    try:
+        return name.format(episode_index=episode_index)
+    except (KeyError, IndexError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"{where}: 'file' is '{name}'; it may hold {{episode_index}} or "
+            f'{{episode_index:06d}} and no other braces'
+        ) from error
+
+
+def _read_json(file: Path, where: str) -> Any:
+    try:
+        return json.loads(file.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise CalibrationError(f"{where}: cannot read '{file}': {error}") from error
+    except ValueError as error:
+        raise CalibrationError(f"{where}: '{file}' is not JSON: {error}") from error
+
+
+def _intrinsics(value: Any, where: str) -> FloatArray:
+    if isinstance(value, Mapping):
+        for names in _FOCAL_NAMES:
+            if set(names) <= set(value):
+                value = [value[name] for name in names]
+                break
+    K = _numbers(value, where, 'intrinsics')
+    if K.size == 4:
+        fx, fy, cx, cy = K.ravel()
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    if K.size != 9:
+        raise CalibrationError(
+            f"{where}: 'intrinsics' is {value!r}, must be 3 x 3, or fx, fy, cx, cy"
+        )
+    return K.reshape(3, 3)
+
+
+def _pose(row: Mapping[str, Any], look_up: _Lookup, where: str) -> FloatArray:
+    T = np.eye(4)
+    if 'extrinsics' in row:
+        given = _numbers(look_up('extrinsics'), where, 'extrinsics')
+        if given.size not in (12, 16):
+            raise CalibrationError(f"{where}: 'extrinsics' has {given.size} numbers, not 12 or 16")
+        T[: given.size // 4] = given.reshape(-1, 4)
+    else:
+        T[:3, :3] = _rotation(_numbers(look_up('rotation'), where, 'rotation'), row, where)
+        translation = _numbers(look_up('translation'), where, 'translation').ravel()
+        if translation.size != 3:
+            raise CalibrationError(f"{where}: 'translation' has {translation.size} numbers, not 3")
+        T[:3, 3] = translation
+    T[:3, 3] *= UNITS[str(row.get('unit', 'm'))]
+    if not is_rigid(T):
+        raise CalibrationError(
+            f'{where}: the pose is {T.tolist()}, not a rotation and a translation (is it stored '
+            'transposed, or in another order?)'
+        )
+    T = inverse(T) if row.get('pose') == 'mount_in_camera' else T
+    # OpenGL's camera looks along -z with y up
+    return T @ np.diag([1.0, -1, -1, 1]) if row.get('axes') == 'opengl' else T
+
+
+def _rotation(value: FloatArray, row: Mapping[str, Any], where: str) -> FloatArray:
+    if value.size == 9:
+        return value.reshape(3, 3)
+    if value.size == 4:
+        x, y, z, w = (
+            value.ravel() if row.get('quaternion') != 'wxyz' else np.roll(value.ravel(), -1)
+        )
+        return rotation([x, y, z, w])
+    raise CalibrationError(f"{where}: 'rotation' has {value.size} numbers, not 9 or 4")
+
+
+def _numbers(value: Any, where: str, key: str) -> FloatArray:
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(f"{where}: '{key}' is {value!r}, must be numbers") from error

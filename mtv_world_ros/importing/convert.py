@@ -1,0 +1,177 @@
+"""Converts one episode of a dataset into a rosbag2 MCAP folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.data.mcap_writer import EpisodeWriter
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.errors import EpisodeError, TrajectoryError
+from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.robot import check_positions
+from mtv_world_ros.importing.camera_parameters import camera_model
+from mtv_world_ros.importing.joint_columns import to_positions
+from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
+from mtv_world_ros.importing.mapping import DatasetMapping, Stream
+
+#: datasets have no date: episodes start at this stamp (0 would mean "not stamped") [ns]
+START_NS = 1_000_000_000
+MAPPING_KEY = 'import_mapping'
+
+
+def convert_episode(
+    dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping, out: Path
+) -> None:
+    """Writes the episode as the folder `out`; nothing is there before it is complete.
+
+    Row k has the state and the images of its time; its action is the target that is reached
+    `delay_frames` later. Times are the dataset's own.
+
+    Raises:
+        MtvWorldError: the episode cannot be converted; nothing is left behind.
+    """
+    rows = _read_rows(dataset, entry, mapping)
+    times = rows['timestamp'].ravel()
+    if len(times) < 2 or (np.diff(times) <= 0).any() or not np.isfinite(times).all():
+        raise EpisodeError(f'its {len(times)} timestamps do not increase')
+    measured = _positions(dataset, rows, mapping.state, mapping, 'state')
+    commanded = measured
+    if mapping.action is not None:
+        commanded = _positions(dataset, rows, mapping.action, mapping, 'action')
+    videos = {
+        view: dataset.frames(entry, source.feature, times)
+        for view, source in mapping.views.items()
+    }
+    first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
+    cameras = _cameras(dataset, entry, mapping, rows, first)
+    texts = _instructions(dataset, rows, mapping)
+    with ExitStack() as stack:
+        writer = EpisodeWriter(
+            out,
+            task=mapping.task,
+            instruction=texts[0],
+            robot=mapping.robot.name,
+            cameras=cameras,
+            objects=mapping.objects,
+            metadata={
+                'source': dataset.root.resolve().name,
+                'source_episode': str(entry.index),
+                MAPPING_KEY: mapping.key,
+            },
+            jpeg_quality=mapping.jpeg_quality,
+        )
+        stack.enter_context(writer)
+        writer.outcome = _outcome(rows, mapping)
+        stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
+        _write_commands(writer, stamps, times, commanded, mapping, dataset.fps)
+        for k, stamp_ns in enumerate(stamps):
+            if k == 0 or texts[k] != texts[k - 1]:
+                writer.write_instruction(stamp_ns, texts[k])
+            writer.write_joint_states(stamp_ns, mapping.robot.joint_names, measured[k])
+            for camera in cameras:
+                view = camera.view
+                frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
+                writer.write_camera_info(view, stamp_ns, camera)
+                writer.write_image(view, stamp_ns, frame)
+
+
+def _read_rows(
+    dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping
+) -> dict[str, FloatArray]:
+    names = ['timestamp', 'task_index', mapping.state.feature]
+    names += [mapping.action.feature] if mapping.action else []
+    names += [mapping.outcome_feature] if mapping.outcome_feature else []
+    for source in mapping.views.values():
+        dataset.feature(source.feature, ('video', 'image'))
+        names += source.features()
+    return dataset.rows(entry, list(dict.fromkeys(names)))
+
+
+def _positions(
+    dataset: LeRobotDataset,
+    rows: dict[str, FloatArray],
+    stream: Stream,
+    mapping: DatasetMapping,
+    what: str,
+) -> FloatArray:
+    values = rows[stream.feature].reshape(len(rows['timestamp']), -1)
+    names = dataset.column_names(stream.feature)
+    positions = to_positions(values, names, stream.joints, stream.feature)
+    try:
+        check_positions(mapping.robot, positions, tolerance=mapping.limit_tolerance)
+    except TrajectoryError as error:
+        raise TrajectoryError(
+            f"{what} '{stream.feature}': {error}; are unit, sign, offset and gripper range in "
+            'the mapping right? (limit_tolerance there says how far outside is accepted)'
+        ) from error
+    return positions
+
+
+def _cameras(
+    dataset: LeRobotDataset,
+    entry: EpisodeEntry,
+    mapping: DatasetMapping,
+    rows: dict[str, FloatArray],
+    first: dict[str, ByteArray],
+) -> list[CameraModel]:
+    cameras = []
+    for view, source in mapping.views.items():
+        height, width = first[view].shape[:2]
+        camera = camera_model(source, dataset.root, entry.index, rows, (width, height))
+        resting = np.zeros((1, len(mapping.robot.joint_names)))
+        camera_poses(camera, mapping.robot, resting)  # names a mount_link that is not there
+        cameras.append(camera)
+    return cameras
+
+
+def _instructions(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
+) -> list[str]:
+    """What the robot is told at each row."""
+    numbers = rows['task_index'].ravel().astype(int)
+    if mapping.instruction:
+        return [mapping.instruction] * len(numbers)
+    unknown = sorted(set(numbers.tolist()) - set(dataset.tasks))
+    if unknown:
+        raise EpisodeError(f'it names task {unknown[0]}, which meta/tasks does not have')
+    return [dataset.tasks[int(number)] for number in numbers]
+
+
+def _outcome(rows: dict[str, FloatArray], mapping: DatasetMapping) -> str:
+    if not mapping.outcome_feature:
+        return mapping.outcome
+    return 'success' if (rows[mapping.outcome_feature] > 0).any() else 'failure'
+
+
+def _write_commands(
+    writer: EpisodeWriter,
+    stamps: Sequence[int],
+    times: FloatArray,
+    positions: FloatArray,
+    mapping: DatasetMapping,
+    fps: float,
+) -> None:
+    """Writes trajectory messages of `chunk_s`, each stamped at its first row."""
+    if mapping.action is None:  # the measured positions of the rows that follow
+        reached, targets = times[1:], positions[1:]
+    else:
+        reached, targets = times + mapping.action.delay_frames / fps, positions
+    size = max(1, round(mapping.chunk_s * fps))
+    for first in range(0, len(targets), size):
+        chunk = slice(first, first + size)
+        relative = reached[chunk] - times[first]
+        trajectory = JointTrajectory(
+            joint_names=mapping.robot.joint_names, times=relative, positions=targets[chunk]
+        )
+        writer.write_trajectory(stamps[first], trajectory)
+
+
+def _next_frame(frames: Iterator[ByteArray], view: str, row: int) -> ByteArray:
+    frame = next(frames, None)
+    if frame is None:
+        raise EpisodeError(f"view '{view}' has no frame for row {row}")
+    return frame

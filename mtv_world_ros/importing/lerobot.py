@@ -1,0 +1,288 @@
+"""Reads LeRobot datasets, formats v2.0, v2.1 and v3.0.
+
+Layout as in huggingface/lerobot (`src/lerobot/datasets/utils.py`, `io_utils.py` and
+`scripts/convert_dataset_v21_to_v30.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data_types import ByteArray, FloatArray
+from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.importing.video import frames_at
+
+VERSIONS = ('v2.0', 'v2.1', 'v3.0')
+_INFO = Path('meta/info.json')
+#: a video frame may be this share of the period away from its row
+_TIME_TOLERANCE = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoPart:
+    """Where an episode's frames lie: a file, and the time in it at which the episode starts."""
+
+    file: Path
+    start_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeEntry:
+    """One episode of a dataset.
+
+    Attributes:
+        index: its number.
+        length: number of rows.
+        data_file: parquet file with its rows, maybe among others'.
+        videos: by feature.
+    """
+
+    index: int
+    length: int
+    data_file: Path
+    videos: Mapping[str, VideoPart]
+
+
+class LeRobotDataset:
+    """A dataset's folder.
+
+    Args:
+        root: folder with `meta/`, `data/` and `videos/`.
+
+    Attributes:
+        root: the folder.
+        version: of the format.
+        fps: rows a second [Hz].
+        features: what the columns hold, by name.
+        episodes: entries by number.
+        tasks: texts by number.
+
+    Raises:
+        EpisodeError: it is no such dataset, or of another version.
+        ConfigError: pyarrow is not installed.
+    """
+
+    def __init__(self, root: Path) -> None:
+        _pyarrow()
+        self.root = root
+        info = self._info()
+        self.version = str(info.get('codebase_version', ''))
+        if self.version not in VERSIONS:
+            raise EpisodeError(
+                f"'{root / _INFO}' is of format '{self.version}'; readable are "
+                f'{", ".join(VERSIONS)} (LeRobot itself converts older ones)'
+            )
+        try:
+            self.fps = float(info['fps'])
+            self.features: dict[str, dict[str, Any]] = dict(info['features'])
+            self._data_path = str(info['data_path'])
+            self._video_path = str(info.get('video_path') or '')
+            self._chunk = int(info.get('chunks_size', 1000))
+            read = self._episodes_v3 if self.version == 'v3.0' else self._episodes_v2
+            self.episodes = {entry.index: entry for entry in read()}
+            self.tasks = self._tasks_v3() if self.version == 'v3.0' else self._tasks_v2()
+        except (KeyError, TypeError, ValueError) as error:
+            raise EpisodeError(
+                f"'{root / 'meta'}' is not what format {self.version} has there: "
+                f'{type(error).__name__}: {error}'
+            ) from error
+
+    def feature(self, name: str, kinds: Sequence[str] = ()) -> dict[str, Any]:
+        """Returns what the dataset says about a feature.
+
+        Raises:
+            ConfigError: there is none of that name and (if any are given) kinds.
+        """
+        known = [n for n, f in self.features.items() if not kinds or f.get('dtype') in kinds]
+        if name not in known:
+            what = 'image or video feature' if kinds else 'feature'
+            raise ConfigError(
+                f"'{self.root}' has no {what} '{name}'{nearest(name, known)}; it has "
+                f'{", ".join(known) or "none"}'
+            )
+        return self.features[name]
+
+    def column_names(self, feature: str) -> list[str]:
+        """Names of a feature's columns, empty where it has none.
+
+        They are a list, a list in a list, or a list under one key (`motors`).
+        """
+        names = self.feature(feature).get('names')
+        if isinstance(names, Mapping):
+            names = next(iter(names.values()), None)
+        if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
+            names = names[0]
+        return [str(name) for name in names] if isinstance(names, list) else []
+
+    def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
+        """Numbers of an episode by feature, (T, ...) each, in order.
+
+        Raises:
+            EpisodeError: the file cannot be read, or does not hold what the metadata say.
+            ConfigError: a feature is not there.
+        """
+        for name in features:
+            self.feature(name)
+        wanted = list(dict.fromkeys([*features, 'frame_index', 'episode_index']))
+        table = self._table(entry, wanted)
+        try:
+            arrays = {
+                name: np.array(table.column(name).to_pylist(), dtype=float) for name in wanted
+            }
+        except (TypeError, ValueError) as error:
+            raise EpisodeError(
+                f"'{entry.data_file}': a feature among {list(features)} does not hold numbers "
+                f'of one shape ({error})'
+            ) from error
+        order = np.argsort(arrays['frame_index'].ravel(), kind='stable')
+        return {name: arrays[name][order] for name in features}
+
+    def frames(
+        self, entry: EpisodeEntry, feature: str, timestamps: FloatArray
+    ) -> Iterator[ByteArray]:
+        """Yields the (H, W, 3) RGB frames of an episode's rows at `timestamps` (T,) [s].
+
+        Raises:
+            EpisodeError: a frame is missing or damaged.
+        """
+        if self.feature(feature, ('video', 'image'))['dtype'] == 'image':
+            yield from self._images(entry, feature)
+            return
+        part = entry.videos[feature]
+        tolerance = _TIME_TOLERANCE / self.fps
+        yield from frames_at(part.file, timestamps + part.start_s, tolerance)
+
+    def _info(self) -> Mapping[str, Any]:
+        file = self.root / _INFO
+        if not file.is_file():
+            raise EpisodeError(f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there")
+        try:
+            info = json.loads(file.read_text(encoding='utf-8'))
+        except ValueError as error:
+            raise EpisodeError(f"'{file}' is not JSON: {error}") from error
+        if not isinstance(info, Mapping):
+            raise EpisodeError(f"'{file}' must hold keys and values")
+        return info
+
+    def _video_keys(self) -> list[str]:
+        return [name for name, f in self.features.items() if f.get('dtype') == 'video']
+
+    def _episodes_v2(self) -> Iterator[EpisodeEntry]:
+        for row in self._lines('meta/episodes.jsonl'):
+            index = int(row['episode_index'])
+            place = {'episode_index': index, 'episode_chunk': index // self._chunk}
+            yield EpisodeEntry(
+                index=index,
+                length=int(row['length']),
+                data_file=self._file(self._data_path, place),
+                videos={
+                    key: VideoPart(
+                        file=self._file(self._video_path, {**place, 'video_key': key}), start_s=0.0
+                    )
+                    for key in self._video_keys()
+                },
+            )
+
+    def _episodes_v3(self) -> Iterator[EpisodeEntry]:
+        files = sorted((self.root / 'meta/episodes').glob('*/*.parquet'))
+        if not files:
+            raise EpisodeError(f"'{self.root / 'meta/episodes'}' holds no parquet file")
+        for file in files:
+            for row in _read_table(file).to_pylist():
+                videos = {}
+                for key in self._video_keys():
+                    place = {'video_key': key, **_place(row, f'videos/{key}')}
+                    videos[key] = VideoPart(
+                        file=self._file(self._video_path, place),
+                        start_s=float(row[f'videos/{key}/from_timestamp']),
+                    )
+                yield EpisodeEntry(
+                    index=int(row['episode_index']),
+                    length=int(row['length']),
+                    data_file=self._file(self._data_path, _place(row, 'data')),
+                    videos=videos,
+                )
+
+    def _tasks_v2(self) -> dict[int, str]:
+        return {int(r['task_index']): str(r['task']) for r in self._lines('meta/tasks.jsonl')}
+
+    def _tasks_v3(self) -> dict[int, str]:
+        table = _read_table(self.root / 'meta/tasks.parquet')
+        # pandas' index: its name, or `__index_level_0__` where it had none
+        texts = next(name for name in table.column_names if name != 'task_index')
+        rows = zip(table.column('task_index').to_pylist(), table.column(texts).to_pylist(),
+                   strict=True)  # fmt: skip
+        return {int(index): str(text) for index, text in rows}
+
+    def _lines(self, name: str) -> Iterator[dict[str, Any]]:
+        file = self.root / name
+        try:
+            lines = file.read_text(encoding='utf-8').splitlines()
+        except OSError as error:
+            raise EpisodeError(f"cannot read '{file}': {error}") from error
+        return (json.loads(line) for line in lines if line.strip())
+
+    def _file(self, template: str, place: Mapping[str, Any]) -> Path:
+        relative = Path(template.format(**place))
+        if relative.is_absolute() or '..' in relative.parts:
+            raise EpisodeError(f"'{self.root / _INFO}' names '{relative}', outside the dataset")
+        return self.root / relative
+
+    def _table(self, entry: EpisodeEntry, columns: Sequence[str]) -> Any:
+        table = _read_table(
+            entry.data_file, columns=columns, filters=[('episode_index', '==', entry.index)]
+        )
+        if table.num_rows != entry.length:
+            raise EpisodeError(
+                f"'{entry.data_file}' has {table.num_rows} rows of episode {entry.index}, the "
+                f'metadata say {entry.length}'
+            )
+        return table
+
+    def _images(self, entry: EpisodeEntry, feature: str) -> Iterator[ByteArray]:
+        table = self._table(entry, [feature, 'frame_index', 'episode_index'])
+        order = np.argsort(table.column('frame_index').to_pylist(), kind='stable')
+        column = table.column(feature)
+        for number in order:
+            yield self._decoded(column[int(number)].as_py(), entry, feature)
+
+    def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
+        data = cell.get('bytes') if isinstance(cell, Mapping) else None
+        if data is None:
+            raise EpisodeError(
+                f"'{entry.data_file}': '{feature}' holds no image bytes, but {type(cell).__name__}"
+            )
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if image is None:
+            raise EpisodeError(f"'{entry.data_file}': an image of '{feature}' is damaged")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
+    return {key: int(row[f'{prefix}/{key}']) for key in ('chunk_index', 'file_index')}
+
+
+def _read_table(file: Path, **options: Any) -> Any:
+    pyarrow, parquet = _pyarrow()
+    try:
+        return parquet.read_table(file, **options)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise EpisodeError(f"cannot read '{file}': {' '.join(str(error).split())}") from error
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ConfigError(
+            "reading LeRobot datasets needs pyarrow: pip install 'mtv_world_ros[import]'"
+        ) from error
+    return pyarrow, parquet
