@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 DIR gets metrics.json, rows.csv, tables.md, numbers.csv, paper_tables.md and report.html. Several
-checkpoints share the last three; the others of each are in DIR/NAME. Running the same command again
-goes on where it was stopped.
+checkpoints share the last three; the others of each are in DIR/NAME. Running the same command
+again goes on where it was stopped.
 """
 
 

@@ -22,7 +22,7 @@ def test_psnr_and_ssim_of_flat_frames_have_closed_forms():
     assert found['psnr'] == pytest.approx(np.mean(20 * np.log10(255 / np.array([10, 20]))))
     c1 = (0.01 * 255) ** 2
     ssim = [(2 * a * b + c1) / (a * a + b * b + c1) for a, b in ((110, 100), (100, 80))]
-    assert found['ssim'] == pytest.approx(np.mean(ssim), abs=1e-6)
+    assert found['ssim'] == pytest.approx(np.mean(ssim), abs=1e-4)
 
 
 def test_equal_frames_have_a_finite_psnr_above_that_of_one_wrong_level():
