@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from mtv_world_ros.data.clips import Clip, clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
@@ -34,14 +36,26 @@ class Batch:
     Attributes:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model is shown it.
-        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, or None where some clip has none.
+        actions: what `ActionEncoding` gives, where they are not drawn.
     """
 
     frames: Tensor
     start_frame: Tensor
-    trajectory: Tensor
+    trajectory: Tensor | None
     object_ids: Tensor | None
+    actions: Tensor | None = None
+
+
+class _Sample(NamedTuple):
+    """One clip of a batch."""
+
+    frames: ByteArray
+    start_frame: ByteArray
+    trajectory: ByteArray | None
+    object_ids: ByteArray | None
+    actions: np.ndarray | None
 
 
 class BatchSource:
@@ -59,6 +73,7 @@ class BatchSource:
         augment: AugmentConfig,
         batch_size: int,
         seed: int,
+        actions: ActionEncoding | None = None,
     ) -> None:
         self._starts = [(r, clip_starts(r, spec)) for r in recordings]
         self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
@@ -70,7 +85,7 @@ class BatchSource:
             )
         self._spec, self._robot, self._segmenter = spec, robot, segmenter
         self._rendering, self._object_mask, self._augment = rendering, object_mask, augment
-        self._batch_size, self._seed = batch_size, seed
+        self._batch_size, self._seed, self._actions = batch_size, seed, actions
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._ahead: tuple[int, Future[Batch]] | None = None
@@ -96,30 +111,32 @@ class BatchSource:
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((self._seed, step))
         samples = [self._sample(rng) for _ in range(self._batch_size)]
-        ids = [sample[3] for sample in samples]
+        encoded = [s.actions for s in samples if s.actions is not None]
         return Batch(
-            frames=torch.from_numpy(np.stack([s[0] for s in samples])),
-            start_frame=torch.from_numpy(np.stack([s[1] for s in samples])),
-            trajectory=torch.from_numpy(np.stack([s[2] for s in samples])),
-            object_ids=None
-            if any(i is None for i in ids)
-            else torch.from_numpy(np.stack([i for i in ids if i is not None])),
+            frames=torch.from_numpy(np.stack([s.frames for s in samples])),
+            start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
+            trajectory=_stack([s.trajectory for s in samples]),
+            object_ids=_stack([s.object_ids for s in samples]),
+            actions=torch.from_numpy(collate(encoded)) if encoded else None,
         )
 
-    def _sample(
-        self, rng: np.random.Generator
-    ) -> tuple[ByteArray, ByteArray, ByteArray, ByteArray | None]:
+    def _sample(self, rng: np.random.Generator) -> _Sample:
         recording, starts = self._choose(rng)
         clip = cut_clip(recording, int(starts[rng.integers(len(starts))]), self._spec)
-        names = clip.objects or objects_from_instruction(recording.instruction)
-        trajectory = self._draw(clip, names)
+        trajectory = actions = None
+        if self._actions is None:
+            names = clip.objects or objects_from_instruction(recording.instruction)
+            trajectory = self._draw(clip, names)
+        else:
+            actions = self._actions.encode(self._robot, clip.positions)
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
             frames = frames[..., rng.permutation(3)]
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
-        return np.ascontiguousarray(frames), start.copy(), trajectory, clip.object_ids
+        whole = np.ascontiguousarray(frames)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
         """An episode and the starts of its clips; failed ones as often as they are asked for."""
@@ -141,6 +158,12 @@ class BatchSource:
             object_masks=masks,
             config=self._rendering,
         ).frames
+
+
+def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:
+    """All of a batch as one tensor; None where some clip has none."""
+    found = [part for part in parts if part is not None]
+    return torch.from_numpy(np.stack(found)) if len(found) == len(parts) else None
 
 
 def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:

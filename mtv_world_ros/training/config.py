@@ -10,13 +10,19 @@ from typing import Any
 import yaml
 
 from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoConfig:
-    """What the model sees and predicts: views, frame rate [Hz], T, size [px], robot."""
+    """What the model sees and predicts: views, frame rate [Hz], T, size [px], robot, control.
+
+    Attributes:
+        control: how the actions enter, of `action_features.CONTROLS`.
+        object_mask: whether the trajectory video carries the objects' masks.
+    """
 
     views: tuple[str, ...] = ('low', 'high')
     fps: float = 5.0
@@ -24,7 +30,11 @@ class VideoConfig:
     width: int = 96
     height: int = 72
     robot: str = 'yam_bimanual'
+    control: str = TRAJECTORY_VIDEO
     object_mask: bool = True
+
+    def __post_init__(self) -> None:
+        check_control(self.control)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,12 +68,15 @@ class AugmentConfig:
         colour_permutation: probability of exchanged colour channels.
         failure_share: share of clips drawn from failed episodes alone, on top of those that come
             by chance: they are few, and a model that rarely sees a miss imagines grasps instead.
+        action_dropout: probability of a sample without its actions; control `ee_mlp` alone
+            (Ctrl-World's value).
     """
 
     start_noise: float = 0.5
     start_noise_std: float = 0.04
     colour_permutation: float = 0.3
     failure_share: float | None = None
+    action_dropout: float = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

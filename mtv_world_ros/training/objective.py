@@ -5,6 +5,8 @@ Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w la
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 import torch.nn.functional as F
@@ -48,6 +50,20 @@ def latent_weights(weights: Tensor, block_size: int) -> Tensor:
     blocks = F.pixel_unshuffle(weights.flatten(0, 1).flatten(0, 1)[:, None], block_size)
     blocks = blocks.repeat(1, 3, 1, 1)  # latent channels are colour-major
     return blocks.unflatten(0, weights.shape[:3]).movedim(3, 2)
+
+
+def pooled_weights(weights: Tensor, shape: Sequence[int]) -> Tensor:
+    """Returns weights of shape (B, V, C, 1 + k, h, w) for latents that begin with the start frame.
+
+    Args:
+        weights: (B, V, T, H, W) of the pixels of the T frames after it; each latent gets the mean
+            of those it stands for, the start frame 1.
+        shape: of the latents.
+    """
+    frames, height, width = shape[3:]
+    pooled = F.adaptive_avg_pool3d(weights.flatten(0, 1), (frames - 1, height, width))
+    pooled = F.pad(pooled, (0, 0, 0, 0, 1, 0), value=1.0)
+    return pooled.unflatten(0, shape[:2]).unsqueeze(2).expand(*shape)
 
 
 def add_noise(clean: Tensor, noise: Tensor, sigmas: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.success.segmenter import Segmenter
+from mtv_world_ros.training.actions import kept_actions
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.trainer import mean_loss, Trainer
@@ -111,6 +112,9 @@ def train(
     paths = find_episodes(dataset)[:num_episodes]
     recordings, skipped = load_recordings(paths, spec_of(config), robot, out / 'cache')
     (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
+    actions = kept_actions(
+        out, config.video.control, recordings, spec_of(config), robot, initial=initial
+    )
     source = BatchSource(
         recordings,
         spec=spec_of(config),
@@ -121,6 +125,7 @@ def train(
         augment=config.augment,
         batch_size=config.optimizer.batch_size,
         seed=seed,
+        actions=actions,
     )
     trained_on = {
         'episodes': len(recordings),
@@ -128,7 +133,15 @@ def train(
         'clips': source.num_clips,
         'tasks': sorted({recording.task for recording in recordings}),
     }
-    trainer = Trainer(config, out, seed=seed, device=device, dtype=dtype, trained_on=trained_on)
+    trainer = Trainer(
+        config,
+        out,
+        seed=seed,
+        device=device,
+        dtype=dtype,
+        trained_on=trained_on,
+        actions=actions,
+    )
     resumed = trainer.load_state()
     if initial is not None and not resumed:
         trainer.start_from(initial)

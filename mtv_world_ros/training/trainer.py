@@ -8,27 +8,21 @@ import json
 import math
 from pathlib import Path
 
-from diffusers import FlowMatchEulerDiscreteScheduler
 from diffusers.training_utils import EMAModel
 from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from mtv_world_ros.model.conditioning import condition, encode_frames
+from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
+from mtv_world_ros.training.actions import transformer_arguments
 from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
-from mtv_world_ros.training.objective import (
-    add_noise,
-    draw_sigmas,
-    latent_weights,
-    pixel_weights,
-    sample_loss,
-)
+from mtv_world_ros.training.loss import batch_loss
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +53,7 @@ class Trainer:
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
         trained_on: what stands in the checkpoint's card.
+        actions: how positions become actions, where the preset's control does not draw them.
     """
 
     def __init__(
@@ -70,14 +65,15 @@ class Trainer:
         device: str,
         dtype: torch.dtype,
         trained_on: dict[str, object],
+        actions: ActionEncoding | None = None,
     ) -> None:
         torch.manual_seed(seed)
         self.config, self.folder, self.seed = config, Path(folder), seed
         self.device = torch.device(device)
-        self.trained_on = trained_on
-        autoencoder = SpaceToDepthAutoencoder(**config.autoencoder)
+        self.trained_on, self.actions = trained_on, actions
+        autoencoder = build_autoencoder(config.autoencoder)
         self.autoencoder = place(autoencoder, self.device, torch.float32)
-        transformer = MultiViewWanTransformer(**config.transformer)
+        transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
         self.master = place(transformer, self.device, torch.float32)
         self.worker = place(copy_of(self.master), self.device, dtype)
         self.ema = EMAModel(
@@ -131,29 +127,10 @@ class Trainer:
 
     def loss(self, batch: Batch, step: int) -> Tensor:
         """The loss of a batch with the noise of a step."""
-        config = self.config.objective
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
-        dtype = self.worker.dtype
-        frames = batch.frames.to(self.device)
-        cond = condition(
-            self.autoencoder, batch.start_frame.to(self.device), batch.trajectory.to(self.device)
+        return batch_loss(
+            self.worker, self.autoencoder, batch, self.config, generator, self.device
         )
-        clean = encode_frames(self.autoencoder, frames[:, :, 1:])
-        sigmas = draw_sigmas(len(frames), config, generator)
-        noise = torch.randn(clean.shape, generator=generator).to(self.device)
-        noisy = add_noise(clean, noise, sigmas.to(self.device))
-        predicted = self.worker(
-            noisy.to(dtype),
-            (sigmas * 1000).to(self.device),
-            control=cond.control.to(dtype),
-            start=cond.start.to(dtype),
-            reference=cond.reference.to(dtype),
-            start_control=cond.start_control.to(dtype),
-        )
-        ids = None if batch.object_ids is None else batch.object_ids.to(self.device)
-        weights = latent_weights(pixel_weights(frames, ids, config), self.autoencoder.block_size)
-        target = clean if self.worker.prediction == 'sample' else noise - clean
-        return sample_loss(predicted, target, weights, config.huber_delta)
 
     def _train_step(self, batch: Batch) -> StepReport:
         loss = self.loss(batch, self.step)
@@ -193,7 +170,12 @@ class Trainer:
         for index, state in self.optimizer.state_dict()['state'].items():
             tensors |= {f'adam.{index}.{k}': v.contiguous() for k, v in state.items()}
         save_file(tensors, partial / 'state.safetensors')
-        card = {'step': self.step, 'ema_step': self.ema.optimization_step, 'seed': self.seed}
+        card = {
+            'step': self.step,
+            'ema_step': self.ema.optimization_step,
+            'seed': self.seed,
+            'control': self.config.video.control,
+        }
         (partial / 'state.json').write_text(json.dumps(card))
         _swap(partial, target)
 
@@ -207,6 +189,12 @@ class Trainer:
             raise TrainingError(
                 f"'{folder}' was trained with seed {card['seed']}, this run has {self.seed}; "
                 'give --seed the same, or another --out'
+            )
+        trained, control = card.get('control', 'trajectory_video'), self.config.video.control
+        if trained != control:
+            raise TrainingError(
+                f"'{folder}' was trained with control '{trained}', this run has '{control}'; "
+                'give --control the same, or another --out'
             )
         tensors = load_file(folder / 'state.safetensors')
         self.master.load_state_dict(
@@ -239,14 +227,18 @@ class Trainer:
             'width': video.width,
             'height': video.height,
             'robot': video.robot,
-            'control': 'trajectory_video',
+            'control': video.control,
             'object_mask': video.object_mask,
             'rendering': self.config.as_dict()['rendering'],
             'trained_on': {**self.trained_on, 'steps': self.step, 'seed': self.seed},
         }
-        scheduler = FlowMatchEulerDiscreteScheduler(**self.config.scheduler)
+        scheduler = build_scheduler(self.config.scheduler)
         parts = Checkpoint(
-            transformer=averaged, autoencoder=self.autoencoder, scheduler=scheduler, card=card
+            transformer=averaged,
+            autoencoder=self.autoencoder,
+            scheduler=scheduler,
+            card=card,
+            actions=self.actions,
         )
         save_checkpoint(parts, folder, dtype=dtype)
 
