@@ -94,8 +94,11 @@ def is_feasible(
         return False
     now = dict(items)
     for number, (move, goal) in enumerate(zip(task.moves, goals, strict=True)):
-        moved = replace(now[move.subject], position=goal)
-        if not _reaches(move, now[move.subject], goal, config):
+        subject = now[move.subject]
+        moved, way = replace(subject, position=goal), _plane(subject.position, goal)
+        if isinstance(move, PickPlace) and way < move.least:
+            return False
+        if not _reaches(move, subject, goal, config):
             return False
         if not _is_free(task, number, moved, now, config):
             return False

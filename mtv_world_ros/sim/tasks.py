@@ -48,6 +48,7 @@ class PickPlace:
         offset: goal centre minus the reference's centre, (x, y) [m].
         spread: half widths of the region around it that the goal is drawn from, (x, y) [m].
         rest: `table`, `on` (comes to rest on the reference) or `in` (dropped into it).
+        least: no goal is nearer than this to where the subject lies [m].
     """
 
     subject: str
@@ -55,6 +56,7 @@ class PickPlace:
     offset: tuple[float, float] = (0.0, 0.0)
     spread: tuple[float, float] = (0.0, 0.0)
     rest: str = 'table'
+    least: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,6 +253,25 @@ _ALL = (
         roles=_TWO_BLOCKS,
         moves=(PickPlace(subject='a', reference='b', rest='on'),),
         succeeds=is_true.all_of(is_true.is_stacked('a', 'b')),
+    ),
+    Task(
+        name='random_pick_place',
+        instruction='pick up the {a} and put it down somewhere else',
+        roles=(
+            *(
+                ObjectRole(role=role, shapes=('bowl', 'cup', *_FOOD, *_TOYS),
+                           x_range=(-0.18, 0.18), y_range=(0.21, 0.33))
+                for role in 'ab'
+            ),
+            _DISTRACTOR,
+        ),
+        moves=(
+            PickPlace(
+                subject='a', reference=TABLE, offset=(0.0, 0.27), spread=(0.22, 0.07), least=0.08
+            ),
+        ),
+        succeeds=is_true.all_of(is_true.is_at_goal(0, 'a')),
+        zero_shot=True,
     ),
 )  # fmt: skip
 
