@@ -20,6 +20,9 @@ class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
     Shapes: B batch, F frames, H W pixels, h w = H / block_size, W / block_size.
     """
 
+    #: whether a chunk is encoded and denoised together with the frame that it starts from
+    includes_start = False
+
     @register_to_config
     def __init__(self, block_size: int = 2) -> None:
         super().__init__()
@@ -31,6 +34,10 @@ class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
     def latent_channels(self) -> int:
         """Channels of the latents."""
         return 3 * self.block_size**2
+
+    def num_latent_frames(self, num_frames: int) -> int:
+        """Latent frames that denoising a chunk of T frames takes."""
+        return num_frames
 
     def encode(self, video: Tensor) -> Tensor:
         """Returns (B, C, F, h, w) latents of a (B, 3, F, H, W) video."""

@@ -24,6 +24,8 @@ _CARD_KEYS = {
     'rendering': dict,
     'trained_on': dict,
 }
+#: what only models with text need: the instruction, what to keep away from and how strongly
+_OPTIONAL_KEYS = {'prompt': str, 'negative_prompt': str, 'guidance_scale': (int, float)}
 
 
 def read_card(folder: Path) -> dict[str, Any]:
@@ -64,11 +66,14 @@ def check_card(card: Mapping[str, Any], path: Path) -> None:
     Raises:
         CheckpointError: missing, unknown or ill-typed keys.
     """
+    known = {**_CARD_KEYS, **_OPTIONAL_KEYS}
     for key in card:
-        if key not in _CARD_KEYS:
-            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, _CARD_KEYS)}")
-    for key, kind in _CARD_KEYS.items():
+        if key not in known:
+            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, known)}")
+    for key, kind in known.items():
         if key not in card:
+            if key in _OPTIONAL_KEYS:
+                continue
             raise CheckpointError(f"'{path}': key '{key}' is missing")
         if not isinstance(card[key], kind):
             raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")

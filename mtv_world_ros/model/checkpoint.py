@@ -9,20 +9,20 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from diffusers import FlowMatchEulerDiscreteScheduler
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 import torch
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
 from mtv_world_ros.model.actions import ActionEncoding
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CARD, check_card, read_card
+from mtv_world_ros.model.image_encoder import ImageEncoder
+from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.tensor_files import open_tensors, PICKLES
+from mtv_world_ros.model.text_encoder import TextEncoder
 from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 
-WEIGHTS = 'diffusion_pytorch_model.safetensors'
+WEIGHTS = 'diffusion_pytorch_model'
 PARTS = ('transformer', 'autoencoder', 'scheduler')
 
 
@@ -35,15 +35,20 @@ class Checkpoint:
         autoencoder: pixels to latents and back.
         scheduler: noise levels and the step rule.
         card: `world_model.json`: views, fps, num_frames (T), width, height, robot, control,
-            object_mask, rendering, trained_on.
+            object_mask, rendering, trained_on; of models with text also prompt, negative_prompt
+            and guidance_scale.
         actions: how positions become the transformer's actions; None where they are drawn.
+        text_encoder: umT5, in models with text.
+        image_encoder: CLIP, in models with text.
     """
 
     transformer: MultiViewWanTransformer
-    autoencoder: SpaceToDepthAutoencoder
-    scheduler: FlowMatchEulerDiscreteScheduler
+    autoencoder: Autoencoder
+    scheduler: Scheduler
     card: Mapping[str, Any]
     actions: ActionEncoding | None = None
+    text_encoder: TextEncoder | None = None
+    image_encoder: ImageEncoder | None = None
 
 
 def save_checkpoint(
@@ -60,6 +65,9 @@ def save_checkpoint(
     checkpoint.scheduler.save_pretrained(partial / 'scheduler')
     if checkpoint.actions is not None:
         checkpoint.actions.save(partial)
+    for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
+        if encoder is not None:
+            encoder.save(partial)
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
     if folder.exists():
         old = folder.with_name(folder.name + '.old')
@@ -82,7 +90,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
     for part in PARTS:
         if not (folder / part).is_dir():
             raise CheckpointError(f"checkpoint '{folder}' has no folder '{part}/'")
-    pickles = [p.name for p in folder.rglob('*') if p.suffix in ('.bin', '.pt', '.pth', '.ckpt')]
+    pickles = [p.name for p in folder.rglob('*') if p.suffix in PICKLES]
     if pickles:
         raise CheckpointError(
             f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
@@ -90,28 +98,48 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
         )
     control = card['control']
     drawn = control == TRAJECTORY_VIDEO
-    scheduler: Any = FlowMatchEulerDiscreteScheduler.from_pretrained(folder / 'scheduler')
+    with_text = (folder / 'text_encoder').is_dir()
     return Checkpoint(
-        transformer=_load_part(MultiViewWanTransformer, folder / 'transformer', dtype),
-        autoencoder=_load_part(SpaceToDepthAutoencoder, folder / 'autoencoder', dtype),
-        scheduler=scheduler,
+        transformer=_load_transformer(folder / 'transformer', dtype),
+        autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
+        scheduler=build_scheduler(_config(folder / 'scheduler' / 'scheduler_config.json')),
         card=card,
         actions=None if drawn else ActionEncoding.load(folder, control),
+        text_encoder=TextEncoder(folder, dtype=dtype) if with_text else None,
+        image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
     )
 
 
-def _load_part(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
+def _load_transformer(folder: Path, dtype: torch.dtype) -> MultiViewWanTransformer:
+    config = _config(folder / 'config.json')
+    found, expected = config.get('_class_name'), MultiViewWanTransformer.__name__
+    if found != expected:
+        raise CheckpointError(f"'{folder}' holds a {found}, expected a {expected}")
+    with torch.device('meta'):
+        transformer: Any = MultiViewWanTransformer.from_config(config)
+    _fill(transformer, folder)
+    return place(transformer, torch.device('cpu'), dtype).eval()
+
+
+def _load_autoencoder(folder: Path, dtype: torch.dtype) -> Autoencoder:
+    config = _config(folder / 'config.json')
+    with torch.device('meta'):
+        autoencoder: Any = build_autoencoder(config)
+    _fill(getattr(autoencoder, 'vae', autoencoder), folder)
+    return place(autoencoder, torch.device('cpu'), dtype).eval()
+
+
+def _fill(module: Any, folder: Path) -> None:
+    """Puts the stored tensors in the place of a module's, which take no memory before."""
+    tensors = {name: stored.read() for name, stored in open_tensors(folder, WEIGHTS).items()}
     try:
-        config = json.loads((folder / 'config.json').read_text())
-        tensors = load_file(folder / WEIGHTS)
-    except (OSError, json.JSONDecodeError, SafetensorError) as error:
-        raise CheckpointError(f"'{folder}' cannot be loaded: {error}") from error
-    found = config.get('_class_name')
-    if found != kind.__name__:
-        raise CheckpointError(f"'{folder}' holds a {found}, expected a {kind.__name__}")
-    part = kind.from_config(config)
-    try:
-        part.load_state_dict(tensors)
+        module.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
         raise CheckpointError(f"'{folder}' does not fit its config: {error}") from error
-    return place(part, torch.device('cpu'), dtype).eval()
+
+
+def _config(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error

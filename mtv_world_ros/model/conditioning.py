@@ -6,12 +6,12 @@ h w = latent size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.parts import Autoencoder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,11 +19,14 @@ class Conditioning:
     """Latents a chunk is denoised under.
 
     Attributes:
-        control: (B, V, C, F, h, w) of the trajectory video's frames 1 .. T.
+        control: (B, V, C, F, h, w) of the trajectory video, in step with the denoised latents.
         start_control: (B, V, C, h, w) of its frame 0.
-        start: (B, V, C, F, h, w) the start image in every frame's channel slot.
+        start: (B, V, C, F, h, w) the start image's channel slot.
         reference: (B, V, C, h, w) of the start image.
         actions: what `ActionEncoding` made of the commands, where they are not drawn.
+        text: (B, 512, text_dim) umT5 tokens of the prompt, in models with text.
+        negative_text: the same of what guidance leads away from; None = no guidance.
+        image: (B, V * 257, image_dim) CLIP tokens of the start image.
     """
 
     control: Tensor
@@ -31,24 +34,41 @@ class Conditioning:
     start: Tensor
     reference: Tensor
     actions: Tensor | None = None
+    text: Tensor | None = None
+    negative_text: Tensor | None = None
+    image: Tensor | None = None
+
+    def repeated(self, count: int) -> Conditioning:
+        """Returns the same for `count` samples, where it is for one."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        held = {name: value for name, value in values.items() if value is not None}
+        return replace(self, **{n: v.expand(count, *v.shape[1:]) for n, v in held.items()})
 
 
-def encode_frames(autoencoder: SpaceToDepthAutoencoder, frames: Tensor) -> Tensor:
+def encode_frames(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
     """Returns (B, V, C, F, h, w) latents of (B, V, T, H, W, 3) uint8 RGB frames."""
     video = frames.to(autoencoder.dtype).div(127.5).sub(1.0).movedim(-1, 2)
     latents = autoencoder.encode(video.flatten(0, 1))
     return latents.unflatten(0, frames.shape[:2])
 
 
-def decode_frames(autoencoder: SpaceToDepthAutoencoder, latents: Tensor) -> Tensor:
-    """Returns (B, V, T, H, W, 3) uint8 RGB frames of (B, V, C, F, h, w) latents."""
+def encode_chunk(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
+    """Returns (B, V, C, F, h, w), what denoising 1 + T frames (B, V, 1 + T, H, W, 3) gives."""
+    kept = frames if autoencoder.includes_start else frames[:, :, 1:]
+    return encode_frames(autoencoder, kept)
+
+
+def decode_frames(autoencoder: Autoencoder, latents: Tensor) -> Tensor:
+    """Returns the (B, V, T, H, W, 3) predicted uint8 RGB frames of (B, V, C, F, h, w) latents."""
     video = autoencoder.decode(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
+    if autoencoder.includes_start:
+        video = video[:, :, :, 1:]
     pixels = video.float().add(1.0).mul(127.5).round().clamp(0, 255)
     return pixels.to(torch.uint8).movedim(2, -1)
 
 
 def condition(
-    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, trajectory_frames: Tensor
+    autoencoder: Autoencoder, start_frame: Tensor, trajectory_frames: Tensor
 ) -> Conditioning:
     """Returns the latents to denoise under.
 
@@ -59,25 +79,35 @@ def condition(
             command k.
     """
     control = encode_frames(autoencoder, trajectory_frames)
-    reference, start = _start(autoencoder, start_frame, control.shape[3] - 1)
+    first = control[:, :, :, 0]
+    if not autoencoder.includes_start:
+        control = control[:, :, :, 1:]
+    reference, start = _start(autoencoder, start_frame, control.shape[3])
     return Conditioning(
-        control=control[:, :, :, 1:],
-        start_control=control[:, :, :, 0],
+        control=control,
+        start_control=first,
         start=start,
         reference=reference,
     )
 
 
 def _start(
-    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, num_latent_frames: int
+    autoencoder: Autoencoder, start_frame: Tensor, num_latent_frames: int
 ) -> tuple[Tensor, Tensor]:
-    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot."""
+    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot.
+
+    Where the video begins with the start image, the slot holds it there and is zero behind, as
+    Wan2.1-Fun-Control was trained; else it holds it in every frame.
+    """
     reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
-    return reference, reference.unsqueeze(3).expand(-1, -1, -1, num_latent_frames, -1, -1)
+    slot = reference.unsqueeze(3).expand(-1, -1, -1, num_latent_frames, -1, -1)
+    if autoencoder.includes_start:
+        slot = torch.cat([slot[:, :, :, :1], torch.zeros_like(slot[:, :, :, 1:])], dim=3)
+    return reference, slot
 
 
 def condition_on_actions(
-    autoencoder: SpaceToDepthAutoencoder, start_frame: Tensor, actions: Tensor, num_frames: int
+    autoencoder: Autoencoder, start_frame: Tensor, actions: Tensor, num_frames: int
 ) -> Conditioning:
     """Returns the latents to denoise under where actions are not drawn: no trajectory video.
 
@@ -89,7 +119,7 @@ def condition_on_actions(
         actions: what `ActionEncoding` gives, of the whole batch.
         num_frames: T.
     """
-    reference, start = _start(autoencoder, start_frame, num_frames)
+    reference, start = _start(autoencoder, start_frame, autoencoder.num_latent_frames(num_frames))
     return Conditioning(
         control=torch.zeros_like(start),
         start_control=torch.zeros_like(reference),

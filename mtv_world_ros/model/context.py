@@ -12,6 +12,8 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
+from mtv_world_ros.errors import CheckpointError
+
 
 class Context(NamedTuple):
     """What the cross-attention of a block looks at.
@@ -75,6 +77,32 @@ def _attend(
     parts = [x.unflatten(2, (heads, -1)).transpose(1, 2) for x in (query, key, value)]
     out = F.scaled_dot_product_attention(*parts, attn_mask=mask)
     return out.transpose(1, 2).flatten(2).type_as(query)
+
+
+#: umT5 tokens; Wan's attention splits image from text tokens by this number
+NUM_TEXT_TOKENS = 512
+
+
+def check_tokens(
+    text: Tensor | None, image: Tensor | None, takes_image: bool, num_views: int
+) -> None:
+    """Checks umT5 and CLIP tokens (B, N, any width) for Wan's own cross-attention.
+
+    Raises:
+        CheckpointError: missing, or of another number than the attention counts on.
+    """
+    if text is None or text.shape[1] != NUM_TEXT_TOKENS:
+        given = 'no' if text is None else text.shape[1]
+        raise CheckpointError(
+            f'{given} text tokens given, the model takes {NUM_TEXT_TOKENS}, padded with zeros'
+        )
+    if not takes_image:
+        return
+    if image is None or image.shape[1] % num_views:
+        given = 'no' if image is None else image.shape[1]
+        raise CheckpointError(
+            f'{given} image tokens given for {num_views} views; give as many for each view'
+        )
 
 
 class _NoContext(nn.Module):

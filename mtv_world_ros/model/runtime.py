@@ -44,5 +44,7 @@ def _cpu_has_bfloat16() -> bool:
 def place(module: Module, device: torch.device, dtype: torch.dtype) -> Module:
     """Returns the module on a device, in a number format, images channels-last."""
     nn.Module.to(module, device=device, dtype=dtype)
-    nn.Module.to(module, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    for parameter in module.parameters():
+        if parameter.ndim == 4:  # images; video convolutions have 5 axes and stay as they are
+            parameter.data = parameter.data.to(memory_format=torch.channels_last)
     return module

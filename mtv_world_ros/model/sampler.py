@@ -1,15 +1,17 @@
-"""Flow-matching sampling with diffusers' Euler scheduler."""
+"""Flow-matching sampling with diffusers' schedulers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from diffusers import FlowMatchEulerDiscreteScheduler
 import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.model.conditioning import Conditioning
+from mtv_world_ros.model.parts import Scheduler
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
 
@@ -30,41 +32,80 @@ def flow_of(transformer: MultiViewWanTransformer, out: Tensor, noisy: Tensor, si
 @torch.inference_mode()
 def sample_latents(
     transformer: MultiViewWanTransformer,
-    scheduler: Any,  # its stubs are looser than what it does
+    scheduler: Scheduler,
     conditioning: Conditioning,
     *,
-    seed: int,
+    seeds: Sequence[int],
     num_inference_steps: int,
     should_stop: Callable[[], bool],
+    guidance_scale: float = 1.0,
 ) -> Tensor:
-    """Returns (B, V, C, F, h, w) float32 denoised latents.
+    """Returns (K, V, C, F, h, w) float32 denoised latents, one sample a seed.
 
-    `scheduler` is a diffusers `FlowMatchEulerDiscreteScheduler`. The noise is drawn on the CPU, so
-    a seed gives the same rollout on every device.
+    The noise of a seed is drawn on the CPU and by itself, so a seed gives the same rollout on
+    every device and in every company.
+
+    Args:
+        transformer: the model.
+        scheduler: noise levels, shift and step rule.
+        conditioning: of one chunk (batch 1); all samples are denoised under it.
+        seeds: K seeds of the noise.
+        num_inference_steps: denoising steps.
+        should_stop: asked between steps.
+        guidance_scale: how far to go from what `conditioning.negative_text` gives to what
+            `conditioning.text` gives; 1 = no guidance, and half the work.
 
     Raises:
         RolloutPreempted: `should_stop` said so between two steps.
     """
-    shape = conditioning.control.shape
+    shape = conditioning.control.shape[1:]
     device = conditioning.control.device
-    generator = torch.Generator().manual_seed(seed)
-    latents = torch.randn(shape, generator=generator).to(device)
-    sigmas = torch.linspace(1.0, 1.0 / num_inference_steps, num_inference_steps).tolist()
-    scheduler.set_timesteps(sigmas=sigmas, device=device)
-    for step, timestep in enumerate(scheduler.timesteps):
+    noise = [torch.randn(1, *shape, generator=torch.Generator().manual_seed(s)) for s in seeds]
+    latents = torch.cat(noise).to(device)
+    conditioning = conditioning.repeated(len(seeds))
+    set_timesteps(scheduler, num_inference_steps, device)
+    timesteps: Any = scheduler.timesteps  # the stubs are looser than the schedulers
+    sigmas: Any = scheduler.sigmas
+    for step, timestep in enumerate(timesteps):
         if should_stop():
             raise RolloutPreempted(
                 f'given up after {step} of {num_inference_steps} denoising steps'
             )
-        out = transformer(
-            latents.to(transformer.dtype),
-            timestep.expand(shape[0]),
-            control=conditioning.control,
-            start=conditioning.start,
-            reference=conditioning.reference,
-            start_control=conditioning.start_control,
-            actions=conditioning.actions,
-        ).float()
-        flow = flow_of(transformer, out, latents, scheduler.sigmas[step].to(device))
-        latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]
+        out = _predict(transformer, latents, timestep, conditioning, conditioning.text)
+        if guidance_scale != 1.0 and conditioning.negative_text is not None:
+            away = _predict(
+                transformer, latents, timestep, conditioning, conditioning.negative_text
+            )
+            out = away + guidance_scale * (out - away)
+        flow = flow_of(transformer, out, latents, sigmas[step].to(device))
+        latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]  # type: ignore[arg-type]
     return latents
+
+
+def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.device) -> None:
+    """Spreads the steps over the noise levels, from 1 down; the scheduler shifts them."""
+    if isinstance(scheduler, FlowMatchEulerDiscreteScheduler):
+        sigmas = torch.linspace(1.0, 1.0 / num_inference_steps, num_inference_steps).tolist()
+        scheduler.set_timesteps(sigmas=sigmas, device=device)
+    else:
+        scheduler.set_timesteps(num_inference_steps, device=device)
+
+
+def _predict(
+    transformer: MultiViewWanTransformer,
+    latents: Tensor,
+    timestep: Tensor,
+    conditioning: Conditioning,
+    text: Tensor | None,
+) -> Tensor:
+    return transformer(
+        latents.to(transformer.dtype),
+        timestep.expand(len(latents)),
+        control=conditioning.control,
+        start=conditioning.start,
+        reference=conditioning.reference,
+        start_control=conditioning.start_control,
+        encoder_hidden_states=text,
+        encoder_hidden_states_image=conditioning.image,
+        actions=conditioning.actions,
+    ).float()

@@ -15,7 +15,7 @@ from torch import nn, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.context import fit_cross_attention
+from mtv_world_ros.model.context import check_tokens, fit_cross_attention
 from mtv_world_ros.model.control import build_control
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.stem import ConvStem, ReferenceDecoder, ReferenceStem
@@ -165,13 +165,19 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             actions_kept: (B,) bool, False = a sample without its actions; see `ActionControl`.
 
         Raises:
-            CheckpointError: more views than the model has embeddings for.
+            CheckpointError: more views than the model has embeddings for, or text or image tokens
+                that are missing or of another number.
         """
         num_views = hidden_states.shape[1]
         if num_views > self.view_embedding.shape[0]:
             raise CheckpointError(
                 f'{num_views} views given, the model was built for '
                 f'{self.view_embedding.shape[0]}; set `views` to those, or train with num_views'
+            )
+        if self.with_text and self.action_control is None:
+            takes_image = self.config['added_kv_proj_dim'] is not None
+            check_tokens(
+                encoder_hidden_states, encoder_hidden_states_image, takes_image, num_views
             )
         if encoder_hidden_states is None:
             encoder_hidden_states = hidden_states.new_zeros(hidden_states.shape[0], 1, 1)

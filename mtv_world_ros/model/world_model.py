@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError
-from mtv_world_ros.model.actions import collate
+from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
@@ -19,6 +20,7 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     decode_frames,
 )
+from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
 
@@ -57,7 +59,13 @@ class DiffusionWorldModel:
         self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self.scheduler = checkpoint.scheduler
+        self.card = checkpoint.card
         self.spec = spec_of(checkpoint.card)
+        check_video(self.autoencoder, self.transformer.config, self.spec)
+        self.text_encoder = checkpoint.text_encoder
+        self.image_encoder = checkpoint.image_encoder
+        if self.image_encoder is not None:
+            self.image_encoder.to(self.device, dtype)
 
     def predict(
         self,
@@ -70,6 +78,29 @@ class DiffusionWorldModel:
         should_stop: Callable[[], bool],
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
+        return self.predict_batch(
+            start_frame,
+            trajectory_frames,
+            positions=positions,
+            seeds=[seed],
+            num_inference_steps=num_inference_steps,
+            should_stop=should_stop,
+        )[0]
+
+    def predict_batch(
+        self,
+        start_frame: ByteArray,
+        trajectory_frames: ByteArray,
+        *,
+        positions: FloatArray,
+        seeds: Sequence[int],
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+    ) -> ByteArray:
+        """Returns (K, V, T, H, W, 3) uint8 RGB frames: one prediction a seed, in one batch.
+
+        The other arguments and the errors are those of `predict`.
+        """
         try:
             with torch.inference_mode():
                 conditioning = self._condition(start_frame, trajectory_frames, positions)
@@ -77,12 +108,15 @@ class DiffusionWorldModel:
                     self.transformer,
                     self.scheduler,
                     conditioning,
-                    seed=seed,
+                    seeds=seeds,
                     num_inference_steps=num_inference_steps,
                     should_stop=should_stop,
+                    guidance_scale=float(self.card.get('guidance_scale', 1.0)),
                 )
-                frames = decode_frames(self.autoencoder, latents.to(self.autoencoder.dtype))
-                return frames[0].cpu().numpy()
+                latents = latents.to(self.autoencoder.dtype)
+                # one at a time: decoding takes more memory than denoising
+                frames = [decode_frames(self.autoencoder, one[None]) for one in latents]
+                return torch.cat(frames).cpu().numpy()
         except (torch.OutOfMemoryError, MemoryError) as error:
             raise self._out_of_memory(trajectory_frames, error) from error
         except RuntimeError as error:
@@ -95,11 +129,34 @@ class DiffusionWorldModel:
     ) -> Conditioning:
         start = self._tensor(start_frame)
         if self.actions is None:
-            return condition(self.autoencoder, start, self._tensor(trajectory_frames))
+            latents = condition(self.autoencoder, start, self._tensor(trajectory_frames))
+        else:
+            latents = self._condition_on_actions(self.actions, start, positions)
+        return self._with_context(latents, start)
+
+    def _condition_on_actions(
+        self, actions: ActionEncoding, start: torch.Tensor, positions: FloatArray
+    ) -> Conditioning:
         assert self.robot is not None
-        encoded = collate([self.actions.encode(self.robot, positions)])
-        actions = torch.from_numpy(encoded).to(self.device)
-        return condition_on_actions(self.autoencoder, start, actions, self.spec.num_frames)
+        encoded = torch.from_numpy(collate([actions.encode(self.robot, positions)]))
+        return condition_on_actions(
+            self.autoencoder, start, encoded.to(self.device), self.spec.num_frames
+        )
+
+    def _with_context(self, latents: Conditioning, start: torch.Tensor) -> Conditioning:
+        """Adds the prompt's and the start images' tokens, in models with text."""
+        if self.text_encoder is None or self.image_encoder is None:
+            return latents
+        dtype = self.transformer.dtype
+        negative = None
+        if self.card.get('guidance_scale', 1.0) != 1.0:
+            negative = self.text_encoder.encode(self.card.get('negative_prompt', ''), self.device)
+        return replace(
+            latents,
+            text=self.text_encoder.encode(self.card.get('prompt', ''), self.device).to(dtype),
+            negative_text=None if negative is None else negative.to(dtype),
+            image=self.image_encoder.encode(start[0]).flatten(0, 1)[None].to(dtype),
+        )
 
     def _tensor(self, frames: ByteArray) -> torch.Tensor:
         return torch.from_numpy(np.array(frames))[None].to(self.device)

@@ -38,7 +38,7 @@ def sample(prediction: str = 'sample', steps: int = 4, should_stop=lambda: False
         Oracle(prediction),  # type: ignore[arg-type]
         FlowMatchEulerDiscreteScheduler(shift=5.0),
         conditioning,
-        seed=seed,
+        seeds=[seed],
         num_inference_steps=steps,
         should_stop=should_stop,
     )

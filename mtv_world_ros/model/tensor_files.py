@@ -1,0 +1,180 @@
+"""Tensors on disk: safetensors files seen as one table, read one tensor at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+import json
+from math import prod
+from pathlib import Path
+import re
+from typing import Any
+
+from safetensors import safe_open, SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
+
+from mtv_world_ros.errors import CheckpointError
+
+PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
+INDEX = '.safetensors.index.json'
+_SHARD = re.compile(r'-(\d+)-of-(\d+)\.safetensors$')
+#: tensors are gathered up to so many bytes before they are written
+SHARD_BYTES = 2 * 2**30
+_BYTES = {'F64': 8, 'F32': 4, 'F16': 2, 'BF16': 2, 'I64': 8, 'I32': 4, 'F8_E4M3': 1}
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTensor:
+    """A tensor that has not been read.
+
+    Attributes:
+        shape: its shape.
+        dtype: its number format in safetensors' words, e.g. `BF16`.
+        read: reads it.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    read: Callable[[], Tensor]
+
+    @property
+    def num_bytes(self) -> int:
+        """Its size on disk."""
+        return prod(self.shape) * _BYTES.get(self.dtype, 8)
+
+
+def open_tensors(path: Path, stem: str = '') -> dict[str, StoredTensor]:
+    """Returns the tensors of a safetensors file, or of a folder's files or shards, by name.
+
+    Args:
+        path: a `.safetensors` file, an index, or a folder.
+        stem: what the names of the folder's files begin with.
+
+    Raises:
+        CheckpointError: nothing there, a pickle, a shard is missing or damaged.
+    """
+    if path.is_dir():
+        return _open_folder(path, stem)
+    if path.suffix in PICKLES:
+        raise pickle_error([path])
+    if not path.is_file():
+        raise CheckpointError(f"'{path}' does not exist; name a .safetensors file or a folder")
+    if path.name.endswith(INDEX):
+        return _open_index(path)
+    if path.suffix != '.safetensors':
+        raise CheckpointError(f"'{path}' is no .safetensors file; only those are read")
+    return _open_files([path])
+
+
+def pickle_error(files: Iterable[Path]) -> CheckpointError:
+    """Returns the error for files that are pickles, and what to give in their place."""
+    names = sorted(str(file) for file in files)
+    return CheckpointError(
+        f'{names} may be pickles, which can run code and are never read; expected '
+        '.safetensors: take a public conversion (DiffSynth-Studio/Wan-Series-Converted-Safetensors'
+        ', Comfy-Org/Wan_2.1_ComfyUI_repackaged, a diffusers folder of Wan-AI)'
+    )
+
+
+def _open_folder(folder: Path, stem: str) -> dict[str, StoredTensor]:
+    indices = sorted(folder.glob(f'{stem}*{INDEX}'))
+    if indices:
+        return _open_index(indices[0])
+    files = sorted(folder.glob(f'{stem}*.safetensors'))
+    if not files:
+        pickles = [f for f in folder.glob(f'{stem}*') if f.suffix in PICKLES]
+        if pickles:
+            raise pickle_error(pickles)
+        raise CheckpointError(f"'{folder}' holds no {stem}*.safetensors")
+    _check_shards(files)
+    return _open_files(files)
+
+
+def _check_shards(files: list[Path]) -> None:
+    """Shards without an index say in their names how many there are."""
+    numbers = [match for file in files if (match := _SHARD.search(file.name))]
+    if not numbers:
+        return
+    have = {int(match[1]) for match in numbers}
+    missing = sorted(set(range(1, int(numbers[0][2]) + 1)) - have)
+    if missing:
+        raise CheckpointError(
+            f"'{files[0].parent}' lacks shards {missing} of {numbers[0][2]}; has "
+            f'{sorted(file.name for file in files)}: copy the missing ones there'
+        )
+
+
+def _open_index(path: Path) -> dict[str, StoredTensor]:
+    try:
+        places: dict[str, str] = json.loads(path.read_text())['weight_map']
+    except (OSError, ValueError, KeyError) as error:
+        raise CheckpointError(f"'{path}' is no index of shards: {error}") from error
+    files = sorted({path.parent / name for name in places.values()})
+    missing = sorted(file.name for file in files if not file.is_file())
+    if missing:
+        raise CheckpointError(
+            f"'{path.parent}' lacks the shards {missing} that '{path.name}' names; copy them there"
+        )
+    tensors = _open_files(files)
+    absent = sorted(set(places) - set(tensors))
+    if absent:
+        raise CheckpointError(
+            f"the shards of '{path}' lack {len(absent)} tensors that it names, the first "
+            f"'{absent[0]}'; copy the shards again"
+        )
+    return tensors
+
+
+def _open_files(files: list[Path]) -> dict[str, StoredTensor]:
+    tensors: dict[str, StoredTensor] = {}
+    for file in files:
+        try:
+            handle: Any = safe_open(file, framework='pt')
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
+        names: list[str] = handle.keys()
+        for name in names:
+            if name in tensors:
+                raise CheckpointError(f"tensor '{name}' is in '{file}' and in another shard")
+            tensors[name] = _stored(handle, name)
+    return tensors
+
+
+def _stored(handle: Any, name: str) -> StoredTensor:
+    part = handle.get_slice(name)
+    return StoredTensor(tuple(part.get_shape()), part.get_dtype(), lambda: handle.get_tensor(name))
+
+
+def write_tensors(
+    tensors: dict[str, StoredTensor], folder: Path, stem: str, *, shard_bytes: int = SHARD_BYTES
+) -> None:
+    """Writes tensors as diffusers and transformers do: one file, or shards and their index.
+
+    Holds no more than one shard in memory.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shards = _plan(tensors, shard_bytes)
+    places = {}
+    for number, names in enumerate(shards, start=1):
+        many = f'-{number:05d}-of-{len(shards):05d}' if len(shards) > 1 else ''
+        file = f'{stem}{many}.safetensors'
+        values = {name: tensors[name].read().contiguous() for name in names}
+        save_file(values, folder / file, metadata={'format': 'pt'})
+        places |= dict.fromkeys(names, file)
+    if len(shards) > 1:
+        total = sum(tensor.num_bytes for tensor in tensors.values())
+        index = {'metadata': {'total_size': total}, 'weight_map': places}
+        (folder / f'{stem}{INDEX}').write_text(json.dumps(index, indent=2) + '\n')
+
+
+def _plan(tensors: dict[str, StoredTensor], shard_bytes: int) -> list[list[str]]:
+    shards: list[list[str]] = [[]]
+    held = 0
+    for name, tensor in tensors.items():
+        if shards[-1] and held + tensor.num_bytes > shard_bytes:
+            shards.append([])
+            held = 0
+        shards[-1].append(name)
+        held += tensor.num_bytes
+    return shards

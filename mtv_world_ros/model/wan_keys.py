@@ -1,0 +1,158 @@
+"""Which tensor of a public Wan 2.1 checkpoint is which of ours.
+
+Names of the original layout (Wan, VideoX-Fun, DiffSynth) and of diffusers and transformers are
+both read; the maps of transformer and autoencoder are diffusers' own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+import re
+
+from diffusers.loaders.single_file_utils import (
+    convert_wan_transformer_to_diffusers,
+    convert_wan_vae_to_diffusers,
+)
+
+#: what repackaged files put before every name
+_PREFIXES = ('model.diffusion_model.', 'diffusion_model.', 'model.', 'vae.', 'pipe.dit.')
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """Where a tensor comes from: a source, or one of several equal parts of it along axis 0."""
+
+    source: str
+    part: int = 0
+    num_parts: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class KeyMap:
+    """How a file's tensors become a model's.
+
+    Attributes:
+        takes: by our name.
+        unused: names that the model has no use for, and why.
+    """
+
+    takes: dict[str, Take]
+    unused: dict[str, str] = field(default_factory=dict)
+
+
+def transformer_keys(names: Iterable[str]) -> KeyMap:
+    """The transformer, of VideoX-Fun's or diffusers' names."""
+    bare = _without_prefix(names)
+    if 'head.head.weight' in bare:
+        ours = convert_wan_transformer_to_diffusers({name: name for name in bare})
+    else:
+        ours = {name: name for name in bare}
+    return KeyMap({new: Take(bare[old]) for new, old in ours.items()})
+
+
+def autoencoder_keys(names: Iterable[str]) -> KeyMap:
+    """The autoencoder, of Wan's or diffusers' names."""
+    bare = _without_prefix(names)
+    original = 'encoder.conv1.weight' in bare
+    ours = convert_wan_vae_to_diffusers({n: n for n in bare}) if original else {n: n for n in bare}
+    return KeyMap({new: Take(bare[old]) for new, old in ours.items()})
+
+
+_UMT5 = {
+    'norm1': 'layer.0.layer_norm',
+    'attn.q': 'layer.0.SelfAttention.q',
+    'attn.k': 'layer.0.SelfAttention.k',
+    'attn.v': 'layer.0.SelfAttention.v',
+    'attn.o': 'layer.0.SelfAttention.o',
+    'pos_embedding.embedding': 'layer.0.SelfAttention.relative_attention_bias',
+    'norm2': 'layer.1.layer_norm',
+    'ffn.gate.0': 'layer.1.DenseReluDense.wi_0',
+    'ffn.fc1': 'layer.1.DenseReluDense.wi_1',
+    'ffn.fc2': 'layer.1.DenseReluDense.wo',
+}
+
+
+def text_encoder_keys(names: Iterable[str]) -> KeyMap:
+    """umT5's encoder, of Wan's or transformers' names."""
+    bare = _without_prefix(names)
+    takes: dict[str, Take] = {}
+    unused: dict[str, str] = {}
+    for name, source in bare.items():
+        block = re.fullmatch(r'blocks\.(\d+)\.(.+)\.weight', name)
+        if block and block[2] in _UMT5:
+            takes[f'encoder.block.{block[1]}.{_UMT5[block[2]]}.weight'] = Take(source)
+        elif name == 'encoder.embed_tokens.weight' and 'shared.weight' in bare:
+            unused[source] = 'the same as shared.weight'
+        elif name in ('token_embedding.weight', 'encoder.embed_tokens.weight'):
+            takes['shared.weight'] = Take(source)
+        elif name == 'norm.weight':
+            takes['encoder.final_layer_norm.weight'] = Take(source)
+        else:
+            takes[name] = Take(source)
+    return KeyMap(takes, unused)
+
+
+_CLIP = {
+    'norm1': 'layer_norm1',
+    'norm2': 'layer_norm2',
+    'attn.proj': 'self_attn.out_proj',
+    'mlp.0': 'mlp.fc1',
+    'mlp.2': 'mlp.fc2',
+}
+_CLIP_ONCE = {
+    'visual.patch_embedding.weight': 'embeddings.patch_embedding.weight',
+    'visual.cls_embedding': 'embeddings.class_embedding',
+    'visual.pos_embedding': 'embeddings.position_embedding.weight',
+    'visual.pre_norm.weight': 'pre_layrnorm.weight',
+    'visual.pre_norm.bias': 'pre_layrnorm.bias',
+    'visual.post_norm.weight': 'post_layernorm.weight',
+    'visual.post_norm.bias': 'post_layernorm.bias',
+}
+_CLIP_UNUSED = {
+    'textual.': "CLIP's text side; text comes from umT5",
+    'log_scale': "CLIP's temperature",
+    'logit_scale': "CLIP's temperature",
+    'visual.head': 'the projection behind the features that are used',
+    'visual_projection.': 'the projection behind the features that are used',
+    'vision_model.embeddings.position_ids': 'a range of numbers',
+    'embeddings.position_ids': 'a range of numbers',
+}
+
+
+def image_encoder_keys(names: Iterable[str]) -> KeyMap:
+    """CLIP's image side, of Wan's or transformers' names."""
+    takes: dict[str, Take] = {}
+    unused: dict[str, str] = {}
+    for name, source in _without_prefix(names).items():
+        reason = next((why for start, why in _CLIP_UNUSED.items() if name.startswith(start)), '')
+        if reason:
+            unused[source] = reason
+        elif name in _CLIP_ONCE:
+            takes[_CLIP_ONCE[name]] = Take(source)
+        else:
+            takes |= _clip_layer(name, source)
+    return KeyMap(takes, unused)
+
+
+def _clip_layer(name: str, source: str) -> dict[str, Take]:
+    layer = re.fullmatch(r'visual\.transformer\.(\d+)\.(.+)\.(weight|bias)', name)
+    if not layer:
+        return {name.removeprefix('vision_model.'): Take(source)}
+    index, module, kind = layer.groups()
+    ours = f'encoder.layers.{index}'
+    if module == 'attn.to_qkv':
+        return {
+            f'{ours}.self_attn.{part}_proj.{kind}': Take(source, number, 3)
+            for number, part in enumerate('qkv')
+        }
+    return {f'{ours}.{_CLIP.get(module, module)}.{kind}': Take(source)}
+
+
+def _without_prefix(names: Iterable[str]) -> dict[str, str]:
+    """Bare name to name in the file; a prefix goes only where every name has it."""
+    listed = list(names)
+    for prefix in _PREFIXES:
+        if listed and all(name.startswith(prefix) for name in listed):
+            return {name.removeprefix(prefix): name for name in listed}
+    return {name: name for name in listed}
