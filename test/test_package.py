@@ -22,6 +22,7 @@ MODULES = sorted((ROOT / 'mtv_world_ros').rglob('*.py'))
 #: imported name -> the distribution that setup.py asks for, where they differ
 DISTRIBUTIONS = {
     'PIL': 'pillow',
+    'coal': 'pin',  # which requires it
     'cv2': 'opencv-python-headless',
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',
