@@ -35,6 +35,7 @@ def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
         ConfigError: there is no such file.
         CheckpointError: it holds something else.
     """
+    _check_file(weights, 'fid_weights')
     import torch
 
     from mtv_world_ros.evaluation.inception import InceptionV3
@@ -68,6 +69,7 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
 
 
 def _i3d(weights: Path, device: str) -> ClipFeatures:
+    _check_file(weights, 'fvd_weights')
     import torch
 
     from mtv_world_ros.evaluation.i3d import I3D, MIN_FRAMES
@@ -150,11 +152,14 @@ def _of_network(state: dict[str, Any], network: torch.nn.Module) -> dict[str, An
     }
 
 
-def _state_dict(path: Path, option: str) -> dict[str, Any]:
+def _check_file(path: Path, option: str) -> None:
     if not path.is_file():
         raise ConfigError(
             f"{option} '{path}' does not exist; nothing is downloaded, name a file that you have"
         )
+
+
+def _state_dict(path: Path, option: str) -> dict[str, Any]:
     if path.suffix == '.safetensors':
         from safetensors.torch import load_file
 

@@ -153,3 +153,109 @@ def test_success_estimates_are_compared_with_the_outcome(make_pipeline, episodes
     assert metrics['success']['num_outcomes_known'] == 3
     assert metrics['success']['real_success_rate'] == pytest.approx(2 / 3)
     assert metrics['seconds_per_chunk'] > 0
+
+
+def test_every_number_has_an_interval_beside_it(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path)
+    for view in metrics['views'].values():
+        named = {'j_object_mean', 'j_union', 'j_moving', 'j_copy_moving', 'j_shuffled_moving'}
+        named |= {'skill', 'j_visible', 'j_ceiling', 'fid', 'fvd', 'psnr', 'ssim', 'lpips'}
+        assert named <= set(view) and named <= set(view['intervals'])
+        low, high = view['intervals']['j_moving']
+        assert low <= view['j_moving'] <= high
+        assert view['psnr'] is view['intervals']['psnr'][0] is None
+
+
+def test_j_by_frame_falls_as_the_held_frame_ages_and_has_a_band(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path, mode='imagine')
+    low = metrics['views']['low']
+    assert len(low['j_moving_by_frame']) == len(low['j_moving_by_frame_interval']) == 9
+    assert low['j_moving_by_frame'] == sorted(low['j_moving_by_frame'], reverse=True)
+    assert low['j_moving_by_frame'] == low['j_copy_moving_by_frame']
+    band = low['j_moving_by_frame_interval'][0]
+    assert band[0] < low['j_moving_by_frame'][0] < band[1]
+
+
+def test_held_and_mirrored_actions_are_scored_beside_the_true_ones(
+    make_pipeline, episodes, oracle, tmp_path
+):
+    actions = ('true', 'shuffled', 'zero', 'mirrored')
+    metrics, table = run(make_pipeline(oracle), episodes, tmp_path, actions=actions)
+    for view in metrics['views'].values():
+        # under any other actions the oracle holds the first frame
+        for name in ('zero', 'mirrored', 'shuffled'):
+            assert view[f'j_{name}_moving'] == view['j_copy_moving']
+        assert view['margin_of_shuffled'] == 0.0 and view['j_self'] == 1.0
+    assert 'imagined, mirrored actions' in table and 'imagined, joints held' in table
+    assert metrics['actions'] == list(actions)
+
+
+def test_actions_that_the_robot_cannot_do_are_noted_and_not_scored(
+    make_pipeline, make_episode, tmp_path
+):
+    reaching = make_episode(tmp_path / 'reaching', offset=2.7, reach=0.0)
+    metrics, table = run(
+        make_pipeline(), [reaching], tmp_path / 'out', actions=('true', 'mirrored')
+    )
+    assert metrics['views']['low']['j_mirrored_moving'] is None
+    assert metrics['views']['low']['j_moving'] is not None
+    (note,) = metrics['notes']['reaching']
+    assert 'mirrored actions were not imagined' in note and note in table
+
+
+def test_true_frames_score_the_segmenters_own_ceiling_against_the_simulators_masks(
+    make_pipeline, episodes, tmp_path
+):
+    metrics, table = run(make_pipeline(), episodes, tmp_path, use_ids=True)
+    assert 0.8 < metrics['overall']['j_self_moving'] <= 1.0
+    assert metrics['overall']['j_ceiling'] is None  # no autoencoder
+    assert 'recorded frames' in table and 'through the autoencoder' not in table
+
+
+def test_ceiling_is_not_measured_unless_asked_for(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes[:1], tmp_path, ceiling=False)
+    assert metrics['overall']['j_self'] is None
+
+
+def test_quality_of_pictures_is_measured_by_view(make_pipeline, episodes, oracle, tmp_path):
+    quality = ('psnr', 'ssim')
+    perfect, table = run(make_pipeline(oracle), episodes[:2], tmp_path / 'a', quality=quality)
+    still, _ = run(make_pipeline(), episodes[:2], tmp_path / 'b', quality=quality)
+    for view in ('low', 'high'):
+        assert perfect['views'][view]['ssim'] == pytest.approx(1, abs=1e-3)
+        assert still['views'][view]['ssim'] < 0.99
+        assert still['views'][view]['psnr'] < 30 < perfect['views'][view]['psnr']
+    assert 'PSNR [dB]' in table
+
+
+def test_statuses_are_counted_in_the_tables(make_pipeline, make_episode, tmp_path):
+    path = make_episode(tmp_path / 'episode', objects=('red block', 'wooden spoon'))
+    _, table = run(make_pipeline(), [path], tmp_path / 'out')
+    assert '| true: out_of_palette | 2   | 2    |' in table
+
+
+def test_damaged_episode_is_noted_or_listed_never_scored_in_silence(
+    make_pipeline, make_episode, episodes, tmp_path
+):
+    cut, garbage = make_episode(tmp_path / 'cut'), make_episode(tmp_path / 'garbage')
+    file = next(cut.glob('*.mcap'))
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.9)])
+    next(garbage.glob('*.mcap')).write_bytes(b'no recording at all')
+    metrics, table = run(make_pipeline(), [*episodes[:1], cut, garbage], tmp_path / 'out')
+    assert list(metrics['failed']) == [str(garbage)] and str(garbage) in table
+    assert metrics['notes']['cut'] and 'cut' in table
+    assert metrics['num_episodes'] == 2 and metrics['num_episodes_failed'] == 1
+
+
+def test_time_of_an_episode_is_split_by_stage(make_pipeline, episodes, tmp_path):
+    metrics, _ = run(make_pipeline(), episodes, tmp_path)
+    seconds = metrics['seconds_per_episode']
+    assert set(seconds) == {
+        'reading',
+        'imagining',
+        'segmenting',
+        'scoring',
+        'features',
+        'storing',
+    }
+    assert seconds['imagining'] > 0 and seconds['segmenting'] > 0

@@ -55,6 +55,63 @@ def test_void_pixels_leave_intersection_and_union():
     assert jaccard(pred, true, np.ones_like(void)) == 1.0
 
 
+def by_pixel_sets(pred, true, void):
+    """The DAVIS 2017 measure of one frame, from its definition over sets of pixels."""
+    pixels = [{tuple(p) for p in np.argwhere(mask)} for mask in (pred, true, void)]
+    either = (pixels[0] | pixels[1]) - pixels[2]
+    both = (pixels[0] & pixels[1]) - pixels[2]
+    return len(both) / len(either) if either else 1.0
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_random_masks_score_as_counted_over_sets_of_pixels(seed):
+    rng = np.random.default_rng(seed)
+    # small and sparse, so that some masks are empty or wholly void
+    shape = (4, 5, 3, 4)
+    pred, true, void = (
+        rng.random(shape) < rng.choice([0, 0.1, 0.5, 0.9, 1], (*shape[:2], 1, 1)) for _ in range(3)
+    )
+    expected = [
+        [by_pixel_sets(pred[i, j], true[i, j], void[i, j]) for j in range(5)] for i in range(4)
+    ]
+    assert np.allclose(jaccard(pred, true, void), expected)
+    nothing = np.zeros(shape, bool)
+    expected = [
+        [by_pixel_sets(pred[i, j], true[i, j], nothing[i, j]) for j in range(5)] for i in range(4)
+    ]
+    assert np.allclose(jaccard(pred, true), expected)
+
+
+@pytest.mark.parametrize(
+    ('pred', 'true', 'void', 'expected'),
+    [
+        ('....', '....', 'xxxx', 1.0),  # all void: nothing is wrong
+        ('xx..', '..xx', 'xxxx', 1.0),
+        ('x...', '....', 'x...', 1.0),  # the only false pixel is void
+        ('xx..', '....', 'x...', 0.0),
+        ('....', 'xx..', 'x...', 0.0),
+        ('xxx.', 'x.xx', '.x..', 2 / 3),  # 0 and 2 of 0, 2 and 3
+        ('xxx.', 'x.xx', 'x..x', 1 / 2),
+    ],
+)
+def test_empty_and_void_cases_counted_by_hand(pred, true, void, expected):
+    masks = [np.array([[c == 'x' for c in text]]) for text in (pred, true, void)]
+    assert jaccard(*masks) == pytest.approx(expected)
+
+
+def test_void_pixels_leave_the_scores_of_objects_and_of_their_union():
+    a, b = square(0, 0, 10), square(20, 0, 10)
+    wrong = a.copy()
+    wrong[40:44, 60:65] = True
+    void = np.zeros((1, 1, 60, 90), bool)
+    void[..., 40:44, 60:65] = True
+    true, pred = objects([[[a], [b]]]), objects([[[wrong], [b]]])
+    assert object_scores(pred, true).objects[0, 0] == pytest.approx(100 / 120)
+    assert object_scores(pred, true).union[0] == pytest.approx(200 / 220)
+    cleared = object_scores(pred, true, void)
+    assert cleared.objects.tolist() == [[1.0, 1.0]] and cleared.union.tolist() == [1.0]
+
+
 def test_leading_axes_are_kept():
     assert jaccard(np.zeros((2, 3, 4, 5), bool), np.zeros((2, 3, 4, 5), bool)).shape == (2, 3)
 
