@@ -35,8 +35,9 @@ class Evaluated:
 
     @property
     def name(self) -> str:
-        """Of the checkpoint."""
-        return self.metrics['name'] or 'no name'
+        """Of the checkpoint: what the user calls it, and its fingerprint."""
+        name, label = self.metrics['name'], self.metrics.get('label', '')
+        return ' · '.join(part for part in (label, name) if part) if label not in name else name
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -53,8 +54,8 @@ class Evaluated:
         return load_rollout(path) if episode in self.results and path.is_file() else None
 
 
-def read_evaluated(folder: Path) -> Evaluated:
-    """Reads what `mtv-world evaluate --out FOLDER` wrote.
+def read_evaluations(folder: Path) -> list[Evaluated]:
+    """Reads what `mtv-world evaluate --out FOLDER` wrote: one evaluation, or one per checkpoint.
 
     Raises:
         ConfigError: the folder holds no evaluation, or one of another version.
@@ -65,15 +66,24 @@ def read_evaluated(folder: Path) -> Evaluated:
         raise ConfigError(f"'{folder}' holds no evaluation (metrics.json); {hint}")
     try:
         metrics = json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
-        results = {name: _result(folder, name) for name in metrics['episodes']}
-        missing = sorted(_NEEDED - set(metrics))
-        if missing:
-            raise KeyError(', '.join(missing))
+        if 'methods' not in metrics:
+            return [_read(folder, metrics)]
+        parts = [read_evaluations(file.parent)[0] for file in folder.glob('*/metrics.json')]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"the evaluation in '{folder}' cannot be read "
             f'({type(error).__name__}: {error}); {hint}'
         ) from error
+    labels = list(metrics['methods'])
+    found = [part for part in parts if part.metrics.get('label') in labels]
+    return sorted(found, key=lambda part: labels.index(part.metrics['label']))
+
+
+def _read(folder: Path, metrics: dict[str, Any]) -> Evaluated:
+    results = {name: _result(folder, name) for name in metrics['episodes']}
+    missing = sorted(_NEEDED - set(metrics))
+    if missing:
+        raise KeyError(', '.join(missing))
     return Evaluated(folder=folder, metrics=metrics, results=results)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.evaluation.evaluated import Evaluated, Pick, picks, read_evaluated
+from mtv_world_ros.evaluation.evaluated import Evaluated, Pick, picks, read_evaluations
 from mtv_world_ros.evaluation.markup import data_uri, element, join, Markup
 from mtv_world_ros.evaluation.report_clips import Clip, make_clip
 from mtv_world_ros.evaluation.report_details import (
@@ -56,9 +56,10 @@ def write_report(folders: Sequence[Path], path: Path) -> Path:
     Raises:
         ConfigError: none is given, or one holds no evaluation.
     """
-    if not folders:
+    evaluations = [found for folder in folders for found in read_evaluations(folder)]
+    if not evaluations:
         raise ConfigError('a report needs at least one evaluation; give the folders of them')
-    write_text(path, page([read_evaluated(folder) for folder in folders]))
+    write_text(path, page(evaluations))
     return path
 
 

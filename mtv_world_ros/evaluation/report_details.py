@@ -16,7 +16,7 @@ from mtv_world_ros.evaluation.report_numbers import badge, hue, letter, number
 _NUM_BINS = 5
 _WILSON_Z = 1.959964
 #: parts of metrics.json that have sections of their own
-_SHOWN = {'name', 'provenance', 'failed', 'notes', 'episodes', 'success'}
+_SHOWN = {'name', 'label', 'provenance', 'failed', 'notes', 'episodes', 'success'}
 _SHOWN |= {'views', 'overall', 'tasks', 'zero_shot'}
 
 
@@ -168,7 +168,7 @@ def provenance_section(evaluations: Sequence[Evaluated]) -> Markup:
     """Returns how the numbers came about."""
     parts = []
     for index, found in enumerate(evaluations):
-        lines = {'checkpoint': found.name, **found.metrics['provenance']}
+        lines = {'checkpoint': found.metrics['name'], **found.metrics['provenance']}
         lines |= {'results': str(found.folder)}
         lines |= {key: _flat(v) for key, v in found.metrics.items() if key not in _SHOWN}
         items = [

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from mtv_world_ros.evaluation.evaluated import Evaluated
 from mtv_world_ros.evaluation.markup import element, join, Markup, table
@@ -19,18 +20,30 @@ QUALITY = {
 }
 
 
+class _Row(NamedTuple):
+    """A row of the paper's tables: numbers by view, and which of them."""
+
+    label: str
+    views: Mapping[str, Mapping[str, Any]]
+    keys: Sequence[str]
+
+
+#: FID, FVD, J of all objects and of those that move; of a model, and of the first frame held
+_MODEL = ('fid', 'fvd', 'j_union', 'j_moving')
+_HELD = ('', '', 'j_copy_union', 'j_copy_moving')
+#: the zero-shot set that is none
+_SEEN = 'seen'
+
+
 def paper_tables(evaluations: Sequence[Evaluated]) -> Markup:
     """Returns method by view and task by view in the form of the paper's tables 1 and 3."""
     views = all_views(evaluations)
-    head = ['Method', *(f'{view} {what}' for view in views for what in ('FID ↓', 'FVD ↓', 'J ↑'))]
-    rows = [
-        [_name(index, evaluations), *_method_cells(found, views, 'j_union')]
-        for index, found in enumerate(evaluations)
-    ]
-    held = [f'{_name(0, evaluations)}: first frame held']
-    for view in views:
-        copy = evaluations[0].metrics['views'].get(view, {}).get('j_copy_union')
-        held += ['–', '–', number(copy)]
+    columns = ('FID ↓', 'FVD ↓', 'J ↑', 'J moving ↑')
+    head = ['Method', *(f'{view} {what}' for view in views for what in columns)]
+    rows = []
+    for row in _rows(evaluations):
+        cells = [row.views.get(view, {}).get(key) for view in views for key in row.keys]
+        rows.append([row.label, *map(number, cells)])
     return element(
         'section',
         element('h2', "In the form of the paper's tables"),
@@ -40,11 +53,22 @@ def paper_tables(evaluations: Sequence[Evaluated]) -> Markup:
             'times 100). FID and FVD need feature weights; a dash is not measured.',
             class_='faint',
         ),
-        table(head, [*rows, held], caption='Method × view'),
+        table(head, rows, caption='Method × view'),
         _quality(evaluations),
         _task_by_view(evaluations, views),
         id='paper',
     )
+
+
+def _rows(evaluations: Sequence[Evaluated]) -> list[_Row]:
+    """A row per evaluation and zero-shot set; then the held first frame of each set."""
+    rows, held = [], {}
+    for index, found in enumerate(evaluations):
+        for name, group in (found.metrics.get('zero_shot') or {_SEEN: found.metrics}).items():
+            suffix = '' if name == _SEEN else f', zero-shot {name}'
+            rows.append(_Row(f'{_name(index, evaluations)}{suffix}', group['views'], _MODEL))
+            held.setdefault(name, _Row(f'First frame held{suffix}', group['views'], _HELD))
+    return [*rows, *held.values()]
 
 
 def _quality(evaluations: Sequence[Evaluated]) -> Markup | None:
@@ -57,15 +81,6 @@ def _quality(evaluations: Sequence[Evaluated]) -> Markup | None:
                 rows.append([_name(index, evaluations), view, *cells])
     head = ['Method', 'View', *QUALITY.values()]
     return table(head, rows, num_labels=2, caption='Pictures') if rows else None
-
-
-def _method_cells(found: Evaluated, views: Sequence[str], key: str) -> list[str]:
-    cells = []
-    for view in views:
-        numbers = found.metrics['views'].get(view, {})
-        cells += [number(numbers.get('fid'), 1), number(numbers.get('fvd'), 1)]
-        cells.append(number(numbers.get(key)))
-    return cells
 
 
 def _name(index: int, evaluations: Sequence[Evaluated]) -> str:

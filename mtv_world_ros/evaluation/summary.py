@@ -120,6 +120,7 @@ class Summary:
         source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return {
             'name': self.name,
+            'label': self.label,
             'provenance': self.provenance,
             'num_episodes': len(self.results),
             'episodes': [result.episode for result in self.results],

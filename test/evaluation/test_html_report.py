@@ -11,6 +11,7 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.charts import Dot, dot_chart, Line, line_chart
+from mtv_world_ros.evaluation.comparison import write_comparison
 from mtv_world_ros.evaluation.evaluate import evaluate
 from mtv_world_ros.evaluation.html_report import write_report
 from mtv_world_ros.evaluation.markup import element, Markup
@@ -179,6 +180,32 @@ def test_report_is_made_again_without_the_model(held, page, tmp_path, capsys):
     assert str(path) in capsys.readouterr().out
     assert path.read_bytes() == (held / 'report.html').read_bytes()
     assert path.stat().st_size < 2_000_000
+
+
+def test_folder_of_several_checkpoints_is_one_report(make_pipeline, episodes, held, tmp_path):
+    summaries = [
+        evaluate(
+            make_pipeline(),
+            episodes[:1],
+            tmp_path / label,
+            label=label,
+            name=f'{label} (1234)',
+            zero_shot={episodes[0]: kind} if kind else {},
+            show_progress=False,
+            num_resamples=10,
+        )
+        for label, kind in (('second', 'object'), ('first', ''))
+    ]
+    scored(make_pipeline(), episodes[:1], tmp_path / 'stale', name='stale')
+    write_comparison(summaries, tmp_path)
+    found = report(tmp_path)
+    assert len(found.all('video')) == 2 and 'stale' not in found.text
+    assert found.text.index('second (1234)') < found.text.index('first (1234)')
+    assert 'A · second (1234), zero-shot object' in found.text
+    assert 'First frame held, zero-shot object' in found.text
+    again = write_report([held, tmp_path], tmp_path / 'three.html')
+    # the three have episode_0, one has the other two
+    assert len(Page(again.read_text()).all('video')) == 3 + 1 + 1
 
 
 def test_folder_without_evaluation_is_an_error(tmp_path, capsys):
