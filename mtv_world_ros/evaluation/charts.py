@@ -65,7 +65,7 @@ class Bin:
 
 def dot_chart(title: str, dots: Sequence[Dot]) -> Markup:
     """Returns values in [0, 1] with their intervals, one below the other."""
-    left, right, top, row = 92.0, 130.0, 8.0, 30.0
+    left, right, top, row = 92.0, 142.0, 8.0, 28.0
     height = top + row * len(dots) + 26
 
     def x(value: float) -> float:

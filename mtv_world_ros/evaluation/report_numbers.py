@@ -39,6 +39,8 @@ _FIELDS = {
     'j_frames': '',
 }
 _NUM_HUES = 6
+#: the bootstrap of fewer episodes says nothing
+_MIN_EPISODES = 3
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -126,14 +128,12 @@ def _meanings(evaluations: Sequence[Evaluated]) -> list[str]:
 
 
 def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
-    found = evaluations[index]
-    doubts = []
-    for view, numbers in found.metrics['views'].items():
-        for key, words in _MARGINS.items():
-            low, _ = interval(numbers, key)
-            if not low > 0:
-                how = 'not measured' if number(numbers.get(key)) == '–' else 'not above 0'
-                doubts.append(f'{view}: margin over {words} {how}')
+    doubts = [
+        doubt
+        for view, numbers in evaluations[index].metrics['views'].items()
+        for key, words in _MARGINS.items()
+        if (doubt := _doubt(numbers, key, f'{view}: margin over {words}'))
+    ]
     text = (
         f'Not shown in every view ({"; ".join(doubts)}).'
         if doubts
@@ -144,27 +144,41 @@ def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
     return element('p', badge(index, evaluations), text, class_=style)
 
 
+def _doubt(numbers: Mapping[str, Any], key: str, words: str) -> str:
+    """What keeps a margin from being shown; empty = nothing."""
+    if number(numbers.get(key)) == '–':
+        return f'{words} not measured'
+    count = numbers['num_episodes_with'][key]
+    if count < _MIN_EPISODES:
+        return f'{words} of too few episodes ({count})'
+    return '' if interval(numbers, key)[0] > 0 else f'{words} not above 0'
+
+
 def _dots(evaluations: Sequence[Evaluated], view: str, keys: tuple[str, str, str]) -> Markup:
-    alone = len(evaluations) == 1
-    dots = []
-    for index, found in enumerate(evaluations):
-        numbers = found.metrics['views'].get(view)
-        if numbers is None:
-            continue
-        colour = hue(index)
-        styles = (colour, 'held', 'alone shuffled' if alone else f'{colour} shuffled')
-        shown = list(zip(keys, ('imagined', 'held', 'shuffled'), styles, strict=True))
-        more = [(key, word, 'held') for key, word in _MORE.items() if numbers.get(key) is not None]
-        dots += [
-            Dot(
-                label=word if alone else f'{letter(index)} {word}',
-                value=nan if numbers.get(key) is None else numbers[key],
-                interval=interval(numbers, key),
-                style=style,
-            )
-            for key, word, style in [*shown, *more]
-        ]
+    """All evaluations' dots of one kind below each other, so that they are compared."""
+    words = {**dict(zip(keys, ('', 'held', 'shuffled'), strict=True)), **_MORE}
+    dots = [
+        dot
+        for key, word in words.items()
+        for index in range(len(evaluations))
+        if (dot := _dot(index, evaluations, view, key, word)) is not None
+    ]
     return dot_chart(f'J in view {view}', dots)
+
+
+def _dot(
+    index: int, evaluations: Sequence[Evaluated], view: str, key: str, word: str
+) -> Dot | None:
+    numbers = evaluations[index].metrics['views'].get(view)
+    if numbers is None or (key in _MORE and numbers.get(key) is None):
+        return None
+    prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
+    return Dot(
+        label=f'{prefix}{word or "imagined"}',
+        value=nan if numbers.get(key) is None else numbers[key],
+        interval=interval(numbers, key),
+        style='held' if key in _MORE else _style(index, evaluations, word),
+    )
 
 
 def horizon_section(evaluations: Sequence[Evaluated]) -> Markup | None:

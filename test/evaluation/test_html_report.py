@@ -203,6 +203,7 @@ def test_folder_of_several_checkpoints_is_one_report(make_pipeline, episodes, he
     assert found.text.index('second (1234)') < found.text.index('first (1234)')
     assert 'A · second (1234), zero-shot object' in found.text
     assert 'First frame held, zero-shot object' in found.text
+    assert 'low: margin over the first frame held of too few episodes (1)' in found.text
     again = write_report([held, tmp_path], tmp_path / 'three.html')
     # the three have episode_0, one has the other two
     assert len(Page(again.read_text()).all('video')) == 3 + 1 + 1
