@@ -11,13 +11,14 @@ from mtv_world_ros.cli import (
     doctor,
     evaluate,
     import_dataset,
+    import_weights,
     replay,
     report,
     train,
 )
 from mtv_world_ros.errors import MtvWorldError
 
-COMMANDS = (demo, replay, collect, train, evaluate, report, doctor, import_dataset)
+COMMANDS = (demo, replay, collect, train, evaluate, report, doctor, import_dataset, import_weights)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -82,19 +82,32 @@ def import_weights(
     partial = out.with_name(out.name + '.partial')
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
+    try:
+        reports = _import_parts(sources, partial, transformer, autoencoder, shard_bytes)
+        shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
+        build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
+        (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
+        listed = [asdict(report) for report in reports]
+        (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return reports
+
+
+def _import_parts(
+    sources: Mapping[str, Path],
+    out: Path,
+    transformer: Mapping[str, Any],
+    autoencoder: Mapping[str, Any],
+    shard_bytes: int,
+) -> list[PartReport]:
     reports = [
-        _import_transformer(sources['transformer'], partial, transformer, shard_bytes),
-        _import_autoencoder(sources['autoencoder'], partial, autoencoder, shard_bytes),
+        _import_transformer(sources['transformer'], out, transformer, shard_bytes),
+        _import_autoencoder(sources['autoencoder'], out, autoencoder, shard_bytes),
     ]
     for part, width in (('text_encoder', 'text_dim'), ('image_encoder', 'image_dim')):
-        report = _import_encoder(part, sources[part], partial, transformer[width], shard_bytes)
-        reports.append(report)
-    shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
-    build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
-    (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
-    listed = [asdict(report) for report in reports]
-    (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')
-    partial.rename(out)
+        reports.append(_import_encoder(part, sources[part], out, transformer[width], shard_bytes))
     return reports
 
 

@@ -121,6 +121,22 @@ class TrainingConfig:
         """The configuration as plain values, for the checkpoint's card."""
         return asdict(self)
 
+    def card(self, trained_on: Mapping[str, Any]) -> dict[str, Any]:
+        """The checkpoint's card, `world_model.json`; `trained_on` says where weights come from."""
+        video = self.video
+        return {
+            'views': list(video.views),
+            'fps': video.fps,
+            'num_frames': video.num_frames,
+            'width': video.width,
+            'height': video.height,
+            'robot': video.robot,
+            'control': video.control,
+            'object_mask': video.object_mask,
+            'rendering': self.as_dict()['rendering'],
+            'trained_on': dict(trained_on),
+        }
+
 
 def load_training_config(
     preset: str | Path, overrides: Mapping[str, Any] | None = None

@@ -219,19 +219,7 @@ class Trainer:
         """Writes the averaged weights as a checkpoint."""
         averaged = copy_of(self.master)
         self.ema.copy_to(averaged.parameters())
-        video = self.config.video
-        card = {
-            'views': list(video.views),
-            'fps': video.fps,
-            'num_frames': video.num_frames,
-            'width': video.width,
-            'height': video.height,
-            'robot': video.robot,
-            'control': video.control,
-            'object_mask': video.object_mask,
-            'rendering': self.config.as_dict()['rendering'],
-            'trained_on': {**self.trained_on, 'steps': self.step, 'seed': self.seed},
-        }
+        card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
         scheduler = build_scheduler(self.config.scheduler)
         parts = Checkpoint(
             transformer=averaged,

@@ -54,9 +54,7 @@ CARD = {
 
 
 def transformer_weights(seed: int = 0) -> Weights:
-    shapes = video_tensors(
-        dim=DIM, ffn=FFN, layers=LAYERS, text_dim=TEXT_DIM, clip_dim=CLIP_DIM
-    )
+    shapes = video_tensors(dim=DIM, ffn=FFN, layers=LAYERS, text_dim=TEXT_DIM, clip_dim=CLIP_DIM)
     return random_weights(shapes, seed)
 
 
