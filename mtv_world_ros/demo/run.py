@@ -106,7 +106,7 @@ def _score(
         truth = true_masks(stretch, segmenter, recording.objects, recording.objects, use_ids=False)
         predicted = chunk.predicted[:, :kept]
         scores = score_frames(predicted, truth, segmenter)
-        rows += score_rows(stretch, views, truth, scores, None, None)
+        rows += score_rows(stretch, views, truth, scores, {})
         times = (chunk.stamps_ns[:kept] - recording.stamp_ns) * 1e-9
         shown.append((times, stretch.frames[:, 1:], chunk.trajectory[:, :kept], predicted))
     times, real, trajectory, imagined = (
