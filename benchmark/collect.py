@@ -13,7 +13,8 @@ from pathlib import Path
 import tempfile
 import time
 
-from mtv_world_ros.sim.collect import CollectConfig, EpisodeMaker, jobs_of
+from mtv_world_ros.sim.episode_maker import CollectConfig, EpisodeMaker
+from mtv_world_ros.sim.jobs import jobs_of
 from mtv_world_ros.sim.tasks import TASKS
 
 

@@ -8,18 +8,48 @@ from pathlib import Path
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
-    parser = commands.add_parser('collect', help='make episodes of the simulated benchmark')
+    parser = commands.add_parser(
+        'collect',
+        help='make episodes of the simulated benchmark',
+        description='Makes the episodes of a data set that are not there yet, its card '
+        '(dataset.json, README.md) and a contact sheet.',
+    )
     parser.add_argument('--task', default='all', help="names, comma-separated, or 'all'")
-    parser.add_argument('--episodes', type=int, required=True, help='episodes per task')
+    parser.add_argument(
+        '--episodes', type=int, required=True, help='per task; with --zero-shot in all'
+    )
+    parser.add_argument(
+        '--zero-shot',
+        default='',
+        metavar='KINDS',
+        help='make a set for testing alone: any of view, task, object, comma-separated '
+        '(new cameras, a task that is not of the 15, half of the objects unseen)',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
+    parser.add_argument('--width', type=int, default=384, help='of the images [px]')
+    parser.add_argument('--height', type=int, default=288)
+    parser.add_argument(
+        '--sheets', action='store_true', help='also a larger contact sheet of every task'
+    )
     parser.set_defaults(handler=_collect)
 
 
 def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect import collect
+    from mtv_world_ros.sim.episode_maker import CollectConfig
+    from mtv_world_ros.sim.randomize import RandomizationConfig
 
-    tasks = [name.strip() for name in arguments.task.split(',')]
-    collect(tasks, arguments.episodes, arguments.seed, arguments.out, workers=arguments.workers)
+    size = RandomizationConfig(width=arguments.width, height=arguments.height)
+    collect(
+        [name.strip() for name in arguments.task.split(',')],
+        arguments.episodes,
+        arguments.seed,
+        arguments.out,
+        zero_shot=arguments.zero_shot,
+        workers=arguments.workers,
+        config=CollectConfig(randomization=size),
+        sheets=arguments.sheets,
+    )
     return 0

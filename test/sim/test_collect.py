@@ -6,7 +6,9 @@ import pytest
 
 from mtv_world_ros.data.mcap_reader import iter_messages, read_episode
 from mtv_world_ros.errors import EpisodeError, SimulatorError
-from mtv_world_ros.sim.collect import collect, CollectConfig, episode_seed, misses
+from mtv_world_ros.sim.collect import collect
+from mtv_world_ros.sim.episode_maker import CollectConfig
+from mtv_world_ros.sim.jobs import episode_seed, misses
 from mtv_world_ros.sim.randomize import RandomizationConfig
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))

@@ -1,0 +1,103 @@
+"""Makes one episode of a data set after the other: attempts until one is as wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import time
+
+from mtv_world_ros.errors import EpisodeError, SimulatorError
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.sim.episode import SimEpisode
+from mtv_world_ros.sim.expert import Expert, ExpertConfig
+from mtv_world_ros.sim.files import GO_ON
+from mtv_world_ros.sim.jobs import episode_seed, Job
+from mtv_world_ros.sim.randomize import RandomizationConfig
+from mtv_world_ros.sim.record import RecordConfig, simulate, Take, write_take
+from mtv_world_ros.sim.tasks import task_named
+from mtv_world_ros.sim.zero_shot import variant, ZeroShotConfig
+
+ROBOT_FILE = ('config', 'robots', 'yam_bimanual.yaml')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollectConfig:
+    """What is randomised, how the expert moves, how episodes are sampled."""
+
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    zero_shot: ZeroShotConfig = field(default_factory=ZeroShotConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spent:
+    """CPU time that one episode took, dropped attempts included [s], and its frames."""
+
+    physics_s: float
+    rendering_s: float
+    writing_s: float
+    num_frames: int
+
+
+class EpisodeMaker:
+    """Makes episodes one after the other in one process."""
+
+    def __init__(self, config: CollectConfig) -> None:
+        self._robot = load_robot(share_path(*ROBOT_FILE))
+        self._config = config
+        self._expert = Expert(self._robot, config.expert)
+
+    def make(self, job: Job) -> Spent:
+        """Simulates attempts until one is as wanted, and writes it.
+
+        Raises:
+            SimulatorError: none of `max_attempts` seeds gave the wanted outcome, or the episode
+                cannot be written.
+        """
+        physics = rendering = 0.0
+        for attempt in range(self._config.record.max_attempts):
+            seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
+            sim, take = self._attempt(job, seed)
+            try:
+                if take is None:
+                    continue
+                physics, rendering = physics + take.physics_s, rendering + take.rendering_s
+                if take.is_as_wanted():
+                    writing = self._write(job, sim, take, seed, attempt)
+                    return Spent(
+                        physics_s=physics,
+                        rendering_s=rendering,
+                        writing_s=writing,
+                        num_frames=len(take.observations),
+                    )
+            finally:
+                sim.close()
+        raise SimulatorError(
+            f"episode {job.index} of task '{job.task}' (seed {job.seed}) was "
+            f'{"no clean miss" if job.miss else "no success"} in '
+            f'{self._config.record.max_attempts} attempts; see sim/expert.py'
+        )
+
+    def _attempt(self, job: Job, seed: int) -> tuple[SimEpisode, Take | None]:
+        """The episode of a seed; no take where its scene or plan is impossible."""
+        config = self._config
+        task, randomization = variant(
+            job.zero_shot, task_named(job.task), seed, config.randomization, config.zero_shot
+        )
+        sim = SimEpisode(self._robot, self._expert.home, randomization)
+        try:
+            return sim, simulate(sim, self._expert, task, seed, config.record, miss=job.miss)
+        except SimulatorError:
+            return sim, None
+
+    def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
+        started = time.process_time()
+        extra = {'attempt': str(attempt), 'index': str(job.index)}
+        if job.zero_shot is not None:
+            extra['zero_shot'] = job.zero_shot
+        try:
+            write_take(job.path, sim, take, seed, self._config.record, **extra)
+        except (OSError, EpisodeError) as error:
+            raise SimulatorError(f"cannot write '{job.path}': {error}; {GO_ON}") from error
+        return time.process_time() - started

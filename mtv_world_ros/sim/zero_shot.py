@@ -1,0 +1,155 @@
+"""Zero-shot sets: episodes from new cameras, of an unseen task, with unseen objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mtv_world_ros.errors import nearest, SimulatorError
+from mtv_world_ros.sim.cameras import CameraSpec
+from mtv_world_ros.sim.randomize import RandomizationConfig
+from mtv_world_ros.sim.shapes import SHAPES
+from mtv_world_ros.sim.tasks import ObjectRole, PickPlace, Range, Shake, Task, task_named
+
+#: what an episode shows that no training or test episode does (paper, "Zero-Shot Ability")
+KINDS = ('view', 'task', 'object')
+UNSEEN_TASK = 'random_pick_place'
+#: shapes that no task asks for
+UNSEEN_SHAPES = ('can', 'house')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZeroShotConfig:
+    """How far the new cameras are from the ones of training.
+
+    Attributes:
+        azimuth: turn about the table to either side [deg].
+        elevation: change of the elevation [deg].
+        distance: factor on the distance.
+        visible_width: width of the view's plane through the target at the nominal distance [m].
+    """
+
+    azimuth: Range = (25.0, 55.0)
+    elevation: Range = (-6.0, 16.0)
+    distance: Range = (0.95, 1.2)
+    visible_width: float = 0.76
+
+
+def kinds_named(text: str | Sequence[str]) -> tuple[str, ...]:
+    """Returns the kinds of a comma-separated list, or of a sequence; each one once.
+
+    Raises:
+        SimulatorError: unknown kind; the text names the nearest known one.
+    """
+    names = text.split(',') if isinstance(text, str) else text
+    kinds = tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
+    for kind in kinds:
+        if kind not in KINDS:
+            raise SimulatorError(
+                f"unknown zero-shot set '{kind}'{nearest(kind, KINDS)}; known are "
+                f'{", ".join(KINDS)}; set --zero-shot'
+            )
+    return kinds
+
+
+def tasks_of(kind: str, tasks: Sequence[Task]) -> tuple[Task, ...]:
+    """Returns the tasks that a zero-shot set is made of, out of the chosen ones.
+
+    Raises:
+        SimulatorError: none of the chosen tasks can show unseen objects.
+    """
+    if kind == 'task':
+        return (task_named(UNSEEN_TASK),)
+    if kind == 'view':
+        return tuple(tasks)
+    usable = tuple(task for task in tasks if _exchangeable(task))
+    if not usable:
+        raise SimulatorError(
+            f'no object of {", ".join(task.name for task in tasks)} can be exchanged for an '
+            'unseen one; set --task all, or leave object out of --zero-shot'
+        )
+    return usable
+
+
+def variant(
+    kind: str | None,
+    task: Task,
+    seed: int,
+    randomization: RandomizationConfig,
+    config: ZeroShotConfig,
+) -> tuple[Task, RandomizationConfig]:
+    """Returns the task and the randomisation of one episode; as given where `kind` is None.
+
+    Args:
+        kind: of `KINDS`, or None.
+        task: the task it is derived from.
+        seed: of the episode.
+        randomization: of training.
+        config: how far the new cameras are.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+    if kind == 'view':
+        cameras = tuple(_new_camera(spec, config, rng) for spec in randomization.cameras)
+        return task, replace(randomization, cameras=cameras)
+    if kind == 'object':
+        return _with_unseen_objects(task, rng), randomization
+    return task, randomization
+
+
+def _new_camera(spec: CameraSpec, config: ZeroShotConfig, rng: np.random.Generator) -> CameraSpec:
+    side = float(rng.choice((-1.0, 1.0)))
+    factor = float(rng.uniform(*config.distance))
+    return replace(
+        spec,
+        azimuth=spec.azimuth + side * float(rng.uniform(*config.azimuth)),
+        elevation=spec.elevation + float(rng.uniform(*config.elevation)),
+        distance=spec.distance * factor,
+        # the lens stays the same
+        visible_width=config.visible_width * factor,
+    )
+
+
+def _movable(task: Task) -> tuple[ObjectRole, ...]:
+    """Roles that are always there and can be grasped: trays and baskets are not counted."""
+    return tuple(
+        role
+        for role in task.roles
+        if role.probability == 1 and all(SHAPES[shape].grasp for shape in role.shapes)
+    )
+
+
+def _exchangeable(task: Task) -> tuple[str, ...]:
+    """Roles that any graspable thing can play.
+
+    Not what carries something, is shaken or is a plate, nor what has to be of a certain size.
+    """
+    carriers = {
+        move.reference
+        for move in task.moves
+        if isinstance(move, PickPlace) and move.rest != 'table'
+    }
+    shaken = {move.subject for move in task.moves if isinstance(move, Shake)}
+    return tuple(
+        role.role
+        for role in _movable(task)
+        if role.role not in carriers | shaken
+        and 'plate' not in role.shapes
+        and role.size_share == ObjectRole(role='').size_share
+    )
+
+
+def _with_unseen_objects(task: Task, rng: np.random.Generator) -> Task:
+    """Half of the movable objects, rounded by a coin, are of shapes that training never shows."""
+    roles, usable = _movable(task), _exchangeable(task)
+    half = (len(roles) + int(rng.integers(2)) * (len(roles) % 2)) // 2
+    chosen = set(rng.permutation(usable)[:half].tolist())
+    return replace(
+        task,
+        roles=tuple(
+            replace(role, shapes=UNSEEN_SHAPES) if role.role in chosen else role
+            for role in task.roles
+            if role.probability == 1
+        ),
+    )
