@@ -4,18 +4,36 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.options import add_dtype
+
+if TYPE_CHECKING:
+    import torch
+
+    from mtv_world_ros.training.config import TrainingConfig
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser('train', help='train a world model on a folder of episodes')
-    parser.add_argument('dataset', type=Path)
-    parser.add_argument('--out', type=Path, required=True, help='resumes what is there')
+    parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
+    parser.add_argument('--out', type=Path, help='resumes what is there')
     parser.add_argument('--preset', default='small', help='name or YAML file')
     parser.add_argument(
         '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides'
+    )
+    parser.add_argument(
+        '--control',
+        help='how actions enter: trajectory_video, policy2vec, ee_mlp or fast_tokens; '
+        'default: what the preset says',
+    )
+    parser.add_argument('--views', help='e.g. low,high or low; default: those of the preset')
+    parser.add_argument(
+        '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
+    )
+    parser.add_argument(
+        '--dry-run', action='store_true', help='print what a step takes, and train nothing'
     )
     parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
     parser.add_argument('--episodes', type=int, help='use only the first so many')
@@ -31,7 +49,6 @@ def _train(arguments: argparse.Namespace) -> int:
     import os
 
     import torch
-    import yaml
 
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.errors import ConfigError
@@ -40,13 +57,14 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.config import load_training_config
     from mtv_world_ros.training.run import train
 
-    overrides = {}
-    for item in arguments.overrides:
-        key, equals, value = item.partition('=')
-        if not equals:
-            raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
-        overrides[key] = yaml.safe_load(value)
-    config = load_training_config(arguments.preset, overrides)
+    config = load_training_config(arguments.preset, _overrides(arguments))
+    if arguments.dry_run:
+        return _dry_run(config, choose_dtype(arguments.dtype, arguments.device))
+    if arguments.dataset is None or arguments.out is None:
+        raise ConfigError(
+            'training needs a folder of episodes and a folder for its results: '
+            'mtv-world train DATASET --out DIR; without them only --dry-run works'
+        )
     torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
     folder = train(
         config,
@@ -62,4 +80,45 @@ def _train(arguments: argparse.Namespace) -> int:
         initial=arguments.init and checkpoint_path(arguments.init),
     )
     print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
+    return 0
+
+
+def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the options change of the preset; --set wins."""
+    import yaml
+
+    from mtv_world_ros.errors import ConfigError
+
+    overrides: dict[str, Any] = {}
+    if arguments.control is not None:
+        overrides['video.control'] = arguments.control
+    if arguments.views is not None:
+        views = [view.strip() for view in arguments.views.split(',') if view.strip()]
+        if not views:
+            raise ConfigError(f"--views '{arguments.views}' names no view; e.g. --views low,high")
+        overrides |= {'video.views': views, 'transformer.num_views': len(views)}
+    if arguments.object_mask is not None:
+        overrides['video.object_mask'] = arguments.object_mask == 'on'
+    for item in arguments.overrides:
+        key, equals, value = item.partition('=')
+        if not equals:
+            raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
+        overrides[key] = yaml.safe_load(value)
+    return overrides
+
+
+def _dry_run(config: TrainingConfig, dtype: torch.dtype) -> int:
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.model.action_features import action_names
+    from mtv_world_ros.training.dry_run import step_cost
+
+    video = config.video
+    robot = load_robot(robot_path(video.robot))
+    cost = step_cost(config, action_dim=len(action_names(video.control, robot)), dtype=dtype)
+    print(
+        f'control {video.control}, {len(video.views)} views of {1 + video.num_frames} frames of '
+        f'{video.width}x{video.height}, batch {config.optimizer.batch_size}, {dtype}'
+    )
+    print('per step, the transformer alone:', *cost.lines(), sep='\n')
     return 0
