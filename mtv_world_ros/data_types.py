@@ -221,9 +221,10 @@ class ObjectMasks:
         masks: (V, O, T, H, W) bool.
         status: V tuples of O words: `ok`, or why the mask is not to be trusted: never seen
             (`absent`), seen and then missing (`lost`; `out_of_view` from the image's edge on),
-            one of several or no known colour (`ambiguous`, `out_of_palette`), found without
-            certainty (`low_confidence`), jumps (`area_jump`, `teleport`), a frame that the
-            simulator's masks do not cover (`not_recorded`).
+            seen as a sliver (`barely_visible`), one of several or of no known colour
+            (`ambiguous`, `out_of_palette`), found without certainty (`low_confidence`), jumps
+            (`area_jump`, `teleport`), a frame that the simulator's masks do not cover
+            (`not_recorded`).
     """
 
     names: tuple[str, ...]

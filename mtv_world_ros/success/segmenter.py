@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.errors import ConfigError, ObservationError
+from mtv_world_ros.success.colour_parts import part_of, with_part
 from mtv_world_ros.success.describer import colour_of
 from mtv_world_ros.success.palette import PALETTE
 from mtv_world_ros.success.tracking import Track, track, TrackingConfig
@@ -172,7 +173,28 @@ class ColourSegmenter:
             if rivals and first is None and found.status == 'ok':
                 found = Track(masks=found.masks, status='ambiguous')
             tracks.append(found)
-        return tracks
+        return [
+            self._complete(tracks, index, name, firsts, (frames, lab, words))
+            for index, name in enumerate(names)
+        ]
+
+    def _complete(
+        self,
+        tracks: Sequence[Track],
+        index: int,
+        name: str,
+        firsts: BoolArray | None,
+        images: tuple[ByteArray, ByteArray, ByteArray],
+    ) -> Track:
+        """The track of an object with its part of another colour, where its noun has one."""
+        word = part_of(name, colour_of(name))
+        if word is None or not tracks[index].masks.any():
+            return tracks[index]
+        frames, lab, words = images
+        pixels = self._pixels(frames, lab, words == self._words.index(word), word)
+        others = [track.masks for i, track in enumerate(tracks) if i != index]
+        first = None if firsts is None else firsts[index]
+        return with_part(tracks[index], pixels, others, first, self.config.tracking)
 
     def _pixels(self, frames: ByteArray, lab: ByteArray, gate: BoolArray, word: str) -> BoolArray:
         """(T, H, W) pixels of a colour, down to where the object makes up half of a pixel."""

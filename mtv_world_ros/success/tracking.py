@@ -30,6 +30,8 @@ class TrackingConfig:
             `min_area_share` count as that, for an object may come out from behind a gripper.
         max_missing: share of frames without the object above which it is absent or, where it was
             seen before, lost.
+        max_slivers: share of the frames with the object that may show no more than a sliver of
+            it, one pixel thin; such a mask is as much edge as object.
     """
 
     min_area_share: float = 0.0006
@@ -39,6 +41,7 @@ class TrackingConfig:
     max_step: float = 0.2
     max_growth: float = 2.5
     max_missing: float = 0.5
+    max_slivers: float = 0.2
 
     def min_area(self, shape: tuple[int, ...]) -> int:
         """Smallest area of a piece [px] in frames of (..., H, W)."""
@@ -105,7 +108,7 @@ def track(
             state.gap += 1
             continue
         masks[index] = found
-    _doubt_if_missing(masks, state, config)
+    _doubt_whole(masks, state, config)
     return Track(masks=masks, status=state.status)
 
 
@@ -124,16 +127,18 @@ def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
             _check(mask, state, config, hypot(*mask.shape))
         else:
             state.gap += 1
-    _doubt_if_missing(masks, state, config)
+    _doubt_whole(masks, state, config)
     return state.status
 
 
-def _doubt_if_missing(masks: BoolArray, state: _State, config: TrackingConfig) -> None:
-    """Says why an object is not seen: never there, out of the image, or lost inside it."""
-    missing = 1.0 - masks.any((1, 2)).mean() if len(masks) else 1.0
-    if missing <= config.max_missing:
-        return
-    if state.centre is None:
+def _doubt_whole(masks: BoolArray, state: _State, config: TrackingConfig) -> None:
+    """Says why an object is not seen (never there, out of the image, lost) or hardly."""
+    shown = [mask for mask in masks if mask.any()]
+    if len(shown) >= (1 - config.max_missing) * len(masks) and shown:
+        slivers = sum(not _has_body(mask) for mask in shown)
+        if slivers > config.max_slivers * len(shown):
+            state.doubt('barely_visible')
+    elif state.centre is None:
         state.doubt('absent')
     elif state.at_edge:
         state.doubt('out_of_view')
@@ -185,6 +190,12 @@ def _join(main: int, pieces: Labels, stats: Labels, config: TrackingConfig) -> l
     down = np.maximum(top - top[main] - height[main], top[main] - top - height)
     near = np.maximum(across, down) <= reach
     return [int(piece) for piece in pieces if piece == main or near[piece]]
+
+
+def _has_body(mask: BoolArray) -> bool:
+    """Whether two by two pixels are set anywhere."""
+    pairs = mask[1:] & mask[:-1]
+    return bool((pairs[:, 1:] & pairs[:, :-1]).any())
 
 
 def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: float) -> None:

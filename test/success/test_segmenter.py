@@ -10,6 +10,7 @@ from mtv_world_ros.success.palette import PALETTE
 from mtv_world_ros.success.segmenter import (
     ColourSegmenter,
     ColourSegmenterConfig,
+    keep_doubts,
     masks_from_ids,
     resize_masks,
 )
@@ -167,6 +168,70 @@ def test_start_masks_of_another_number_of_objects_are_refused():
 def test_frames_that_are_not_bytes_are_refused():
     with pytest.raises(ObservationError, match='float64.*uint8'):
         segment(np.zeros((1, 1, HEIGHT, WIDTH, 3)), 'red block')
+
+
+def test_object_that_shows_no_more_than_a_sliver_is_barely_visible():
+    frames, _ = video([{'red': (40, 40)}] * 2 + [{'blue': (10, 10)}] * 3)
+    frames[:, 2:, 40, 40:52] = PALETTE['red']
+    assert segment(frames, 'red block').status == (('barely_visible',),)
+
+
+def test_sliver_for_a_moment_stays_ok():
+    frames, _ = video([{'red': (40, 40)}] * 6 + [{'blue': (10, 10)}])
+    frames[:, 6, 40, 40:52] = PALETTE['red']
+    assert segment(frames, 'red block').status == (('ok',),)
+
+
+def carrot(num_frames=3, leaf=(40, 36), names=('orange carrot',), **more):
+    """Segments an orange square under a green one, and returns both masks of the truth."""
+    blocks = {'orange': (40, 40), 'green': leaf, **more}
+    frames, true = video([blocks] * num_frames, size=4)
+    return segment(frames, *names), true
+
+
+def test_green_of_a_carrot_belongs_to_it():
+    found, true = carrot()
+    assert found.status == (('ok',),)
+    assert jaccard(found.masks[0, 0], true['orange'] | true['green']).min() > 0.8
+
+
+def test_green_away_from_the_carrot_does_not():
+    found, true = carrot(leaf=(40, 20))
+    assert jaccard(found.masks[0, 0], true['orange']).min() > 0.8
+
+
+def test_green_that_touches_a_block_does_not_belong_to_it():
+    found, true = carrot(names=('orange block',))
+    assert jaccard(found.masks[0, 0], true['orange']).min() > 0.8
+
+
+def test_green_of_another_named_object_stays_its_own():
+    found, true = carrot(names=('orange carrot', 'green cup'))
+    assert jaccard(found.masks[0, 0], true['orange']).min() > 0.8
+    assert jaccard(found.masks[0, 1], true['green']).min() > 0.8
+
+
+def test_carrot_on_a_large_green_thing_does_not_swallow_it():
+    frames, true = video([{'orange': (40, 40)}] * 3, size=4)
+    frames[:, :, 44:64, 30:60] = PALETTE['green']
+    found = segment(frames, 'orange carrot')
+    assert jaccard(found.masks[0, 0], true['orange']).min() > 0.8
+
+
+def test_green_carrot_has_no_part_of_its_own_colour():
+    frames, true = video([{'green': (40, 40)}] * 2)
+    assert jaccard(segment(frames, 'green carrot').masks[0, 0], true['green']).min() > 0.8
+
+
+def test_doubt_about_the_start_stays_with_what_is_followed_from_it():
+    frames, true = video([{'red': (20, 40)}] * 2)
+    frames[:, :, 40:48, 60:68] = frames[:, :, 40:48, 20:28]
+    first = segment(frames[:, :1], 'red block')
+    rest = segment(frames[:, 1:], 'red block', first_masks=first.masks[:, :, 0])
+    assert (first.status, rest.status) == ((('ambiguous',),), (('ok',),))
+    assert keep_doubts(first, rest).status == (('ambiguous',),)
+    assert keep_doubts(rest, first).status == (('ambiguous',),)
+    assert keep_doubts(rest, rest).status == (('ok',),)
 
 
 def test_short_occlusion_stays_ok_and_empty():
