@@ -53,6 +53,7 @@ setup(
         'pin>=4.1,<5',
         'rosbags>=0.11',
         'safetensors>=0.8',
+        'tokenizers>=0.22',
         'torch>=2.6',
         'tqdm>=4.66',
         'zstandard>=0.22',
