@@ -62,6 +62,8 @@ setup(
         'train': ['tensorboard>=2.21'],
         # Vision-language models that name objects: behind a server, or here.
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
+        # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
+        'vision': ['transformers>=5.23,<6'],
         # PSNR and SSIM of `mtv-world evaluate --quality`
         'evaluate': ['torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.

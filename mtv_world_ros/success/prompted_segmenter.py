@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.errors import ModelMemoryError
 from mtv_world_ros.success.mask_tracking import SamVideo, track_masks
 from mtv_world_ros.success.segmenter import check_request
 from mtv_world_ros.success.tracking import judge, TrackingConfig
@@ -64,6 +67,9 @@ class PromptedSegmenter:
 
         First masks without their frames are taken for masks of `frames[:, 0]`, and that frame is
         then segmented like the others.
+
+        Raises:
+            ModelMemoryError: the device ran out of memory.
         """
         check_request(frames, names, first_masks, first_frames)
         num_views, num_frames, height, width, _ = frames.shape
@@ -74,7 +80,8 @@ class PromptedSegmenter:
             if first_masks is not None:
                 start = frames[view, 0] if first_frames is None else first_frames[view]
                 given = start, first_masks[view]
-            row = self._segment_view(frames[view], names, given, masks[view])
+            with memory_errors(self.name, self.video.device):
+                row = self._segment_view(frames[view], names, given, masks[view])
             status.append(row)
         rows = status or [('absent',) * len(names)] * num_views
         return ObjectMasks(names=names, masks=masks, status=tuple(rows))
@@ -106,6 +113,20 @@ class PromptedSegmenter:
             _status(doubt, firsts[item], masks[item], self.tracking)
             for item, doubt in enumerate(doubts)
         )
+
+
+@contextmanager
+def memory_errors(name: str, device: str) -> Iterator[None]:
+    """Turns torch's error into one that says what can be done."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise ModelMemoryError(
+            f"the segmenter '{name}' does not fit on '{device}' ({error}); set another device or "
+            'segmenter, or weights of a smaller model'
+        ) from error
 
 
 def _status(doubt: str, first: BoolArray, masks: BoolArray, config: TrackingConfig) -> str:

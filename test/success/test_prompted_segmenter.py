@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from tiny_vision import save_sam2
+import torch
 
-from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.errors import ModelMemoryError, ObservationError
 from mtv_world_ros.success.grounding import GroundingConfig, MMGroundingDino
 from mtv_world_ros.success.prompted_segmenter import PromptedSegmenter
 from mtv_world_ros.success.sam2_segmenter import BoxedFinder, sam2_segmenter, Sam2Video
@@ -156,6 +157,30 @@ def test_start_frames_of_another_size_are_refused(segmenter):
     small = frames()[:, 0, ::2, ::2]
     with pytest.raises(ObservationError, match=r'\(2, 24, 32, 3\)'):
         segmenter.segment(frames(), NAMES, first_masks=start_masks(), first_frames=small)
+
+
+def test_device_without_memory_says_what_to_set(segmenter, monkeypatch):
+    def full(*_):
+        raise torch.OutOfMemoryError('CUDA out of memory')
+
+    monkeypatch.setattr(type(segmenter.video), 'advance', full)
+    with pytest.raises(ModelMemoryError, match=f"'{segmenter.name}' does not fit on 'cpu'.*set"):
+        segmenter.segment(frames(), NAMES, first_masks=start_masks())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize('kind', ['sam2', 'sam3'])
+def test_masks_on_a_gpu_are_those_of_the_cpu(weights, segmenters, kind):
+    given = {'first_masks': start_masks(), 'first_frames': frames(seed=1)[:, 0]}
+    if kind == 'sam3':
+        there = sam3_segmenter(weights / 'third', device='cuda', grounding=EAGER)
+    else:
+        folders = weights / 'some org' / 'detector', weights / 'tracker'
+        there = sam2_segmenter(*folders, device='cuda', grounding=EAGER)
+    here = segmenters[kind].segment(frames(), NAMES, **given)
+    masks = there.segment(frames(), NAMES, **given).masks
+    assert (masks == here.masks).mean() > 0.98
+    assert there.segment(frames(), NAMES).masks.any()
 
 
 def test_no_names_give_no_masks(segmenter):
