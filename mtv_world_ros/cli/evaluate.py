@@ -132,10 +132,14 @@ def _row(entry: Entry, pipeline: Pipeline) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.evaluation.comparison import write_comparison
     from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.model.card import read_card
 
     entries = parse_entries(arguments.checkpoints)
+    for entry in entries:
+        read_card(checkpoint_path(entry.path))  # before hours go into the first one
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     print(f'{arguments.dataset}: {selection}')
     alone = len(entries) == 1
