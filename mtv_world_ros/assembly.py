@@ -84,11 +84,12 @@ def load_pipeline(
     from mtv_world_ros.model.world_model import DiffusionWorldModel
 
     set_num_threads(num_threads)
-    loaded = load_checkpoint(checkpoint_path(checkpoint))
+    number_format = choose_dtype(dtype, device)
+    loaded = load_checkpoint(checkpoint_path(checkpoint), dtype=number_format)
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
-        dtype=choose_dtype(dtype, device),
+        dtype=number_format,
         robot=_robot_of(loaded.card, robot),
     )
     return assemble(

@@ -23,6 +23,7 @@ from mtv_world_ros.model.text_encoder import TextEncoder
 from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 
 WEIGHTS = 'diffusion_pytorch_model'
+ADAPTER_FOLDER = 'adapter'
 PARTS = ('transformer', 'autoencoder', 'scheduler')
 
 
@@ -40,6 +41,7 @@ class Checkpoint:
         actions: how positions become the transformer's actions; None where they are drawn.
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.
+        adapter: folder of a LoRA adapter to use on the transformer; see `lora.py`.
     """
 
     transformer: MultiViewWanTransformer
@@ -49,6 +51,7 @@ class Checkpoint:
     actions: ActionEncoding | None = None
     text_encoder: TextEncoder | None = None
     image_encoder: ImageEncoder | None = None
+    adapter: Path | None = None
 
 
 def save_checkpoint(
@@ -68,6 +71,8 @@ def save_checkpoint(
     for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
         if encoder is not None:
             encoder.save(partial)
+    if checkpoint.adapter is not None:
+        shutil.copytree(checkpoint.adapter, partial / ADAPTER_FOLDER)
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
     if folder.exists():
         old = folder.with_name(folder.name + '.old')
@@ -99,6 +104,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
     control = card['control']
     drawn = control == TRAJECTORY_VIDEO
     with_text = (folder / 'text_encoder').is_dir()
+    adapter = folder / ADAPTER_FOLDER
     return Checkpoint(
         transformer=_load_transformer(folder / 'transformer', dtype),
         autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
@@ -107,6 +113,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
         actions=None if drawn else ActionEncoding.load(folder, control),
         text_encoder=TextEncoder(folder, dtype=dtype) if with_text else None,
         image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
+        adapter=adapter if adapter.is_dir() else None,
     )
 
 

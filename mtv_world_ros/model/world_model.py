@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     decode_frames,
 )
+from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
@@ -57,6 +59,8 @@ class DiffusionWorldModel:
         self.actions, self.robot = checkpoint.actions, robot
         self.device = torch.device(device)
         self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
+        self._adapters = Adapters(self.transformer)
+        self.use_adapter(checkpoint.adapter)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self.scheduler = checkpoint.scheduler
         self.card = checkpoint.card
@@ -66,6 +70,15 @@ class DiffusionWorldModel:
         self.image_encoder = checkpoint.image_encoder
         if self.image_encoder is not None:
             self.image_encoder.to(self.device, dtype)
+
+    def use_adapter(self, path: Path | None) -> None:
+        """Exchanges the LoRA adapter, not while a prediction runs; None = none.
+
+        Raises:
+            CheckpointError: it cannot be read or is for another model; the one before stays.
+        """
+        if path != self._adapters.current:
+            self._adapters.use(path)
 
     def predict(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+import shutil
 from typing import Any
 
 from diffusers import AutoencoderKLWan
@@ -28,6 +29,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
 from mtv_world_ros.model.image_encoder import ImageEncoder
 from mtv_world_ros.model.import_weights import import_weights
+from mtv_world_ros.model.lora import add_adapter, save_adapter
 from mtv_world_ros.model.text_encoder import TextEncoder
 from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
 from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -100,6 +102,25 @@ def test_text_is_encoded_once_and_images_once_each(
     assert (len(loads), len(images)) == (1, VIEWS)
     predict(model, [0], start_frame=frames(VIEWS, seed=9))
     assert (len(loads), len(images)) == (1, 2 * VIEWS)
+
+
+def test_an_adapter_in_the_checkpoint_is_used_and_can_be_taken_away(
+    folder: Path, tmp_path: Path
+) -> None:
+    plain = load(folder)
+    before = predict(plain, [0])
+    trained = load_checkpoint(folder).transformer
+    add_adapter(trained, rank=2)
+    with torch.no_grad():
+        for name, parameter in trained.named_parameters():
+            if 'lora_B' in name:
+                parameter.fill_(0.3)
+    copied = Path(shutil.copytree(folder, tmp_path / 'checkpoint'))
+    save_adapter(trained, copied / 'adapter')
+    model = load(copied)
+    assert np.abs(predict(model, [0]).astype(int) - before).max() > 1
+    model.use_adapter(None)
+    assert np.abs(predict(model, [0]).astype(int) - before).max() <= 1
 
 
 @pytest.mark.parametrize(('scale', 'passes'), [(1.0, 1), (5.0, 2)])

@@ -1,0 +1,184 @@
+"""LoRA adapters: trained beside frozen weights, saved apart, exchanged in a loaded model."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+import torch
+from torch import Tensor
+
+from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.model.lora_keys import Factors, METADATA, read_lora
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+
+ADAPTER = 'pytorch_lora_weights.safetensors'
+#: weights that are trained whole and saved beside the adapter: phi, views, the way in
+BESIDE = ('ref_conv.', 'view_embedding', 'patch_embedding.')
+BESIDE_FILE = 'beside.safetensors'
+BASE_FILE = 'base.json'
+#: the paper's targets: queries, keys, values, outputs and the feed-forward layers
+TARGETS = ('to_q', 'to_k', 'to_v', 'to_out.0', 'ffn.net.0.proj', 'ffn.net.2')
+_NAME = 'adapter'
+
+
+def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: float = 32) -> None:
+    """Freezes the transformer and adds a trainable adapter that changes nothing yet.
+
+    Args:
+        transformer: whose phi, view embedding and patch embedding stay trainable as they are.
+        rank: of the adapter's factors (the paper's: 32).
+        alpha: the factors' product counts alpha / rank.
+
+    Raises:
+        ConfigError: peft is not installed.
+    """
+    _check_peft()
+    from peft import LoraConfig
+
+    transformer.requires_grad_(False)
+    config: Any = LoraConfig(r=rank, lora_alpha=alpha, target_modules=list(TARGETS))  # type: ignore[arg-type]
+    transformer.add_adapter(config, adapter_name=_NAME)
+    for parameter in beside(transformer).values():
+        parameter.requires_grad_(True)
+
+
+def beside(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
+    """Returns the weights that are saved beside an adapter, by name."""
+    return {n: p for n, p in transformer.named_parameters() if n.startswith(BESIDE)}
+
+
+def save_adapter(transformer: MultiViewWanTransformer, folder: Path) -> None:
+    """Writes the adapter's folder; it appears under its name only when it is whole.
+
+    The adapter itself is in diffusers' layout.
+    """
+    from peft.utils import get_peft_model_state_dict
+
+    partial = folder.with_name(folder.name + '.partial')
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    config = json.dumps(transformer.peft_config[_NAME].to_dict(), default=list, sort_keys=True)
+    _save(get_peft_model_state_dict(transformer, adapter_name=_NAME), partial / ADAPTER, config)
+    _save(beside(transformer), partial / BESIDE_FILE)
+    (partial / BASE_FILE).write_text(json.dumps(_base(transformer), indent=2) + '\n')
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:
+    metadata = {'format': 'pt', **({METADATA: config} if config else {})}
+    save_file({n: t.detach().contiguous() for n, t in tensors.items()}, file, metadata)
+
+
+class Adapters:
+    """Exchanges the adapter of a loaded transformer; the weights under it are not touched.
+
+    Args:
+        transformer: loaded, without an adapter.
+    """
+
+    def __init__(self, transformer: MultiViewWanTransformer) -> None:
+        self._transformer = transformer
+        self._beside = {n: p.detach().clone() for n, p in beside(transformer).items()}
+        self.current: Path | None = None
+
+    def use(self, path: Path | None) -> None:
+        """Takes another adapter, or none; where that fails, the one before stays.
+
+        Args:
+            path: a folder of ours, or a LoRA file of DiffSynth-Studio or VideoX-Fun; None = none.
+
+        Raises:
+            CheckpointError: it cannot be read, or is for another model.
+            ConfigError: peft is not installed.
+        """
+        if path is None:
+            factors, whole = {}, {}
+        else:
+            _check_peft()
+            factors, whole = self._read(path)
+        self._transformer.unload_lora()
+        self._fill({**self._beside, **whole})
+        if factors:
+            self._inject(factors)
+        self.current = path
+
+    def merge(self) -> None:
+        """Adds the adapter into the weights for good: faster, and no exchange from then on."""
+        self._transformer.fuse_lora()
+        self._transformer.unload_lora()
+
+    def _read(self, path: Path) -> tuple[dict[str, Factors], dict[str, Tensor]]:
+        if path.is_file():
+            return read_lora(path, self._transformer), {}
+        if not (path / ADAPTER).is_file():
+            raise CheckpointError(
+                f"'{path}' is no adapter: expected a folder with {ADAPTER}, or a .safetensors "
+                'file of DiffSynth-Studio or VideoX-Fun'
+            )
+        self._check_base(path)
+        return read_lora(path / ADAPTER, self._transformer), self._read_beside(path)
+
+    def _check_base(self, path: Path) -> None:
+        file = path / BASE_FILE
+        mine = _base(self._transformer)
+        theirs = json.loads(file.read_text()) if file.is_file() else mine
+        for key, value in mine.items():
+            if theirs.get(key) != value:
+                raise CheckpointError(
+                    f"adapter '{path}' was trained on a transformer of {key} {theirs.get(key)}, "
+                    f'this one has {value}; load the checkpoint it was trained on'
+                )
+
+    def _read_beside(self, path: Path) -> dict[str, Tensor]:
+        file = path / BESIDE_FILE
+        if not file.is_file():
+            return {}
+        try:
+            whole = load_file(file)
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
+        for name, value in whole.items():
+            held = self._beside.get(name)
+            if held is None or held.shape != value.shape:
+                expected = 'none' if held is None else list(held.shape)
+                raise CheckpointError(
+                    f"'{file}': '{name}' has shape {list(value.shape)}, expected {expected}"
+                )
+        return whole
+
+    @torch.no_grad()
+    def _fill(self, whole: dict[str, Tensor]) -> None:
+        for name, parameter in beside(self._transformer).items():
+            parameter.copy_(whole[name])
+
+    def _inject(self, factors: dict[str, Factors]) -> None:
+        transformer = self._transformer
+        tensors = {}
+        for name, pair in factors.items():
+            tensors[f'{name}.lora_A.weight'] = pair.A.float()
+            tensors[f'{name}.lora_B.weight'] = pair.B.float()
+        device, dtype = transformer.device, transformer.dtype
+        transformer.load_lora_adapter(tensors, prefix=None, adapter_name=_NAME)  # type: ignore[arg-type]
+        torch.nn.Module.to(transformer, device=device, dtype=dtype)
+
+
+def _base(transformer: MultiViewWanTransformer) -> dict[str, Any]:
+    """What must be equal where an adapter is used and where it was trained."""
+    config: Any = transformer.config
+    names = ('num_layers', 'num_attention_heads', 'attention_head_dim', 'in_channels', 'num_views')
+    return {name: config[name] for name in names}
+
+
+def _check_peft() -> None:
+    if find_spec('peft') is None:
+        raise ConfigError(
+            "LoRA adapters need the package 'peft'; install it with "
+            "pip install 'mtv_world_ros[wan]'"
+        )

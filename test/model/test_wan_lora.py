@@ -1,0 +1,232 @@
+"""LoRA adapters: trained, saved with what goes beside them, merged, exchanged, foreign ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file, save_file
+import torch
+from torch import Tensor
+from wan_files import CLIP_DIM, DIM, FFN, TEXT_DIM, TRANSFORMER
+
+from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.lora import ADAPTER, Adapters, add_adapter, save_adapter
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.config import load_training_config
+
+RANK = 4
+
+
+def build(seed: int = 0, **changes: object) -> MultiViewWanTransformer:
+    torch.manual_seed(seed)
+    model = MultiViewWanTransformer(**{**TRANSFORMER, **changes}).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return model
+
+
+def run(model: MultiViewWanTransformer) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator).to(model.dtype)
+
+    with torch.inference_mode():
+        return model(
+            random(1, 2, 16, 2, 4, 4),
+            torch.tensor([500.0]),
+            control=random(1, 2, 16, 2, 4, 4),
+            start=random(1, 2, 16, 2, 4, 4),
+            reference=random(1, 2, 16, 4, 4),
+            encoder_hidden_states=random(1, 512, TEXT_DIM),
+            encoder_hidden_states_image=random(1, 2 * 257, CLIP_DIM),
+        )
+
+
+def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:
+    """Saves an adapter that changes everything it may; returns the output with it."""
+    model = build()
+    add_adapter(model, rank=RANK, alpha=alpha)
+    torch.manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.requires_grad:
+                parameter.add_(0.2 * torch.randn_like(parameter))
+    save_adapter(model, folder)
+    return run(model)
+
+
+def test_the_papers_adapter_has_the_known_size() -> None:
+    """Rank 32 on queries, keys, values, outputs and feed-forward layers: 43.75 M on the 1.3B."""
+    with torch.device('meta'):
+        model = MultiViewWanTransformer(**load_training_config('wan-1.3b').transformer)
+    add_adapter(model)
+    lora = sum(p.numel() for n, p in model.named_parameters() if '.lora_' in n)
+    assert lora == 30 * (8 * 32 * 2 * 1536 + 2 * 32 * (1536 + 8960)) == 43_745_280
+    others = {n for n, p in model.named_parameters() if p.requires_grad and '.lora_' not in n}
+    assert others == {
+        'ref_conv.weight',
+        'ref_conv.bias',
+        'view_embedding',
+        'patch_embedding.weight',
+        'patch_embedding.bias',
+    }
+
+
+def test_a_new_adapter_changes_nothing() -> None:
+    model = build()
+    before = run(model)
+    add_adapter(model, rank=RANK)
+    torch.testing.assert_close(run(model), before, rtol=0, atol=1e-5)
+
+
+def test_saved_and_loaded_gives_the_same_output(tmp_path: Path) -> None:
+    expected = trained(tmp_path / 'adapter')
+    model = build()
+    before = run(model)
+    assert not torch.allclose(expected, before, atol=0.1)
+    Adapters(model).use(tmp_path / 'adapter')
+    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-5)
+    assert {path.name for path in (tmp_path / 'adapter').iterdir()} == {
+        ADAPTER,
+        'beside.safetensors',
+        'base.json',
+    }
+
+
+def test_merged_gives_the_same_output_without_an_adapter(tmp_path: Path) -> None:
+    expected = trained(tmp_path / 'adapter')
+    model = build()
+    names = set(model.state_dict())
+    adapters = Adapters(model)
+    adapters.use(tmp_path / 'adapter')
+    adapters.merge()
+    assert set(model.state_dict()) == names
+    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
+
+
+def test_adapters_are_exchanged_in_a_loaded_model(tmp_path: Path) -> None:
+    first, second = trained(tmp_path / 'a'), trained(tmp_path / 'b', seed=6)
+    model = build()
+    before = run(model)
+    adapters = Adapters(model)
+    for path, expected in (('a', first), ('b', second), ('a', first)):
+        adapters.use(tmp_path / path)
+        torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-5)
+    adapters.use(None)
+    torch.testing.assert_close(run(model), before, rtol=0, atol=1e-5)
+    for name, value in build().state_dict().items():
+        assert torch.equal(model.state_dict()[name], value), name
+
+
+def test_a_failed_exchange_leaves_the_adapter_before(tmp_path: Path) -> None:
+    expected = trained(tmp_path / 'a')
+    model = build()
+    adapters = Adapters(model)
+    adapters.use(tmp_path / 'a')
+    (tmp_path / 'broken.safetensors').write_bytes(b'no safetensors')
+    with pytest.raises(CheckpointError, match='cannot be loaded'):
+        adapters.use(tmp_path / 'broken.safetensors')
+    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-5)
+    assert adapters.current == tmp_path / 'a'
+
+
+def test_the_number_format_of_the_model_stays(tmp_path: Path) -> None:
+    trained(tmp_path / 'a')
+    model = torch.nn.Module.to(build(), torch.bfloat16)
+    Adapters(model).use(tmp_path / 'a')
+    assert {parameter.dtype for parameter in model.parameters()} == {torch.bfloat16}
+    assert torch.isfinite(run(model)).all()
+
+
+#: module names: in Wan's files, in diffusers' class, inputs, outputs
+MODULES = (
+    ('blocks.0.self_attn.q', 'blocks.0.attn1.to_q', DIM, DIM),
+    ('blocks.1.cross_attn.o', 'blocks.1.attn2.to_out.0', DIM, DIM),
+    ('blocks.1.cross_attn.k_img', 'blocks.1.attn2.add_k_proj', DIM, DIM),
+    ('blocks.0.ffn.0', 'blocks.0.ffn.net.0.proj', DIM, FFN),
+    ('blocks.1.ffn.2', 'blocks.1.ffn.net.2', FFN, DIM),
+    ('head.head', 'proj_out', DIM, 64),
+)
+
+
+def factors(scale: float = 1.0) -> dict[str, tuple[Tensor, Tensor]]:
+    generator = torch.Generator().manual_seed(7)
+
+    def random(*shape: int) -> Tensor:
+        return scale * torch.randn(shape, generator=generator)
+
+    return {name: (random(RANK, i), random(o, RANK)) for name, _, i, o in MODULES}
+
+
+def diffsynth(pairs: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    keys = {}
+    for name, (a, b) in pairs.items():
+        keys |= {f'{name}.lora_A.default.weight': a, f'{name}.lora_B.default.weight': b}
+    return keys
+
+
+def videox(pairs: dict[str, tuple[Tensor, Tensor]], alpha: float) -> dict[str, Tensor]:
+    keys = {}
+    for name, (a, b) in pairs.items():
+        flat = f'lora_unet__{name.replace(".", "_")}'
+        keys |= {f'{flat}.lora_down.weight': a, f'{flat}.lora_up.weight': b}
+        keys[f'{flat}.alpha'] = torch.tensor(alpha)
+    return keys
+
+
+@pytest.mark.parametrize('layout', ['diffsynth', 'prefixed', 'videox'])
+def test_loras_of_others_add_their_product_to_the_weights(tmp_path: Path, layout: str) -> None:
+    pairs = factors(0.2)
+    keys = {
+        'diffsynth': diffsynth(pairs),
+        'prefixed': {f'diffusion_model.{k}': v for k, v in diffsynth(pairs).items()},
+        'videox': videox(pairs, alpha=2.0),
+    }[layout]
+    save_file(keys, tmp_path / 'lora.safetensors')
+    expected = build()
+    scale = 2.0 / RANK if layout == 'videox' else 1.0
+    with torch.no_grad():
+        for name, ours, *_ in MODULES:
+            a, b = pairs[name]
+            expected.get_parameter(f'{ours}.weight').add_(scale * b @ a)
+    model = build()
+    before = run(model)
+    Adapters(model).use(tmp_path / 'lora.safetensors')
+    torch.testing.assert_close(run(model), run(expected), rtol=0, atol=1e-4)
+    assert not torch.allclose(run(model), before, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ('key', 'value', 'message'),
+    [
+        ('blocks.7.self_attn.q.lora_A.weight', torch.zeros(4, DIM), r"'blocks\.7\..* is no layer"),
+        ('blocks.0.self_attn.k.lora_A.weight', torch.zeros(4, DIM), 'one of its two factors'),
+        ('blocks.0.self_attn.q.lora_B.default.weight', torch.zeros(99, 4), 'for another size'),
+        ('lora_te_encoder.lora_down.bias', torch.zeros(4), 'it is for a text encoder'),
+        ('blocks.0.self_attn.q.diff_b', torch.zeros(DIM), 'whole differences'),
+    ],
+)
+def test_a_lora_of_another_model_is_refused(
+    tmp_path: Path, key: str, value: Tensor, message: str
+) -> None:
+    save_file({**diffsynth(factors()), key: value}, tmp_path / 'lora.safetensors')
+    with pytest.raises(CheckpointError, match=message):
+        Adapters(build()).use(tmp_path / 'lora.safetensors')
+
+
+def test_adapters_of_another_transformer_and_pickles_are_refused(tmp_path: Path) -> None:
+    trained(tmp_path / 'a')
+    with pytest.raises(CheckpointError, match='of num_layers 2, this one has 3'):
+        Adapters(build(num_layers=3)).use(tmp_path / 'a')
+    whole = load_file(tmp_path / 'a' / 'beside.safetensors')
+    save_file({**whole, 'view_embedding': torch.zeros(1, DIM)}, tmp_path / 'a/beside.safetensors')
+    with pytest.raises(CheckpointError, match=r"'view_embedding' has shape \[1, 24\], expected"):
+        Adapters(build()).use(tmp_path / 'a')
+    with pytest.raises(CheckpointError, match='is no adapter: expected a folder with'):
+        Adapters(build()).use(tmp_path)
+    (tmp_path / 'lora.pth').write_bytes(b'')
+    with pytest.raises(CheckpointError, match='never read'):
+        Adapters(build()).use(tmp_path / 'lora.pth')
