@@ -42,6 +42,10 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return '\n'.join('| ' + ' | '.join(map(str, line)) + ' |' for line in lines)
 
 
+def _number(count: int, noun: str) -> str:
+    return f'{count} {noun}{"" if count == 1 else "s"}'
+
+
 def _counts(first: str, groups: Mapping[str, Mapping[str, Any]]) -> str:
     head = (first, 'episodes', 'success', 'failure', 'expert success before filtering', 'length')
     rows = []
@@ -178,11 +182,12 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
         [(f'`{key}`', KEYS.get(key, ''), f'`{text}`') for key, text in metadata.items()],
     )
     again = '\n'.join(commands(card, entries))
-    return f"""# {what}: {len(card['tasks'])} tasks, {len(entries)} episodes
+    size = f'{_number(len(entries), "episode")} of {_number(len(card["tasks"]), "task")}'
+    return f"""# {what}: {size}
 
-Two YAM arms in MuJoCo, a scripted expert; {outcomes['success']} episodes succeed and in
-{outcomes['failure']} the gripper misses and the motion goes on. Each episode is a rosbag2 MCAP
-folder like a robot's recording. `dataset.json` says the same as this page, and more, as data.
+Two YAM arms in MuJoCo and a scripted expert. {_number(outcomes['success'], 'episode')} with
+success; in the other {outcomes['failure']} a grasp misses and the motion goes on. Each episode
+is a rosbag2 MCAP folder like a robot's recording; `dataset.json` has this page's numbers, and more.
 
 ![a success and a failure of every task]({SHEET_FILE})
 

@@ -119,13 +119,10 @@ def test_the_command_on_the_card_makes_the_same_set(make):
     ]
     entries.append(make('shake_bottle', 2))
     rest = ','.join(sorted(set(tasks) - {'shake_bottle'}))
-    assert (
-        sorted(commands(_card(entries), entries))
-        == [
-            'mtv-world collect --task shake_bottle --episodes 3 --seed 3 --out DIR',
-            f'mtv-world collect --task {rest} --episodes 2 --seed 3 --out DIR',
-        ][:: 1 if rest > 'shake_bottle' else -1]
-    )
+    assert set(commands(_card(entries), entries)) == {
+        'mtv-world collect --task shake_bottle --episodes 3 --seed 3 --out DIR',
+        f'mtv-world collect --task {rest} --episodes 2 --seed 3 --out DIR',
+    }
 
 
 def test_the_card_of_a_zero_shot_set_gives_one_command_where_kinds_took_turns(make):
@@ -139,7 +136,7 @@ def test_the_card_of_a_zero_shot_set_gives_one_command_where_kinds_took_turns(ma
 def test_the_text_says_what_is_in_the_written_episodes(make, tmp_path):
     entries = [make('stack_blocks_two', 0, frames=8), make('stack_blocks_two', 1, 'failure', 8)]
     text = readme(tmp_path, _card(entries), entries)
-    assert '# Simulated benchmark: 1 tasks, 2 episodes' in text
+    assert '# Simulated benchmark: 2 episodes of 1 task\n' in text
     assert '| stack_blocks_two | 2 | 1 | 1 | 100 % of 1 | 0.7 s, 8 frames |' in text
     assert '1 train, 1 test' in text
     # focal length, position and angle of the camera as written above
