@@ -31,6 +31,8 @@ PERCENTILES = (1.0, 99.0)
 CLIP = {POLICY2VEC: 1.5, EE_MLP: 1.0, FAST_TOKENS: 1.5}
 #: half of the least range that is stretched to [-1, 1] [m or rad]: below is noise
 _LEAST_HALF_RANGE = 1e-3
+#: cosine of the pitch from which on yaw is not told from roll
+_VERTICAL = 1e-9
 
 
 def check_control(name: str) -> None:
@@ -69,11 +71,18 @@ def tool_features(robot: RobotModel, positions: FloatArray) -> FloatArray:
 
 
 def roll_pitch_yaw(rotations: FloatArray) -> FloatArray:
-    """Returns (..., 3) angles [rad] of (..., 3, 3): R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Returns (..., 3) angles [rad] of (..., 3, 3): R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Straight up and down, where roll and yaw turn about the same axis, yaw is zero.
+    """
     r = rotations
-    roll = np.arctan2(r[..., 2, 1], r[..., 2, 2])
-    pitch = np.arctan2(-r[..., 2, 0], np.hypot(r[..., 0, 0], r[..., 1, 0]))
-    yaw = np.arctan2(r[..., 1, 0], r[..., 0, 0])
+    level = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    pitch = np.arctan2(-r[..., 2, 0], level)
+    yaw = np.where(level < _VERTICAL, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    sine, cosine = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(
+        sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
+    )
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
