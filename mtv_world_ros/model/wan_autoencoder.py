@@ -51,6 +51,11 @@ class WanAutoencoder(nn.Module):
         return self.vae.dtype
 
     @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.vae.device
+
+    @property
     def config(self) -> Any:
         """The arguments that it was built with."""
         return self.vae.config

@@ -5,14 +5,24 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from diffusers import FlowMatchEulerDiscreteScheduler
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.errors import CheckpointError, RolloutPreempted
 from mtv_world_ros.model.conditioning import Conditioning
-from mtv_world_ros.model.sampler import sample_latents
+from mtv_world_ros.model.parts import build_scheduler, Scheduler
+from mtv_world_ros.model.sampler import sample_latents, set_timesteps
 
 CLEAN = torch.linspace(-1, 1, 2 * 12 * 3 * 4 * 4).reshape(1, 2, 12, 3, 4, 4)
+EULER = {'_class_name': 'FlowMatchEulerDiscreteScheduler', 'shift': 5.0}
+UNIPC = {
+    '_class_name': 'UniPCMultistepScheduler',
+    'prediction_type': 'flow_prediction',
+    'use_flow_sigmas': True,
+    'flow_shift': 5.0,
+}
 
 
 class Oracle:
@@ -24,30 +34,104 @@ class Oracle:
         self.prediction = prediction
         self.config = SimpleNamespace(prediction=prediction)
 
-    def __call__(self, noisy: torch.Tensor, timestep: torch.Tensor, **_: object) -> torch.Tensor:
+    def __call__(self, noisy: Tensor, timestep: Tensor, **_: object) -> Tensor:
         if self.prediction == 'sample':
-            return CLEAN
+            return CLEAN.expand_as(noisy)
         return (noisy - CLEAN) / (timestep[0] / 1000)
 
 
-def sample(prediction: str = 'sample', steps: int = 4, should_stop=lambda: False, seed: int = 0):
+class ConstantFlow:
+    """Predicts the mean of its text as the flow everywhere."""
+
+    dtype = torch.float32
+    prediction = 'flow'
+
+    def __call__(
+        self, noisy: Tensor, timestep: Tensor, *, encoder_hidden_states: Tensor, **_: object
+    ) -> Tensor:
+        del timestep
+        return torch.full_like(noisy, encoder_hidden_states.mean().item())
+
+
+def sample(
+    prediction: str = 'sample',
+    steps: int = 4,
+    should_stop=lambda: False,
+    seeds: tuple[int, ...] = (0,),
+    scheduler: Scheduler | None = None,
+    model: object = None,
+    **more: object,
+) -> Tensor:
+    texts = {name: more.pop(name) for name in ('text', 'negative_text') if name in more}
     conditioning = Conditioning(
-        control=CLEAN, start_control=CLEAN[:, :, :, 0], start=CLEAN, reference=CLEAN[:, :, :, 0]
+        control=CLEAN,
+        start_control=CLEAN[:, :, :, 0],
+        start=CLEAN,
+        reference=CLEAN[:, :, :, 0],
+        **texts,
     )
     return sample_latents(
-        Oracle(prediction),  # type: ignore[arg-type]
-        FlowMatchEulerDiscreteScheduler(shift=5.0),
+        model or Oracle(prediction),
+        scheduler or FlowMatchEulerDiscreteScheduler(shift=5.0),
         conditioning,
-        seeds=[seed],
+        seeds=seeds,
         num_inference_steps=steps,
         should_stop=should_stop,
+        **more,
     )
 
 
 @pytest.mark.parametrize('prediction', ['sample', 'flow'])
 @pytest.mark.parametrize('steps', [1, 4, 13])
-def test_reaches_what_a_perfect_predictor_predicts(prediction: str, steps: int) -> None:
-    torch.testing.assert_close(sample(prediction, steps), CLEAN, rtol=0, atol=1e-5)
+@pytest.mark.parametrize('config', [EULER, UNIPC], ids=['euler', 'unipc'])
+def test_reaches_what_a_perfect_predictor_predicts(
+    prediction: str, steps: int, config: dict
+) -> None:
+    reached = sample(prediction, steps, scheduler=build_scheduler(config))
+    # UniPC tells the model whole time steps, so this oracle's flow is off by up to 1 / 1000
+    tolerance = 5e-3 if (config, prediction) == (UNIPC, 'flow') else 1e-5
+    torch.testing.assert_close(reached, CLEAN, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize('steps', [4, 50])
+def test_noise_levels_are_spread_and_shifted_as_wan_does(steps: int) -> None:
+    """`s * sigma / (1 + (s - 1) * sigma)`; Euler's last one is 1 / n, UniPC's an n-th of 1000."""
+    levels = {
+        'euler': (EULER, np.linspace(1, 1 / steps, steps), 1e-6),
+        'unipc': (UNIPC, np.linspace(1, 1 / 1000, steps + 1)[:-1], 2e-6),
+    }
+    for config, plain, tolerance in levels.values():
+        scheduler = build_scheduler(config)
+        set_timesteps(scheduler, steps, torch.device('cpu'))
+        expected = 5.0 * plain / (1 + 4.0 * plain)
+        sigmas = np.asarray(scheduler.sigmas)
+        np.testing.assert_allclose(sigmas[:-1], expected, atol=tolerance)
+        assert sigmas[-1] == 0
+        timesteps = np.asarray(scheduler.timesteps)
+        np.testing.assert_allclose(timesteps, 1000 * expected, rtol=0, atol=1.0)
+
+
+def test_a_seed_gives_the_same_noise_alone_and_in_a_batch() -> None:
+    still = {'model': ConstantFlow(), 'text': torch.zeros(1, 512, 1)}
+    together = sample(seeds=(3, 8), **still)
+    assert together.shape == (2, *CLEAN.shape[1:])
+    for index, seed in enumerate((3, 8)):
+        noise = torch.randn(CLEAN.shape, generator=torch.Generator().manual_seed(seed))
+        torch.testing.assert_close(together[index : index + 1], noise)
+        torch.testing.assert_close(sample(seeds=(seed,), **still), noise)
+
+
+@pytest.mark.parametrize(('scale', 'flow'), [(1.0, 2.0), (3.0, 0.5 + 3.0 * (2.0 - 0.5))])
+def test_guidance_goes_beyond_the_prompt(scale: float, flow: float) -> None:
+    """A constant flow moves the noise by itself: the levels go from 1 to 0."""
+    moved = sample(
+        model=ConstantFlow(),
+        text=torch.full((1, 512, 1), 2.0),
+        negative_text=torch.full((1, 512, 1), 0.5),
+        guidance_scale=scale,
+    )
+    noise = torch.randn(CLEAN.shape, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(moved, noise - flow, rtol=0, atol=1e-5)
 
 
 def test_stops_between_steps() -> None:
@@ -59,3 +143,16 @@ def test_stops_between_steps() -> None:
 
     with pytest.raises(RolloutPreempted, match='after 2 of 4 denoising steps'):
         sample(should_stop=should_stop)
+
+
+@pytest.mark.parametrize(
+    ('config', 'message'),
+    [
+        ({'_class_name': 'DDIMScheduler'}, "'DDIMScheduler' is not one of FlowMatchEuler"),
+        ({**UNIPC, 'prediction_type': 'epsilon'}, 'prediction_type: flow_prediction'),
+        ({'_class_name': 'UniPCMultistepScheduler'}, 'use_flow_sigmas: true'),
+    ],
+)
+def test_a_schedule_without_flow_matching_is_refused(config: dict, message: str) -> None:
+    with pytest.raises(CheckpointError, match=message):
+        build_scheduler(config)
