@@ -180,7 +180,7 @@ class EpisodeScorer:
         with found.timed('scoring'):
             predicted = object_scores(masks, truth.masks)
         others = self._controls(recording, stretch, donor, truth, found)
-        others |= self._ceilings(real, truth, found)
+        others |= self._ceilings(stretch, truth, found)
         views = self.pipeline.spec.views
         with found.timed('scoring'):
             found.rows += score_rows(stretch, views, truth, predicted, others)
@@ -249,14 +249,14 @@ class EpisodeScorer:
             scores[name] = self._scored(predicted_frames(chunks), truth, found)
         return scores
 
-    def _ceilings(self, real: ByteArray, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
+    def _ceilings(self, stretch: Stretch, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
         """Scores of the recorded frames: as they are, and through the autoencoder."""
         if not self.config.ceiling:
             return {}
-        scores = {'self': self._scored(real, truth, found)}
+        scores = {'self': self._scored(stretch.frames[:, 1:], truth, found)}
         if self.instruments.reconstruct is not None:
             with found.timed('imagining'):
-                back = self.instruments.reconstruct(real)
+                back = self.instruments.reconstruct(stretch.frames)
             scores['ceiling'] = self._scored(back, truth, found)
         return scores
 
