@@ -1,7 +1,7 @@
-"""How well does the weight-free colour segmenter find the simulator's objects?
+"""How well does a segmenter, by default the weight-free one, find the simulator's objects?
 
     mtv-world collect --task all --episodes 3 --seed 9000 --out EPISODES
-    python benchmark/segmenter.py EPISODES [--out benchmark/results]
+    python benchmark/segmenter.py EPISODES [--segmenter sam2] [--out benchmark/results]
 
 Scores it on the recorded frames against the simulator's masks, in windows of 17 frames as in
 serving, and counts the frames in which it was wrong and did not say so.
@@ -26,7 +26,8 @@ from mtv_world_ros.data_types import ByteArray, ObjectMasks, WorldModelSpec
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.jaccard import jaccard
-from mtv_world_ros.success.segmenter import ColourSegmenter, masks_from_ids
+from mtv_world_ros.success.segmenter import masks_from_ids, Segmenter
+from mtv_world_ros.success.segmenter_choice import choose_segmenter, SEGMENTERS
 
 WINDOW = 17
 VIEWS = ('low', 'high')
@@ -86,10 +87,11 @@ CONDITIONS: tuple[tuple[str, tuple[int, int], Degrade], ...] = (
 )
 
 
-def score(recording: Recording, degrade: Degrade, seconds: list[float]) -> list[Row]:
+def score(
+    segmenter: Segmenter, recording: Recording, degrade: Degrade, seconds: list[float]
+) -> list[Row]:
     """A row per view, object and frame; adds the time of each window to `seconds`."""
     assert recording.object_ids is not None
-    segmenter = ColourSegmenter()
     rows = []
     for start in range(0, len(recording.times), WINDOW):
         window = slice(start, start + WINDOW)
@@ -157,6 +159,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('dataset', type=Path)
+    parser.add_argument('--segmenter', choices=SEGMENTERS, default='colour')
+    parser.add_argument('--device', default='cpu')
     parser.add_argument('--episodes', type=int, help='use only the first so many')
     parser.add_argument('--seed', type=int, default=9000, help='that the episodes were made with')
     parser.add_argument('--machine', default=f'cpu{os.cpu_count()}')
@@ -164,13 +168,14 @@ def main() -> None:
     options = parser.parse_args()
     paths = list_episodes(options.dataset)[: options.episodes]
     options.repeats = len(paths)
+    segmenter = choose_segmenter(options.segmenter, device=options.device)
     lines, kept = [], []
     loaded: dict[tuple[int, int], list[Recording]] = {}
     for title, size, degrade in CONDITIONS:
         seconds: list[float] = []
         if size not in loaded:
             loaded = {size: _recordings(paths, size)}
-        rows = [row for r in loaded[size] for row in score(r, degrade, seconds)]
+        rows = [row for r in loaded[size] for row in score(segmenter, r, degrade, seconds)]
         name = f'{title} ({size[0]} x {size[1]})'
         milliseconds = f'{1e3 * np.median(seconds):.0f}'
         lines.append([name, *_summary(rows), milliseconds])
@@ -184,9 +189,10 @@ def main() -> None:
     )
     body += page.table(('frames are', *_HEADER, 'ms'), lines) + '\n\n' + '\n'.join(kept)
     page.publish(
-        'segmenter',
-        "Colour segmenter against the simulator's masks",
-        f'python benchmark/segmenter.py EPISODES --seed {options.seed}',
+        f'segmenter_{segmenter.name.replace("+", "_")}',
+        f"Segmenter `{segmenter.name}` against the simulator's masks",
+        f'python benchmark/segmenter.py EPISODES --segmenter {options.segmenter} '
+        f'--seed {options.seed}',
         body,
         options,
         f'OpenCV {cv2.__version__}',

@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from tiny_vision import save_sam2
@@ -5,9 +7,11 @@ import torch
 
 from mtv_world_ros.errors import ModelMemoryError, ObservationError
 from mtv_world_ros.success.grounding import GroundingConfig, MMGroundingDino
+from mtv_world_ros.success.jaccard import jaccard
 from mtv_world_ros.success.prompted_segmenter import PromptedSegmenter
 from mtv_world_ros.success.sam2_segmenter import BoxedFinder, sam2_segmenter, Sam2Video
 from mtv_world_ros.success.sam3_segmenter import sam3_segmenter
+from mtv_world_ros.success.segmenter_choice import choose_segmenter, WEIGHTS_VARIABLE
 from mtv_world_ros.success.tracking import TrackingConfig
 
 HEIGHT, WIDTH = 48, 64
@@ -166,6 +170,22 @@ def test_device_without_memory_says_what_to_set(segmenter, monkeypatch):
     monkeypatch.setattr(type(segmenter.video), 'advance', full)
     with pytest.raises(ModelMemoryError, match=f"'{segmenter.name}' does not fit on 'cpu'.*set"):
         segmenter.segment(frames(), NAMES, first_masks=start_masks())
+
+
+@pytest.mark.weights
+def test_public_weights_outline_two_blocks():
+    segmenter = choose_segmenter()
+    if segmenter.name == 'colour':
+        pytest.skip(f'no MM-Grounding-DINO and SAM 2 in {os.environ[WEIGHTS_VARIABLE]}')
+    scene = np.full((1, 3, 240, 320, 3), 150, np.uint8)
+    true = np.zeros((1, 2, 3, 240, 320), bool)
+    for index in range(3):
+        true[0, 0, index, 100:150, 60 + 5 * index : 110 + 5 * index] = True
+        true[0, 1, index, 120:170, 200:250] = True
+    scene[true[:, 0]], scene[true[:, 1]] = (210, 25, 35), (15, 105, 220)
+    found = segmenter.segment(scene, ('red square', 'blue square'))
+    assert found.status == (('ok', 'ok'),)
+    assert jaccard(found.masks, true).min() > 0.8
 
 
 @pytest.mark.gpu
