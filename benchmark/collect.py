@@ -47,7 +47,9 @@ def main() -> None:
 def _body(spent: list[Spent], total: float, config: CollectConfig) -> str:
     num, frames = len(spent), sum(item.num_frames for item in spent)
     size = config.randomization
-    seconds = {name: sum(getattr(item, part) for item in spent) for name, part in PARTS.items()}
+    seconds = {
+        name: float(sum(getattr(item, part) for item in spent)) for name, part in PARTS.items()
+    }
     seconds['other'] = total - sum(seconds.values())
     rows = [
         (name, f'{value / num:.2f}', f'{100 * value / total:.0f} %')

@@ -187,7 +187,7 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
 
 Two YAM arms in MuJoCo and a scripted expert. {_number(outcomes['success'], 'episode')} with
 success; in the other {outcomes['failure']} a grasp misses and the motion goes on. Each episode
-is a rosbag2 MCAP folder like a robot's recording; `dataset.json` has this page's numbers, and more.
+is a rosbag2 MCAP folder like a robot's recording; `dataset.json` says the same, and more, as data.
 
 ![a success and a failure of every task]({SHEET_FILE})
 
