@@ -9,17 +9,24 @@ both views. Writing: JPEG, PNG, MCAP.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
 from pathlib import Path
 import tempfile
 import time
 
+import numpy as np
 from page import parse_arguments, publish, table
 
-from mtv_world_ros.sim.episode_maker import CollectConfig, EpisodeMaker, Spent
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.sim.episode import scene_generator
+from mtv_world_ros.sim.episode_maker import CollectConfig, EpisodeMaker, ROBOT_FILE, Spent
 from mtv_world_ros.sim.jobs import jobs_of
 from mtv_world_ros.sim.opengl import load_mujoco
-from mtv_world_ros.sim.tasks import tasks_named
+from mtv_world_ros.sim.randomize import draw_scene
+from mtv_world_ros.sim.scene import scene_xml
+from mtv_world_ros.sim.tasks import task_named, tasks_named
 
 PARTS = {'planning and physics': 'physics_s', 'rendering': 'rendering_s', 'writing': 'writing_s'}
 
@@ -38,13 +45,42 @@ def main() -> None:
         'collect',
         'Collecting episodes',
         'python benchmark/collect.py',
-        _body(spent, total, config),
+        _body(spent, total, config, options.seed),
         options,
         f'MuJoCo {load_mujoco().__version__}, MUJOCO_GL {os.environ["MUJOCO_GL"]}',
     )
 
 
-def _body(spent: list[Spent], total: float, config: CollectConfig) -> str:
+def _image_parts(config: CollectConfig, seed: int) -> str:
+    """What an image is made of: the same one with nothing, the table alone, and everything."""
+    mujoco = load_mujoco()
+    robot = load_robot(share_path(*ROBOT_FILE))
+    scene = draw_scene(task_named('collect_food'), scene_generator(seed), config.randomization)
+    model = mujoco.MjModel.from_xml_string(scene_xml(scene, robot))
+    data, size = mujoco.MjData(model), config.randomization
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, size.height, size.width) as renderer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        renderer.update_scene(data, 'low')
+        count = renderer.scene.ngeom
+        # the table is the first geom of the world
+        shown = {'nothing': 0, 'the table alone': 1, f'all {count} geoms': count}
+        rows = []
+        for name, number in shown.items():
+            renderer.scene.ngeom = number
+            times = [_spent(renderer.render) for _ in range(50)]
+            rows.append((name, f'{1e3 * float(np.median(times)):.2f}'))
+    return table(('an image of', 'CPU-ms'), rows)
+
+
+def _spent(call: Callable[[], object]) -> float:
+    begun = time.process_time()
+    call()
+    return time.process_time() - begun
+
+
+def _body(spent: list[Spent], total: float, config: CollectConfig, seed: int) -> str:
     num, frames = len(spent), sum(item.num_frames for item in spent)
     size = config.randomization
     seconds = {
@@ -57,12 +93,14 @@ def _body(spent: list[Spent], total: float, config: CollectConfig) -> str:
     ]
     images = 4 * frames  # two views, RGB and masks, of the episodes that were kept
     return (
-        f'{(__doc__ or "").strip().splitlines()[-3]}\n'
+        f'{(__doc__ or "").strip().split(chr(10) * 2)[-1]}\n\n'
         f'{num} episodes of {frames / num:.0f} frames x 2 views at {size.width} x {size.height} '
         f'px, CPU seconds an episode:\n\n'
         f'{table(("part", "CPU-s an episode", "share"), rows)}\n\n'
         f'**{60 * num / total:.0f} episodes a minute a core** '
-        f'({1e3 * seconds["rendering"] / images:.1f} ms of rendering an image or mask).'
+        f'({1e3 * seconds["rendering"] / images:.1f} ms of rendering an image or mask). Bound by '
+        f'drawing: with no GPU an image costs by its triangles, less by its pixels (a scene of '
+        f'collect_food, medians of 50).\n\n{_image_parts(config, seed)}'
     )
 
 
