@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from mtv_world_ros.cli import main
 from mtv_world_ros.data.mcap_reader import iter_messages, read_episode, read_info
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.cameras import camera_model, CAMERAS
@@ -140,3 +141,18 @@ def test_a_zero_shot_set_is_for_testing_and_names_its_kinds(tmp_path):
     text = (out / 'README.md').read_text()
     assert 'mtv-world collect --zero-shot object,task,view --episodes 3 --seed 1' in text
     assert task_named(info.task).name in text
+
+
+@pytest.mark.parametrize(
+    ('options', 'reason'),
+    [
+        (['--zero-shot', 'views'], "unknown zero-shot set 'views' (did you mean 'view'?)"),
+        (['--task', 'stack_block_two'], "unknown task 'stack_block_two' (did you mean"),
+        (['--episodes', '0'], 'both must be at least 1'),
+    ],
+)
+def test_the_command_says_what_is_wrong_and_makes_nothing(options, reason, tmp_path, capsys):
+    out = tmp_path / 'set'
+    assert main(['collect', '--episodes', '1', '--out', str(out), *options]) == 1
+    assert reason in capsys.readouterr().err
+    assert not out.exists()
