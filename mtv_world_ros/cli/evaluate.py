@@ -68,6 +68,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
     parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
+    parser.add_argument(
+        '--describer',
+        type=Path,
+        metavar='YAML',
+        help='what names the objects (see config/describer.yaml); default: the episodes do',
+    )
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_dtype(parser)
     add_model_options(parser)
@@ -166,7 +172,7 @@ def _slug(label: str) -> str:
 def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, out: Path
 ) -> Summary:
-    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.assembly import assemble_describer, fingerprint, load_pipeline
     from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 
     load = partial(
@@ -195,6 +201,7 @@ def _score(
             make_pipeline=partial(load, num_threads=threads),
             threads=threads,
         ),
+        describer=arguments.describer and assemble_describer(arguments.describer),
         mode=arguments.mode,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 import time
@@ -59,12 +59,15 @@ class Job:
         name: of its results, unique in the evaluation.
         donor: the episode that lends its actions, if there is one.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+        objects: names of its objects; empty = the pipeline's, the recorded ones, or those that
+            the instruction names, in this order.
     """
 
     path: Path
     name: str
     donor: Path | None = None
     zero_shot: str = ''
+    objects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,8 +133,10 @@ class EpisodeScorer:
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
         probability, reasons = np.nan, ()
+        names = job.objects or self.pipeline.objects or recording.objects
+        names = names or objects_from_instruction(recording.instruction)
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
-            chunks = self._stretch(recording, stretch, donor, found)
+            chunks = self._stretch(recording, stretch, donor, names, found)
             probability, reasons = chunks[-1].success.probability, chunks[-1].success.reasons
             if features:
                 with found.timed('features'):
@@ -168,14 +173,25 @@ class EpisodeScorer:
             return None
 
     def _stretch(
-        self, recording: Recording, stretch: Stretch, donor: Recording | None, found: _Found
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        donor: Recording | None,
+        names: tuple[str, ...],
+        found: _Found,
     ) -> list[Prediction]:
         """Imagines and scores one stretch; returns its chunks."""
-        chunks = self._imagine(recording, stretch, recording, found)
+        chunks = self._imagine(recording, stretch, recording, names, found)
         found.chunk_seconds += [sum(chunk.seconds.values()) for chunk in chunks]
         frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
         with found.timed('segmenting'):
-            truth = self._truth(recording, stretch)
+            truth = true_masks(
+                stretch,
+                self.pipeline.segmenter,
+                names,
+                recording.objects,
+                use_ids=self.config.use_ids,
+            )
             masks = find_masks(frames, truth, self.pipeline.segmenter)
         with found.timed('scoring'):
             predicted = object_scores(masks, truth.masks)
@@ -199,11 +215,16 @@ class EpisodeScorer:
         return chunks
 
     def _imagine(
-        self, recording: Recording, stretch: Stretch, actions: Recording, found: _Found
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        actions: Recording,
+        names: tuple[str, ...],
+        found: _Found,
     ) -> list[Prediction]:
         with found.timed('imagining'):
             chunks = imagine_stretch(
-                self.pipeline,
+                replace(self.pipeline, objects=names),
                 recording,
                 stretch,
                 actions=actions,
@@ -216,16 +237,6 @@ class EpisodeScorer:
         found.seconds['imagining'] -= masks
         found.seconds['segmenting'] += masks
         return chunks
-
-    def _truth(self, recording: Recording, stretch: Stretch) -> Truth:
-        names = self.pipeline.objects or recording.objects
-        return true_masks(
-            stretch,
-            self.pipeline.segmenter,
-            names or objects_from_instruction(recording.instruction),
-            recording.objects,
-            use_ids=self.config.use_ids,
-        )
 
     def _controls(
         self,
@@ -242,7 +253,7 @@ class EpisodeScorer:
                 actions = with_actions(name, recording, stretch, donor, self.pipeline.robot)
                 if name == 'true' or actions is None:
                     continue
-                chunks = self._imagine(recording, stretch, actions, found)
+                chunks = self._imagine(recording, stretch, actions, truth.names, found)
             except MtvWorldError as error:
                 found.notes[f'{name} actions were not imagined: {error}'] = None
                 continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 import json
 import os
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.errors import DescriptionError, EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
 from mtv_world_ros.evaluation.feature_store import (
@@ -33,7 +34,9 @@ from mtv_world_ros.evaluation.statistics import Estimate
 from mtv_world_ros.evaluation.summary import Group, Summary
 from mtv_world_ros.evaluation.workers import score_all
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.success.describer import Describer
 from mtv_world_ros.success.jaccard import mean_of_known
+from mtv_world_ros.success.scene_objects import names_of
 
 #: makes the pipeline anew, in another process
 MakePipeline = Callable[[], Pipeline]
@@ -64,6 +67,7 @@ def evaluate(
     zero_shot: Mapping[Path, str] = MappingProxyType({}),
     provenance: Mapping[str, str] = MappingProxyType({}),
     parallel: Parallel | None = None,
+    describer: Describer | None = None,
     show_progress: bool = True,
     **options: Any,
 ) -> Summary:
@@ -82,6 +86,7 @@ def evaluate(
         zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
         provenance: what the results were made with, by heading; goes into metrics.json.
         parallel: processes to score with; None = this one.
+        describer: names the objects from each episode's first frame; None = see `Job.objects`.
         show_progress: draw a progress bar.
         **options: fields of `EvaluationConfig`.
 
@@ -93,7 +98,7 @@ def evaluate(
         EpisodeError: no episode can be used.
     """
     config, out = config_from(options), Path(out)
-    run = _Run(pipeline, out, name, config, parallel)
+    run = _Run(pipeline, out, name, config, parallel, describer)
     jobs = make_jobs(episode_paths, zero_shot, config.seed)
     results, failed = [], {}
     bar = tqdm(run.results(jobs), total=len(jobs), unit='ep', disable=not show_progress)
@@ -205,9 +210,10 @@ class _Run:
         name: str,
         config: EvaluationConfig,
         parallel: Parallel | None,
+        describer: Describer | None,
     ) -> None:
         self.pipeline, self.out, self.name, self.config = pipeline, out, name, config
-        self.parallel = parallel
+        self.parallel, self.describer = parallel, describer
         spec = pipeline.spec
         self.settings = {
             **config.as_json(),
@@ -220,7 +226,10 @@ class _Run:
     def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, EpisodeResult | str]]:
         """Yields jobs with their result, or why there is none."""
         left = []
-        for job in jobs:
+        for job in map(self._described, jobs):
+            if isinstance(job, tuple):
+                yield job
+                continue
             stored = self._stored(job)
             if stored is None:
                 left.append(job)
@@ -233,6 +242,22 @@ class _Run:
             values = {'settings': self._settings_of(job), 'result': outcome}
             tables.write_json(self._file(job), values)
             yield job, EpisodeResult.from_json(outcome)
+
+    def _described(self, job: Job) -> Job | tuple[Job, str]:
+        """The episode with its objects named, or why they could not be."""
+        if self.describer is None:
+            return job
+        try:
+            episode = read_episode(job.path)
+            frame = np.asarray(episode.images[self.pipeline.spec.views[0]].frames[0])
+            found = self.describer.describe(frame, episode.info.instruction)
+        except DescriptionError as error:
+            return job, f'its objects could not be named ({error.status}): {error}'
+        except MtvWorldError as error:
+            return job, str(error)
+        if not found:
+            return job, 'no object was seen in its first frame'
+        return replace(job, objects=names_of(found))
 
     def _scored(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, dict[str, Any] | str]]:
         if self.parallel is None or self.parallel.workers == 1:
@@ -253,6 +278,7 @@ class _Run:
             'path': str(job.path),
             'donor': str(job.donor),
             'zero_shot': job.zero_shot,
+            'objects': list(job.objects),
         }
 
     def _stored(self, job: Job) -> EpisodeResult | None:
