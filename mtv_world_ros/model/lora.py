@@ -166,7 +166,9 @@ class Adapters:
             tensors[f'{name}.lora_B.weight'] = pair.B.float()
         device, dtype = transformer.device, transformer.dtype
         transformer.load_lora_adapter(tensors, prefix=None, adapter_name=_NAME)  # type: ignore[arg-type]
-        torch.nn.Module.to(transformer, device=device, dtype=dtype)
+        for name, parameter in transformer.named_parameters():
+            if '.lora_' in name:
+                parameter.data = parameter.data.to(device, dtype)
 
 
 def _base(transformer: MultiViewWanTransformer) -> dict[str, Any]:

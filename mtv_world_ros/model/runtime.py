@@ -42,8 +42,20 @@ def _cpu_has_bfloat16() -> bool:
 
 
 def place(module: Module, device: torch.device, dtype: torch.dtype) -> Module:
-    """Returns the module on a device, in a number format, images channels-last."""
+    """Returns the module on a device, in a number format, images channels-last.
+
+    What the module names in `_keep_in_fp32_modules` stays in float32.
+    """
+    precise = getattr(module, '_keep_in_fp32_modules', None) or ()
+    kept = {
+        name: tensor.data.to(device, torch.float32)
+        for name, tensor in [*module.named_parameters(), *module.named_buffers()]
+        if any(part in precise for part in name.split('.'))
+    }
     nn.Module.to(module, device=device, dtype=dtype)
+    for name, tensor in [*module.named_parameters(), *module.named_buffers()]:
+        if name in kept:
+            tensor.data = kept[name]
     for parameter in module.parameters():
         if parameter.ndim == 4:  # images; video convolutions have 5 axes and stay as they are
             parameter.data = parameter.data.to(memory_format=torch.channels_last)

@@ -97,6 +97,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             pos_embed_seq_len=pos_embed_seq_len,
         )
         self.stem, self.prediction = stem, prediction
+        if stem == 'patch':  # as Wan was trained; bfloat16 is too coarse for angles and times
+            self._keep_in_fp32_modules = ['rope', 'time_embedder', 'scale_shift_table']
         self.patch_size = tuple(patch_size)
         dim = num_attention_heads * attention_head_dim
         # computed, not loaded: real also where the weights are still to come (meta device)

@@ -52,9 +52,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / 'checkpoint'
 
 
-def load(folder: Path, **card: Any) -> DiffusionWorldModel:
+def load(folder: Path, dtype: torch.dtype = torch.float32, **card: Any) -> DiffusionWorldModel:
     checkpoint: Checkpoint = load_checkpoint(folder)
-    return DiffusionWorldModel(replace(checkpoint, card={**checkpoint.card, **card}))
+    changed = replace(checkpoint, card={**checkpoint.card, **card})
+    return DiffusionWorldModel(changed, dtype=dtype)
 
 
 def frames(*shape: int, seed: int = 0) -> np.ndarray:
@@ -81,6 +82,18 @@ def test_predicts_exactly_the_cards_frames_and_seeds_do_not_meet(folder: Path) -
     # a batch may round differently in the last bit, a byte shows it at most as 1
     assert np.abs(together.astype(int) - alone).max() <= 1
     assert np.abs(together[0].astype(int) - together[1]).max() > 10
+
+
+def test_bfloat16_keeps_angles_and_times_in_float32(folder: Path) -> None:
+    exact, coarse = load(folder), load(folder, dtype=torch.bfloat16)
+    angles = exact.transformer.rope.get_buffer('freqs_cos')
+    assert torch.equal(coarse.transformer.rope.get_buffer('freqs_cos'), angles)
+    precise = {n for n, p in coarse.transformer.named_parameters() if p.dtype == torch.float32}
+    assert {name.split('.')[-1] for name in precise} == {'scale_shift_table', 'weight', 'bias'}
+    assert all('time_embedder' in n or 'scale_shift_table' in n for n in precise)
+    assert coarse.transformer.dtype == torch.bfloat16
+    one, other = predict(exact, [0]), predict(coarse, [0])
+    assert np.abs(one.astype(int) - other).mean() < 3
 
 
 def test_the_prompt_reaches_the_prediction(folder: Path) -> None:
