@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 import statistics
 import sys
@@ -85,14 +86,7 @@ class Bench:
         views, arguments = self.frames.shape[1], self.config.transformer
         text = self._tokens(NUM_TEXT_TOKENS, arguments['text_dim'])
         image = self._tokens(views * _IMAGE_TOKENS, arguments['image_dim'])
-        return Conditioning(
-            control=latents.control,
-            start_control=latents.start_control,
-            start=latents.start,
-            reference=latents.reference,
-            text=text,
-            image=image,
-        )
+        return replace(latents, text=text, image=image)
 
     def _tokens(self, count: int, width: int) -> Tensor:
         return torch.zeros(1, count, width, device=self.device, dtype=self.dtype)
