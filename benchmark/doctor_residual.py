@@ -34,6 +34,8 @@ def main() -> None:
     file = share_path('config', 'robots', 'yam_bimanual.yaml')
     robot = load_robot(file)
     episodes = list_episodes(options.dataset)
+    if not episodes:
+        parser.error(f"'{options.dataset}' holds no episodes")
     for shape in (load_shape(file, robot), rods(robot, 'for comparison')):
         inspector = Inspector(robot, shape, CONFIG)
         distances, passed, found = [], [], []
@@ -48,7 +50,7 @@ def main() -> None:
             '  distance as it is: median {:.1f}, 90 % {:.1f}, at most {:.1f} px'.format(*quantiles)
         )
         print(f'  passed as it is: {sum(passed)} of {len(passed)}')
-        print(f'  found {options.pixels:g} px off: {sum(found)} of {len(found)}')
+        print(f'  found {options.pixels:g} px off: {sum(found)} of {len(found)}', flush=True)
 
 
 def _judge(

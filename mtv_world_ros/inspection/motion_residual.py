@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.camera import camera_poses, project, scaled
+from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.inspection.joint_track import JointTrack
 from mtv_world_ros.inspection.shapes import LinkShape
+from mtv_world_ros.inspection.silhouettes import fill, project_part
 
 FloatImage = NDArray[np.float32]
 
 #: an image whose joints moved less than this in any pair shows no motion [px]
 _LEAST_AREA_PX = 20
-#: pixels are drawn with this many fractional bits
-_SHIFT_BITS = 4
-_FAR_PX = 4000
+#: share of the drawn motion that must stay in the image under a shift
+_LEAST_INSIDE = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +46,7 @@ class ResidualConfig:
 
     width: int = 384
     step_s: float = 0.5
-    max_pairs: int = 60
+    max_pairs: int = 45
     reach: float = 0.08
     blur_px: float = 1.5
     saturation: float = 25.0
@@ -158,7 +158,7 @@ def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, config: ResidualCon
 def _seen_motion(
     track: Track, pairs: np.ndarray, small: CameraModel, config: ResidualConfig
 ) -> list[FloatImage]:
-    """How much each pixel changed between the frames of a pair, 0 .. 1, with room to search."""
+    """How much each pixel changed between the frames of a pair, 0 .. 1, NaN around the image."""
     grey = {int(i): _grey(track.frames[int(i)], small) for i in np.unique(pairs)}
     return [_softened(np.abs(grey[int(j)] - grey[int(i)]), config) for i, j in pairs]
 
@@ -172,9 +172,7 @@ def _softened(change: FloatImage, config: ResidualConfig) -> FloatImage:
     blurred = cv2.GaussianBlur(change, (0, 0), config.blur_px)
     moving = np.minimum(blurred / np.float32(config.saturation), 1)
     rim = _radius(change.shape[1], config)
-    mean = float(moving.mean())
-    padded = cv2.copyMakeBorder(moving, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=mean)
-    return np.asarray(padded, np.float32)
+    return np.pad(moving, rim, constant_values=np.nan)
 
 
 def _radius(width: int, config: ResidualConfig) -> int:
@@ -196,62 +194,43 @@ def _surface(
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
     for link in dict.fromkeys(shape.link for shape in shapes):
         parts = [
-            _project_part(part, poses[link], small, T_base_camera)
+            project_part(part, poses[link], small, T_base_camera)
             for part in shapes
             if part.link == link
         ]
-        surface, count = _correlate(seen, _fill(parts, small), config, radius)
+        surface, count = _correlate(seen, fill(parts, small), config, radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
     return total / weights if weights else None
 
 
-def draw_silhouettes(
-    shapes: Sequence[LinkShape], camera: CameraModel, robot: RobotModel, positions: FloatArray
-) -> NDArray[np.uint8]:
-    """(T, H, W) 1 where the robot is in the image, for positions (T, J)."""
-    poses = robot.forward_kinematics(positions)
-    T_base_camera = camera_poses(camera, robot, positions)
-    parts = [_project_part(part, poses[part.link], camera, T_base_camera) for part in shapes]
-    return _fill(parts, camera)
-
-
-def _project_part(
-    part: LinkShape, poses: FloatArray, camera: CameraModel, T_base_camera: FloatArray
-) -> FloatArray:
-    """(T, N, 2) pixels of its points."""
-    points = np.einsum('tij,nj->tni', poses[:, :3, :3], part.points) + poses[:, None, :3, 3]
-    return project(camera, T_base_camera[:, None], points)[0]
-
-
-def _fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
-    """(T, H, W) the convex hulls of the parts' pixels; parts that reach behind are left out."""
-    images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
-    for part in parts:
-        for image, pixels in zip(images, part, strict=True):
-            if np.isfinite(pixels).all():
-                fixed = np.rint(pixels.clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS).astype(np.int32)
-                cv2.fillConvexPoly(image, cv2.convexHull(fixed), 1, shift=_SHIFT_BITS)
-    return images
-
-
 def _correlate(
     seen: Sequence[FloatImage], drawn: NDArray[np.uint8], config: ResidualConfig, radius: int
 ) -> tuple[FloatArray, int]:
-    """One link's normalised correlation over shifts, and the pairs in which it moves."""
-    total = np.zeros((2 * radius + 1,) * 2)
-    energy_seen = energy_drawn = 0.0
+    """One link's normalised correlation over shifts, and the pairs in which it moves.
+
+    Drawn motion that a shift moves out of the image counts for nothing, in the norm too: else
+    a robot that is drawn too far inside would seem to be nearer than it is.
+    """
+    total, energy_drawn = np.zeros((2 * radius + 1,) * 2), np.zeros((2 * radius + 1,) * 2)
+    energy_seen = 0.0
     count = 0
     for change, before, after in zip(seen, drawn[::2], drawn[1::2], strict=True):
         differs = cv2.absdiff(before, after)
         if cv2.countNonZero(differs) < _LEAST_AREA_PX:
             continue
         template, window = _cut(differs, change, radius, config.blur_px)
+        inside = np.isfinite(window).astype(np.float32)
+        window = np.nan_to_num(window - np.nanmean(window))
         total += cv2.matchTemplate(window, template, cv2.TM_CCORR)
-        energy_seen += cv2.norm(window, cv2.NORM_L2SQR) * template.size / window.size
-        energy_drawn += cv2.norm(template, cv2.NORM_L2SQR)
+        energy_seen += cv2.norm(window, cv2.NORM_L2SQR) * template.size / float(inside.sum())
+        energy_drawn += cv2.matchTemplate(inside, template**2, cv2.TM_CCORR)
         count += 1
-    return total / np.sqrt(energy_seen * energy_drawn + 1e-12), count
+    if count == 0:
+        return total, 0
+    enough = energy_drawn > _LEAST_INSIDE * energy_drawn.max()
+    norm = np.sqrt(energy_seen * energy_drawn.clip(0) + 1e-12)
+    return np.where(enough, total / norm, 0.0), count
 
 
 def _cut(
@@ -260,7 +239,7 @@ def _cut(
     radius: int,
     blur_px: float,
 ) -> tuple[FloatImage, FloatImage]:
-    """The drawn motion's surroundings and the window of `change` to search, means removed."""
+    """The drawn motion's surroundings, mean removed, and the window of `change` to search."""
     rim = round(5 * blur_px)
     left, top, width, height = cv2.boundingRect(differs)
     right, bottom = left + width + rim, top + height + rim
@@ -269,7 +248,7 @@ def _cut(
     template = cv2.GaussianBlur(part, (0, 0), blur_px)
     height, width = template.shape
     window = change[top : top + height + 2 * radius, left : left + width + 2 * radius]
-    return _centred(template), _centred(window)
+    return _centred(template), window
 
 
 def _centred(image: NDArray[np.floating] | cv2.typing.MatLike) -> FloatImage:

@@ -13,12 +13,9 @@ from mtv_world_ros.data.mcap_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector, load_inspector
 from mtv_world_ros.inspection.joint_track import JointTrack
-from mtv_world_ros.inspection.motion_residual import (
-    draw_silhouettes,
-    measure_residual,
-    ResidualConfig,
-)
+from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
 from mtv_world_ros.inspection.shapes import load_shape, rods
+from mtv_world_ros.inspection.silhouettes import draw_silhouettes
 from mtv_world_ros.resources import share_path
 
 QUICK = InspectionConfig(residual=ResidualConfig(max_pairs=25, lags_s=(0.0,)))
