@@ -10,11 +10,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 import re
 
-from diffusers.loaders.single_file_utils import (
-    convert_wan_transformer_to_diffusers,
-    convert_wan_vae_to_diffusers,
-)
-
 #: what repackaged files put before every name
 _PREFIXES = ('model.diffusion_model.', 'diffusion_model.', 'model.', 'vae.', 'pipe.dit.')
 
@@ -45,6 +40,8 @@ def transformer_keys(names: Iterable[str]) -> KeyMap:
     """The transformer, of VideoX-Fun's or diffusers' names."""
     bare = _without_prefix(names)
     if 'head.head.weight' in bare:
+        from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
+
         ours = convert_wan_transformer_to_diffusers({name: name for name in bare})
     else:
         ours = {name: name for name in bare}
@@ -55,6 +52,9 @@ def autoencoder_keys(names: Iterable[str]) -> KeyMap:
     """The autoencoder, of Wan's or diffusers' names."""
     bare = _without_prefix(names)
     original = 'encoder.conv1.weight' in bare
+    # imported here: it pulls in transformers, which a node of the small preset does not need
+    from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
+
     ours = convert_wan_vae_to_diffusers({n: n for n in bare}) if original else {n: n for n in bare}
     return KeyMap({new: Take(bare[old]) for new, old in ours.items()})
 
