@@ -16,6 +16,8 @@ import torch
 from transformers import PreTrainedTokenizerFast
 from wan_reference import random_weights, video_tensors, Weights
 
+Shapes = dict[str, tuple[int, ...]]
+
 HEADS, LAYERS, DIM, FFN = 2, 2, 24, 40
 TEXT_DIM, CLIP_DIM = 32, 32
 TRANSFORMER = {
@@ -58,48 +60,71 @@ def transformer_weights(seed: int = 0) -> Weights:
     return random_weights(shapes, seed)
 
 
-def umt5_weights(vocab: int = 64, ffn: int = 48, layers: int = 2, heads: int = 4) -> Weights:
-    """`models_t5_umt5-xxl-enc-bf16` at another size."""
-    shapes: dict[str, tuple[int, ...]] = {
-        'token_embedding.weight': (vocab, TEXT_DIM),
-        'norm.weight': (TEXT_DIM,),
-    }
+def umt5_shapes(width: int, vocab: int, ffn: int, layers: int, heads: int) -> Shapes:
+    """Names and shapes in `models_t5_umt5-xxl-enc-bf16`, at any size."""
+    shapes: Shapes = {'token_embedding.weight': (vocab, width), 'norm.weight': (width,)}
     for index in range(layers):
         block = f'blocks.{index}'
-        shapes |= {f'{block}.attn.{name}.weight': (TEXT_DIM, TEXT_DIM) for name in 'qkvo'}
-        shapes |= {f'{block}.norm{n}.weight': (TEXT_DIM,) for n in (1, 2)}
-        shapes |= {f'{block}.ffn.{name}.weight': (ffn, TEXT_DIM) for name in ('gate.0', 'fc1')}
-        shapes[f'{block}.ffn.fc2.weight'] = (TEXT_DIM, ffn)
+        shapes |= {f'{block}.attn.{name}.weight': (width, width) for name in 'qkvo'}
+        shapes |= {f'{block}.norm{n}.weight': (width,) for n in (1, 2)}
+        shapes |= {f'{block}.ffn.{name}.weight': (ffn, width) for name in ('gate.0', 'fc1')}
+        shapes[f'{block}.ffn.fc2.weight'] = (width, ffn)
         shapes[f'{block}.pos_embedding.embedding.weight'] = (32, heads)
-    return random_weights(shapes, 1)
+    return shapes
 
 
-def clip_weights(layers: int = 3) -> Weights:
-    """`models_clip_open-clip-xlm-roberta-large-vit-huge-14` at another size, 16 heads."""
-    dim, side, patch = CLIP_DIM, 4, 2
-    shapes: dict[str, tuple[int, ...]] = {
+def umt5_weights() -> Weights:
+    return random_weights(umt5_shapes(TEXT_DIM, vocab=64, ffn=48, layers=2, heads=4), 1)
+
+
+def clip_shapes(width: int, layers: int, side: int, patch: int, out: int) -> Shapes:
+    """Names and shapes of the image side of `models_clip_open-clip-xlm-roberta-...-huge-14`."""
+    shapes: Shapes = {
         'log_scale': (),
-        'textual.head.0.weight': (8, 8),
-        'visual.cls_embedding': (1, 1, dim),
-        'visual.pos_embedding': (1, 1 + side**2, dim),
-        'visual.patch_embedding.weight': (dim, 3, patch, patch),
-        'visual.head': (dim, 8),
+        'visual.cls_embedding': (1, 1, width),
+        'visual.pos_embedding': (1, 1 + side**2, width),
+        'visual.patch_embedding.weight': (width, 3, patch, patch),
+        'visual.head': (width, out),
     }
-    for name in ('pre_norm', 'post_norm'):
-        shapes |= {f'visual.{name}.{kind}': (dim,) for kind in ('weight', 'bias')}
+    linear = {
+        'attn.to_qkv': (3 * width, width),
+        'attn.proj': (width, width),
+        'mlp.0': (4 * width, width),
+        'mlp.2': (width, 4 * width),
+    }
+    norms = ['visual.pre_norm', 'visual.post_norm']
     for index in range(layers):
         layer = f'visual.transformer.{index}'
-        linear = {
-            'attn.to_qkv': (3 * dim, dim),
-            'attn.proj': (dim, dim),
-            'mlp.0': (4 * dim, dim),
-            'mlp.2': (dim, 4 * dim),
-        }
+        norms += [f'{layer}.norm1', f'{layer}.norm2']
         for name, shape in linear.items():
             shapes |= {f'{layer}.{name}.weight': shape, f'{layer}.{name}.bias': shape[:1]}
-        for name in ('norm1', 'norm2'):
-            shapes |= {f'{layer}.{name}.{kind}': (dim,) for kind in ('weight', 'bias')}
-    return random_weights(shapes, 2)
+    return shapes | {f'{name}.{kind}': (width,) for name in norms for kind in ('weight', 'bias')}
+
+
+def clip_text_shapes(width: int = 1024, layers: int = 24, vocab: int = 250002) -> Shapes:
+    """Names and shapes of its text side, which nobody needs."""
+    shapes: Shapes = {
+        'textual.token_embedding.weight': (vocab, width),
+        'textual.type_embedding.weight': (1, width),
+        'textual.pos_embedding.weight': (514, width),
+        'textual.head.0.weight': (width, width),
+        'textual.head.2.weight': (width, width),
+    }
+    linear = {f'attn.{name}': (width, width) for name in 'qkvo'}
+    linear |= {'ffn.0': (4 * width, width), 'ffn.2': (width, 4 * width)}
+    norms = ['textual.norm']
+    for index in range(layers):
+        block = f'textual.blocks.{index}'
+        norms += [f'{block}.norm1', f'{block}.norm2']
+        for name, shape in linear.items():
+            shapes |= {f'{block}.{name}.weight': shape, f'{block}.{name}.bias': shape[:1]}
+    return shapes | {f'{name}.{kind}': (width,) for name in norms for kind in ('weight', 'bias')}
+
+
+def clip_weights() -> Weights:
+    """At another size, with 16 heads as the published one."""
+    image = clip_shapes(CLIP_DIM, layers=3, side=4, patch=2, out=8)
+    return random_weights({**image, 'textual.head.0.weight': (8, 8)}, 2)
 
 
 def vae_model(seed: int = 3) -> AutoencoderKLWan:
