@@ -36,7 +36,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--dry-run', action='store_true', help='print what a step takes, and train nothing'
     )
     parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
-    parser.add_argument('--episodes', type=int, help='use only the first so many')
+    parser.add_argument('--episodes', type=int, help='use only so many, spread over all')
+    parser.add_argument(
+        '--split', default='all', help="of dataset.json, e.g. train; default 'all' episodes"
+    )
+    parser.add_argument(
+        '--cache', type=Path, metavar='DIR', help='what was read of episodes; runs may share it'
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
@@ -52,6 +58,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.evaluation.dataset import select
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.training.config import load_training_config
@@ -68,7 +75,7 @@ def _train(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
     folder = train(
         config,
-        arguments.dataset,
+        select(arguments.dataset, arguments.split).paths,
         arguments.out,
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter(device=arguments.device),
@@ -78,6 +85,7 @@ def _train(arguments: argparse.Namespace) -> int:
         save_every=arguments.save_every,
         num_episodes=arguments.episodes,
         initial=arguments.init and checkpoint_path(arguments.init),
+        cache=arguments.cache,
     )
     print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
     return 0

@@ -43,6 +43,13 @@ def find_episodes(dataset: Path) -> list[Path]:
     return found
 
 
+def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
+    """Returns so many of them, evenly spread: sorted by name, the first ones are of one task."""
+    if count is None or count >= len(paths):
+        return list(paths)
+    return [paths[index * len(paths) // count] for index in range(count)]
+
+
 def load_recordings(
     paths: Sequence[Path], spec: WorldModelSpec, robot: RobotModel, cache: Path
 ) -> tuple[list[Recording], dict[str, str]]:
@@ -78,7 +85,7 @@ def spec_of(config: TrainingConfig) -> WorldModelSpec:
 
 def train(
     config: TrainingConfig,
-    dataset: Path,
+    dataset: Path | Sequence[Path],
     out: Path,
     *,
     robot: RobotModel,
@@ -89,12 +96,13 @@ def train(
     save_every: int = 250,
     num_episodes: int | None = None,
     initial: Path | None = None,
+    cache: Path | None = None,
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
     Args:
         config: the preset.
-        dataset: folder with episode folders in it.
+        dataset: folder with episode folders in it, or the episode folders.
         out: gets `state/` (to resume), `log.jsonl`, TensorBoard events and `checkpoint/`.
         robot: of the episodes.
         segmenter: finds the objects of the first frames.
@@ -102,15 +110,18 @@ def train(
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward.
         save_every: steps between saved states.
-        num_episodes: use only the first so many.
+        num_episodes: use only so many, spread evenly over all.
         initial: checkpoint whose weights a new run starts from; a resumed one has its own.
+        cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
 
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
     """
     out.mkdir(parents=True, exist_ok=True)
-    paths = find_episodes(dataset)[:num_episodes]
-    recordings, skipped = load_recordings(paths, spec_of(config), robot, out / 'cache')
+    paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
+    recordings, skipped = load_recordings(
+        spread(paths, num_episodes), spec_of(config), robot, cache or out / 'cache'
+    )
     (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
     actions = kept_actions(
         out, config.video.control, recordings, spec_of(config), robot, initial=initial
