@@ -189,7 +189,7 @@ def main() -> None:
     )
     body += page.table(('frames are', *_HEADER, 'ms'), lines) + '\n\n' + '\n'.join(kept)
     page.publish(
-        f'segmenter_{segmenter.name.replace("+", "_")}',
+        f'segmenter_{segmenter.name.replace("+", "_")}_seed{options.seed}',
         f"Segmenter `{segmenter.name}` against the simulator's masks",
         f'python benchmark/segmenter.py EPISODES --segmenter {options.segmenter} '
         f'--seed {options.seed}',
