@@ -65,8 +65,9 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.run import train
 
     config = load_training_config(arguments.preset, _overrides(arguments))
+    dtype = choose_dtype(arguments.dtype, arguments.device)
     if arguments.dry_run:
-        return _dry_run(config, choose_dtype(arguments.dtype, arguments.device))
+        return _dry_run(config, dtype)
     if arguments.dataset is None or arguments.out is None:
         raise ConfigError(
             'training needs a folder of episodes and a folder for its results: '
@@ -81,7 +82,7 @@ def _train(arguments: argparse.Namespace) -> int:
         segmenter=assemble_segmenter(device=arguments.device),
         seed=arguments.seed,
         device=arguments.device,
-        dtype=choose_dtype(arguments.dtype, arguments.device),
+        dtype=dtype,
         save_every=arguments.save_every,
         num_episodes=arguments.episodes,
         initial=arguments.init and checkpoint_path(arguments.init),

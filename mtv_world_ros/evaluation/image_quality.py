@@ -79,20 +79,21 @@ def _ssim() -> Callable[[Any, Any], Any]:
 
 
 def _lpips(device: str) -> Callable[[Any, Any], Any]:
+    from importlib.util import find_spec
+
     import torch
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
+
+    if find_spec('torchvision') is None:
+        raise ConfigError(
+            'quality lpips needs torchvision, which is not installed and which this package does '
+            'not install (its Linux wheels pull CUDA); install a build that fits your torch, or '
+            'leave lpips out'
+        )
 
     def measure(predicted: Any, real: Any) -> Any:
         batch = [video.to(device).float() / 255 for video in (predicted, real)]
         with torch.inference_mode():
             return learned_perceptual_image_patch_similarity(*batch, normalize=True)
 
-    try:
-        import torchvision  # noqa: F401 # type: ignore[import-not-found]
-    except ImportError as error:
-        raise ConfigError(
-            'quality lpips needs torchvision, which is not installed and which this package does '
-            'not install (its Linux wheels pull CUDA); install a build that fits your torch, or '
-            'leave lpips out'
-        ) from error
     return measure
