@@ -38,7 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
     parser.add_argument('--episodes', type=int, help='use only so many, spread over all')
     parser.add_argument(
-        '--split', default='all', help="of dataset.json, e.g. train; default 'all' episodes"
+        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
     )
     parser.add_argument(
         '--cache', type=Path, metavar='DIR', help='what was read of episodes; runs may share it'
@@ -76,7 +76,7 @@ def _train(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
     folder = train(
         config,
-        select(arguments.dataset, arguments.split).paths,
+        select(arguments.dataset, arguments.split, default='train').paths,
         arguments.out,
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter(device=arguments.device),

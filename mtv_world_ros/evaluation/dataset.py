@@ -36,14 +36,17 @@ class Selection:
         return f'{len(self.paths)} of {self.num_in_dataset} episodes, split {self.split}'
 
 
-def select(dataset: Path, split: str | None = None, limit: int | None = None) -> Selection:
+def select(
+    dataset: Path, split: str | None = None, limit: int | None = None, *, default: str = 'test'
+) -> Selection:
     """Returns the episodes of a split.
 
     Args:
         dataset: folder with episode folders in it; its `dataset.json`, if there is one, names the
             splits and, per episode, `zero_shot`: `view`, `task` or `object`.
-        split: name of a split, or `all`; default: `test` where the data set has it, else `all`.
+        split: name of a split, or `all`; None = `default` where the data set has it, else `all`.
         limit: only the first so many of them.
+        default: see `split`.
 
     Raises:
         EpisodeError: the folder holds no episodes, or no one of the split.
@@ -58,7 +61,7 @@ def select(dataset: Path, split: str | None = None, limit: int | None = None) ->
     card = _card(dataset)
     splits = card.get('splits', {})
     if split is None:
-        split = 'test' if splits.get('test') else EVERY
+        split = default if splits.get(default) else EVERY
     names = _names(dataset, splits, split)
     paths = [path for path in found if names is None or path.name in names][:limit]
     if not paths:
