@@ -28,7 +28,7 @@ from mtv_world_ros.data.mcap_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.dataset_card import CARD_FILE, EpisodeEntry, read_entry
+from mtv_world_ros.sim.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
 from mtv_world_ros.sim.dataset_readme import commands
 from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.episode_maker import CollectConfig, ROBOT_FILE
@@ -43,7 +43,8 @@ from mtv_world_ros.success.jaccard import mean_of_known
 OTHER_SEEDS = 1_000_000
 HEAD = (
     'task', 'episodes', 'expert success, written', 'other seeds', 'length [s]', 'frames',
-    'objects', 'visible low', 'visible high', 'J all low', 'J all high', 'J moving low', 'J moving high',
+    'objects', 'visible low', 'visible high', 'J all low', 'J all high', 'J moving low',
+    'J moving high',
 )  # fmt: skip
 
 
@@ -53,7 +54,8 @@ def _visible(measures: Iterable[EpisodeMeasures], view: int) -> str:
 
 
 def _mean(values: Iterable[float]) -> str:
-    return f'{float(mean_of_known(np.array(list(values)))):.3f}'
+    mean = float(mean_of_known(np.array(list(values))))
+    return '-' if np.isnan(mean) else f'{mean:.3f}'
 
 
 def _successes(task: str, seed: int, attempts: int) -> int:
@@ -112,23 +114,21 @@ def main() -> None:
         measure(read_episode(options.dataset / entry.name, with_cameras=False))
         for entry in entries
     ]
-    groups: dict[tuple[str, str], list[int]] = {}
+    groups: dict[str, list[int]] = {}
     for number, entry in enumerate(entries):
-        groups.setdefault((entry.zero_shot or '', entry.task), []).append(number)
-    rows, total, attempts = [], 0, options.attempts
-    for (kind, task), chosen in groups.items():
+        groups.setdefault(entry.zero_shot or entry.task, []).append(number)
+    attempts = options.attempts if card['kind'] == TASKS_SET else 0
+    rows, total = [], 0
+    for name, chosen in groups.items():
         others = '-'
-        if attempts and not kind:
-            done = _successes(task, card['seed'], attempts)
+        if attempts:
+            done = _successes(name, card['seed'], attempts)
             total, others = total + done, f'{100 * done / attempts:.0f} % of {attempts}'
-        name = f'{kind} {task}'.strip()
-        rows.append(
-            _row(name, [entries[i] for i in chosen], [measures[i] for i in chosen], others)
-        )
-    tried = attempts * sum(not kind for kind, _ in groups)
-    rows.append(
-        _row('all', entries, measures, f'{100 * total / tried:.1f} % of {tried}' if tried else '-')
-    )
+        group = [entries[i] for i in chosen], [measures[i] for i in chosen]
+        rows.append(_row(name, *group, others))
+    tried = attempts * len(groups)
+    others = f'{100 * total / tried:.1f} % of {tried}' if tried else '-'
+    rows.append(_row('all', entries, measures, others))
     made = '\n'.join(commands(card, entries))
     explained = (__doc__ or '').split('\n\n')[-1]
     options.seed, options.repeats = card['seed'], len(entries)
