@@ -144,7 +144,9 @@ def _objects(entries: Iterable[EpisodeEntry]) -> str:
             colour, _, noun = name.partition(' ')
             nouns[noun] += 1
             colours.setdefault(noun, set()).add(colour)
-    rows = [(noun, count, ', '.join(sorted(colours[noun]))) for noun, count in nouns.most_common()]
+    # by number, then by name: episodes may have been finished in any order
+    listed = sorted(nouns.items(), key=lambda item: (-item[1], item[0]))
+    rows = [(noun, count, ', '.join(sorted(colours[noun]))) for noun, count in listed]
     return _table(('object', 'times', 'colours'), rows)
 
 

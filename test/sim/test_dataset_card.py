@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -145,6 +147,16 @@ def test_the_text_says_what_is_in_the_written_episodes(make, tmp_path):
     assert '| `/low/image_raw/compressed` | `sensor_msgs/msg/CompressedImage` | 8 |' in text
     assert '| `/instruction` | `std_msgs/msg/String` | 1 |' in text
     assert '| `attempt` | seeds dropped before this one | `0` |' in text
+
+
+def test_the_text_is_the_same_in_whatever_order_the_episodes_were_finished(make, tmp_path):
+    entries = [
+        replace(make('stack_blocks_two', index), objects=(f'red {noun}', 'blue block'))
+        for index, noun in enumerate(('cup', 'plate', 'bowl'))
+    ]
+    text = readme(tmp_path, _card(entries), entries)
+    assert readme(tmp_path, _card(entries[::-1]), entries[::-1]) == text
+    assert text.index('| bowl |') < text.index('| cup |') < text.index('| plate |')
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
