@@ -46,6 +46,7 @@ def main() -> None:
     print(text)
     if options.out is not None:
         path = options.out / f'evaluation_{options.machine}_{date.today()}.md'
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding='utf-8')
         print(f'written: {path}')
 
