@@ -50,6 +50,10 @@ class SimulatorError(MtvWorldError):
     """The simulator cannot render or build a scene."""
 
 
+class PolicyError(MtvWorldError):
+    """A policy cannot answer, or its answer cannot be used."""
+
+
 class DescriptionError(MtvWorldError):
     """The objects of a scene could not be had; not the same answer as "there are none".
 

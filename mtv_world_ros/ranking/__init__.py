@@ -1,0 +1,1 @@
+"""Policies ranked in imagination, and how well that agrees with the simulator."""
