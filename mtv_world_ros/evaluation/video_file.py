@@ -28,7 +28,8 @@ def encode_video(
         full_colour: keep colour at every pixel (4:4:4), which not every browser plays.
     """
     rate = Fraction(fps).limit_denominator(1000)
-    options = {'crf': str(crf), 'preset': 'veryfast'}
+    # one thread: with several, the same frames once gave another file on a busy machine
+    options = {'crf': str(crf), 'preset': 'veryfast', 'threads': '1'}
     file = io.BytesIO()
     with av.open(file, 'w', format='mp4') as container:
         stream = container.add_stream('libx264', rate=rate, options=options)
