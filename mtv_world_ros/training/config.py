@@ -14,6 +14,16 @@ from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
 
+_SIGMA_WEIGHTINGS = ('uniform', 'middle')
+_PROBABILITIES = (
+    'start_noise',
+    'colour_permutation',
+    'action_dropout',
+    'control_dropout',
+    'reference_dropout',
+    'image_dropout',
+)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoConfig:
@@ -44,7 +54,9 @@ class ObjectiveConfig:
     Attributes:
         sigma_shift: draws noise levels towards high noise.
         full_noise_share: share of samples at noise level 1, where sampling starts.
-        huber_delta: in [-1, 1] pixel units.
+        sigma_weighting: how much samples count by their noise level: `uniform`, or `middle`
+            (DiffSynth-Studio's, see `sigma_weights`).
+        huber_delta: in units of the latents; None = the squared error, as Wan was trained.
         change_weight: extra weight of pixels that differ from the start frame.
         object_weight: extra weight of pixels on objects.
         moved_weight: extra weight of pixels where objects came or went.
@@ -52,10 +64,23 @@ class ObjectiveConfig:
 
     sigma_shift: float = 5.0
     full_noise_share: float = 0.25
-    huber_delta: float = 0.1
+    sigma_weighting: str = 'uniform'
+    huber_delta: float | None = 0.1
     change_weight: float = 4.0
     object_weight: float = 6.0
     moved_weight: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.sigma_weighting not in _SIGMA_WEIGHTINGS:
+            raise ConfigError(
+                f"objective.sigma_weighting '{self.sigma_weighting}' is not one of "
+                f'{", ".join(_SIGMA_WEIGHTINGS)}'
+            )
+        if self.huber_delta is not None and not self.huber_delta > 0:
+            raise ConfigError(
+                f'objective.huber_delta is {self.huber_delta}; it must be positive, or null for '
+                'the squared error'
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +95,9 @@ class AugmentConfig:
             by chance: they are few, and a model that rarely sees a miss imagines grasps instead.
         action_dropout: probability of a sample without its actions; control `ee_mlp` alone
             (Ctrl-World's value).
+        control_dropout: probability of a sample without its trajectory video.
+        reference_dropout: of one without its start image.
+        image_dropout: of one without that image's CLIP tokens.
     """
 
     start_noise: float = 0.5
@@ -77,6 +105,15 @@ class AugmentConfig:
     colour_permutation: float = 0.3
     failure_share: float | None = None
     action_dropout: float = 0.05
+    control_dropout: float = 0.0
+    reference_dropout: float = 0.0
+    image_dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in _PROBABILITIES:
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ConfigError(f'augment.{name} is {value}; it must be in [0, 1]')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The training loss: flow matching in clean-sample form, weighted towards what moves.
+"""The training loss: flow matching, weighted towards what moves.
 
 Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w latent size.
 """
@@ -72,14 +72,47 @@ def add_noise(clean: Tensor, noise: Tensor, sigmas: Tensor) -> Tensor:
     return (1 - sigma) * clean + sigma * noise
 
 
-def sample_loss(predicted: Tensor, clean: Tensor, weights: Tensor, delta: float) -> Tensor:
-    """Returns the weighted mean Huber loss between predicted and clean latents.
+def sigma_weights(sigmas: Tensor, config: ObjectiveConfig) -> Tensor:
+    """Returns how much samples count by their noise level, in the shape of `sigmas`.
+
+    `middle` is DiffSynth-Studio's weighting: `exp(-2 ((t - 500) / 1000)^2)` for t = 1000 sigma,
+    less its least value, with a mean of 1 over the 1000 steps of the shifted schedule.
+    """
+    if config.sigma_weighting == 'uniform':
+        return torch.ones_like(sigmas)
+    steps = torch.linspace(1, 0, 1001, dtype=torch.float64)[:-1]
+    shift = config.sigma_shift
+    schedule = _bell(shift * steps / (1 + (shift - 1) * steps))
+    lowest = schedule.min()
+    weights = (_bell(sigmas.double()) - lowest) / (schedule - lowest).mean()
+    return weights.clamp_min(0).to(sigmas.dtype)
+
+
+def _bell(sigmas: Tensor) -> Tensor:
+    return torch.exp(-2 * (sigmas - 0.5) ** 2)
+
+
+def sample_loss(
+    predicted: Tensor,
+    clean: Tensor,
+    weights: Tensor,
+    delta: float | None,
+    by_sample: Tensor | None = None,
+) -> Tensor:
+    """Returns the weighted mean loss between predicted and clean latents.
 
     Args:
         predicted: (B, V, C, T, h, w).
         clean: the same shape.
         weights: the same shape, positive.
-        delta: where the loss turns from square to linear.
+        delta: where the Huber loss turns from square to linear; None = the squared error.
+        by_sample: (B,) how much each sample counts; None = all alike.
     """
-    error = F.huber_loss(predicted.float(), clean.float(), reduction='none', delta=delta) / delta
+    predicted, clean = predicted.float(), clean.float()
+    if delta is None:
+        error = F.mse_loss(predicted, clean, reduction='none')
+    else:
+        error = F.huber_loss(predicted, clean, reduction='none', delta=delta) / delta
+    if by_sample is not None:
+        error = error * by_sample.reshape(-1, *[1] * (error.ndim - 1))
     return (error * weights).sum() / weights.sum()

@@ -22,6 +22,7 @@ from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
 from mtv_world_ros.training.actions import transformer_arguments
 from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
+from mtv_world_ros.training.encoding import Encoders
 from mtv_world_ros.training.loss import batch_loss
 
 
@@ -73,6 +74,7 @@ class Trainer:
         self.trained_on, self.actions = trained_on, actions
         autoencoder = build_autoencoder(config.autoencoder)
         self.autoencoder = place(autoencoder, self.device, torch.float32)
+        self.encoders = Encoders(autoencoder=self.autoencoder)
         transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
         self.master = place(transformer, self.device, torch.float32)
         self.worker = place(copy_of(self.master), self.device, dtype)
@@ -128,9 +130,7 @@ class Trainer:
     def loss(self, batch: Batch, step: int) -> Tensor:
         """The loss of a batch with the noise of a step."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
-        return batch_loss(
-            self.worker, self.autoencoder, batch, self.config, generator, self.device
-        )
+        return batch_loss(self.worker, self.encoders, batch, self.config, generator, self.device)
 
     def _train_step(self, batch: Batch) -> StepReport:
         loss = self.loss(batch, self.step)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch
 
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
@@ -12,6 +15,7 @@ from mtv_world_ros.training.objective import (
     latent_weights,
     pixel_weights,
     sample_loss,
+    sigma_weights,
 )
 
 CONFIG = ObjectiveConfig()
@@ -64,3 +68,23 @@ def test_loss_is_zero_for_the_truth_and_counts_by_weight() -> None:
     low = sample_loss(wrong, clean, light.reshape(clean.shape), 0.1)
     high = sample_loss(wrong, clean, heavy.reshape(clean.shape), 0.1)
     torch.testing.assert_close(high, 3 * low)
+
+
+def test_middle_noise_levels_count_as_in_diffsynth() -> None:
+    """exp(-2 ((t - 500) / 1000)^2) of t = 1000, 995.02 .. 4.98, less the least, mean 1."""
+    config = ObjectiveConfig(sigma_weighting='middle', sigma_shift=5.0)
+    steps = [k / 1000 for k in range(1000, 0, -1)]
+    times = [1000 * 5 * s / (1 + 4 * s) for s in steps]
+    bell = [math.exp(-2 * ((t - 500) / 1000) ** 2) for t in times]
+    scale = 1000 / sum(b - math.exp(-0.5) for b in bell)
+    expected = [(math.exp(-2 * (s - 0.5) ** 2) - math.exp(-0.5)) * scale for s in (0.5, 0.9, 1.0)]
+    found = sigma_weights(torch.tensor([0.5, 0.9, 1.0]), config)
+    assert found.tolist() == pytest.approx(expected, abs=1e-5)
+    assert sigma_weights(torch.tensor([0.1, 1.0]), CONFIG).tolist() == [1, 1]
+
+
+def test_without_delta_the_error_is_squared_and_samples_count_by_noise_level() -> None:
+    clean = torch.zeros(2, 1, 1, 1, 1, 2)
+    wrong = torch.tensor([[1.0, 2.0], [3.0, 0.0]]).reshape(clean.shape)
+    loss = sample_loss(wrong, clean, torch.ones_like(clean), None, torch.tensor([1.0, 0.5]))
+    assert loss.item() == pytest.approx((1 + 4 + 0.5 * 9) / 4)

@@ -1,0 +1,121 @@
+"""Clips as the transformer sees them: latents, tokens, and how much each latent weighs.
+
+Shape letters: B batch, V views, C latent channels, F latent frames, h w latent size, N tokens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.conditioning import (
+    condition,
+    condition_on_actions,
+    Conditioning,
+    encode_chunk,
+)
+from mtv_world_ros.model.image_encoder import ImageEncoder
+from mtv_world_ros.model.parts import Autoencoder
+from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
+from mtv_world_ros.training.objective import latent_weights, pixel_weights, pooled_weights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Encoders:
+    """What is not trained: pixels and words in, latents and tokens out.
+
+    Attributes:
+        autoencoder: on the device that trains.
+        text: (1, 512, text_dim) umT5 tokens of the prompt that all clips share, in models with
+            text; the paper has one for all tasks.
+        image: CLIP, in models with text.
+    """
+
+    autoencoder: Autoencoder
+    text: Tensor | None = None
+    image: ImageEncoder | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodedBatch:
+    """Clips in latents.
+
+    Attributes:
+        clean: (B, V, C, F, h, w) what denoising shall give.
+        conditioning: what it is denoised under.
+        weights: in the shape of `clean`, at least 1: how much each latent counts.
+    """
+
+    clean: Tensor
+    conditioning: Conditioning
+    weights: Tensor
+
+    def __len__(self) -> int:
+        return len(self.clean)
+
+
+@torch.no_grad()
+def encode_batch(
+    encoders: Encoders, batch: Batch, objective: ObjectiveConfig, device: torch.device
+) -> EncodedBatch:
+    """Returns a batch of clips in latents, on a device."""
+    frames = batch.frames.to(device)
+    clean = encode_chunk(encoders.autoencoder, frames)
+    ids = None if batch.object_ids is None else batch.object_ids.to(device)
+    return EncodedBatch(
+        clean=clean,
+        conditioning=_condition(encoders, batch, device),
+        weights=_weights(pixel_weights(frames, ids, objective), encoders.autoencoder, clean),
+    )
+
+
+def _condition(encoders: Encoders, batch: Batch, device: torch.device) -> Conditioning:
+    autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
+    if batch.actions is None:
+        assert batch.trajectory is not None
+        latents = condition(autoencoder, start, batch.trajectory.to(device))
+    else:
+        num_frames = batch.frames.shape[2] - 1
+        latents = condition_on_actions(autoencoder, start, batch.actions.to(device), num_frames)
+    if encoders.text is None or encoders.image is None:
+        return latents
+    tokens = torch.stack([encoders.image.encode(images).flatten(0, 1) for images in start])
+    text = encoders.text.to(device).expand(len(start), -1, -1)
+    return replace(latents, text=text, image=tokens.to(device).clone())
+
+
+def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor:
+    """Pixels' weights (B, V, T, H, W) in the shape of the latents."""
+    if isinstance(autoencoder, SpaceToDepthAutoencoder):
+        return latent_weights(weights, autoencoder.block_size)
+    return pooled_weights(weights, clean.shape)
+
+
+def drop_conditions(
+    conditioning: Conditioning, augment: AugmentConfig, generator: torch.Generator
+) -> Conditioning:
+    """Takes the control, the start image or its CLIP tokens from some samples, each by chance.
+
+    What is dropped is zero. VideoX-Fun does so to one sample in ten; guidance away from a
+    condition needs a model that has seen none.
+    """
+    dropped = {
+        ('control', 'start_control'): augment.control_dropout,
+        ('reference', 'start'): augment.reference_dropout,
+        ('image',): augment.image_dropout,
+    }
+    changes = {}
+    for names, probability in dropped.items():
+        if probability == 0:  # nothing is drawn: runs without dropout keep their noise
+            continue
+        kept = torch.rand(len(conditioning.control), generator=generator) >= probability
+        for name in names:
+            value = getattr(conditioning, name)
+            if value is not None:
+                mask = kept.to(value.device).reshape(-1, *[1] * (value.ndim - 1))
+                changes[name] = value * mask
+    return replace(conditioning, **changes)

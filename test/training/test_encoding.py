@@ -1,0 +1,68 @@
+"""Clips in latents: conditions are dropped by chance, each by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.model.conditioning import Conditioning
+from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
+from mtv_world_ros.training.encoding import drop_conditions
+
+COUNT = 2000
+
+
+def conditions() -> Conditioning:
+    def ones(*shape: int) -> torch.Tensor:
+        return torch.ones(COUNT, *shape)
+
+    return Conditioning(
+        control=ones(2, 3, 2, 1, 1),
+        start_control=ones(2, 3, 1, 1),
+        start=ones(2, 3, 2, 1, 1),
+        reference=ones(2, 3, 1, 1),
+        text=ones(4, 5),
+        image=ones(6, 5),
+    )
+
+
+def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
+    augment = AugmentConfig(control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3)
+    out = drop_conditions(conditions(), augment, torch.Generator().manual_seed(0))
+    gone = {
+        name: (getattr(out, name) == 0).flatten(1).all(1)
+        for name in ('control', 'start_control', 'start', 'reference', 'image')
+    }
+    for name, dropped in gone.items():  # a sample is dropped whole or not at all
+        assert torch.equal(dropped, (getattr(out, name) == 0).flatten(1).any(1)), name
+    assert torch.equal(gone['control'], gone['start_control'])
+    assert torch.equal(gone['reference'], gone['start'])
+    shares = [gone[name].float().mean().item() for name in ('control', 'reference', 'image')]
+    assert shares == pytest.approx([0.1, 0.2, 0.3], abs=0.03)
+    both = (gone['control'] & gone['reference']).float().mean().item()
+    assert both == pytest.approx(0.02, abs=0.01)  # independent: the product
+    assert (out.text == 1).all()
+
+
+def test_without_dropout_nothing_is_drawn() -> None:
+    generator = torch.Generator().manual_seed(0)
+    before = generator.get_state()
+    drop_conditions(conditions(), AugmentConfig(), generator)
+    assert torch.equal(generator.get_state(), before)
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (lambda: AugmentConfig(image_dropout=1.1), r'augment.image_dropout is 1.1.*\[0, 1\]'),
+        (lambda: ObjectiveConfig(sigma_weighting='bell'), "'bell' is not one of uniform, middle"),
+        (lambda: ObjectiveConfig(huber_delta=0.0), 'huber_delta is 0.0; it must be positive'),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make()
+    assert replace(AugmentConfig(), image_dropout=1.0).image_dropout == 1.0
