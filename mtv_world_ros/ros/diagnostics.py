@@ -46,12 +46,23 @@ class Tally:
         for name, value in seconds.items():
             self._seconds.setdefault(name, deque(maxlen=_WINDOW)).append(value)
 
-    def level(self, now_s: float) -> tuple[bytes, str]:
-        """How bad it is, and why."""
+    def level(self, now_s: float, num_policies: int = 1) -> tuple[bytes, str]:
+        """How bad it is, and why.
+
+        Args:
+            now_s: now [s].
+            num_policies: publishers of trajectories.
+        """
         if self._last is not None and now_s - self._last[0] < _WARN_S:
             _, reason, text = self._last
             level = DiagnosticStatus.ERROR if reason in _ERRORS else DiagnosticStatus.WARN
             return level, f'{reason}: {text}'
+        if num_policies > 1:
+            text = (
+                f'{num_policies} publishers of joint trajectories: each pre-empts the rollouts of '
+                'the others; stop all but one'
+            )
+            return DiagnosticStatus.WARN, text
         if self._fruitless >= _STARVED:
             text = (
                 f'the last {self._fruitless} rollouts were pre-empted before their first chunk: '

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo
@@ -46,12 +47,20 @@ class Intrinsics:
         if is_news:
             raise Rejection(Reason.CAMERA_INFO_CHANGED, text)
 
-    def accept(self) -> None:
+    def accept(self, cameras: Sequence[CameraModel]) -> None:
         """Takes changed infos as the valid ones from now on.
+
+        Args:
+            cameras: calibrated cameras of the views. Where they are others than before, the
+                infos belong to those: the next ones are awaited.
 
         Raises:
             Rejection: a new one is not calibrated.
         """
+        if not _are_equal(self._calibrated.values(), cameras):
+            self._calibrated = {camera.view: camera for camera in cameras}
+            for stored in (self._infos, self._cameras, self._changed):
+                stored.clear()
         for view, (message, _) in list(self._changed.items()):
             self._take(view, message)
             del self._changed[view]
@@ -90,6 +99,14 @@ class Intrinsics:
     def _take(self, view: str, message: CameraInfo) -> None:
         self._cameras[view] = camera_from_info(self._calibrated[view], message)
         self._infos[view] = message
+
+
+def _are_equal(before: Iterable[CameraModel], now: Iterable[CameraModel]) -> bool:
+    def key(camera: CameraModel) -> tuple[object, ...]:
+        values = (getattr(camera, field.name) for field in fields(camera))
+        return tuple(v.tolist() if isinstance(v, np.ndarray) else v for v in values)
+
+    return list(map(key, before)) == list(map(key, now))
 
 
 _FIELDS = tuple(CameraInfo.get_fields_and_field_types())

@@ -11,6 +11,7 @@ from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.rejection import Reason, rejected_as
 
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
@@ -43,3 +44,13 @@ def load_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraModel,
             "them, or set 'calibration_file' to a file that has them"
         )
     return tuple(cameras[view] for view in spec.views)
+
+
+def reload_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
+    """The same while the node runs.
+
+    Raises:
+        Rejection: the file is wrong or lacks a view.
+    """
+    with rejected_as(Reason.CAMERA_INFO_INVALID):
+        return load_cameras(settings, spec)

@@ -16,8 +16,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
-from mtv_world_ros.ros.inputs import subscribe
-from mtv_world_ros.ros.loading import load_cameras, load_named_pipeline
+from mtv_world_ros.ros.inputs import Inputs
+from mtv_world_ros.ros.loading import load_cameras, load_named_pipeline, reload_cameras
 from mtv_world_ros.ros.observation_buffer import FreshnessLimits, ObservationBuffer
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.prediction_publisher import PredictionPublisher
@@ -72,7 +72,7 @@ class WorldModelNode(Node):
         self._arrived: deque[tuple[float, JointTrajectory]] = deque()
         self._arrivals = self.create_guard_condition(self._start_rollouts)
         self._results = self.create_guard_condition(self._publish_results)
-        self._inputs = subscribe(
+        self._inputs = Inputs(
             self,
             self._spec.views,
             compressed=self._settings.compressed_input,
@@ -136,7 +136,7 @@ class WorldModelNode(Node):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._give_up()
         try:
-            self._buffer.accept_cameras()
+            self._buffer.accept_cameras(reload_cameras(self._settings, self._spec))
         except Rejection as error:
             self._reporter.reject(error)
             response.message = f'not reset: {error}'
@@ -169,8 +169,7 @@ class WorldModelNode(Node):
         self._settings = parameters.read(self)
 
     def _on_period(self) -> None:
-        for subscription in self._inputs:
-            subscription.refresh()
+        self._inputs.refresh()
         self._reporter.publish_diagnostics()
 
     def _freshness(self) -> FreshnessLimits:
@@ -186,7 +185,8 @@ class WorldModelNode(Node):
             'checkpoint': self._settings.checkpoint,
             'views': self._spec.views,
             'busy': self._worker.busy,
-            **{f'publishers.{i.topic}': i.num_publishers for i in self._inputs},
+            **self._inputs.publisher_counts(),
+            **self._publisher.subscriber_counts(),
             **self._buffer.ages(self.get_clock().now().nanoseconds),
         }
 

@@ -120,13 +120,16 @@ class ObservationBuffer:
         for samples in (*self._images.values(), *self._joints.values()):
             samples.clear()
 
-    def accept_cameras(self) -> None:
+    def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
         """Takes changed camera infos as the valid ones from now on.
+
+        Args:
+            cameras: calibrated cameras of the V views.
 
         Raises:
             Rejection: a new one is not calibrated.
         """
-        self._intrinsics.accept()
+        self._intrinsics.accept(cameras)
 
     def ages(self, now_ns: int) -> Mapping[str, float]:
         """Age [s] of the newest image of each view and of the oldest joint; NaN = none yet."""

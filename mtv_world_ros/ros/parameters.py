@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 
@@ -68,11 +68,6 @@ _AGE = (0.001, 3600.0)
 TABLE: tuple[Entry, ...] = (
     _at_start('checkpoint', 'bundled', "Checkpoint folder; 'bundled' ships with the package."),
     _at_start('robot_file', '', "Robot YAML or a bundled robot's name; empty = the checkpoint's."),
-    _at_start(
-        'calibration_file',
-        '',
-        "YAML with every view's pose; empty = config/cameras/<robot>.yaml of the package.",
-    ),
     _at_start('device', 'cpu', 'Device of the model: cpu, cuda, cuda:1.'),
     _at_start(
         'num_threads', 0, 'CPU threads of the model; 0 = all cores but one.', bounds=(0, 1024)
@@ -91,6 +86,12 @@ TABLE: tuple[Entry, ...] = (
     ),
     _at_start('mode', 'observe', 'Mode at start; ~/imagine changes it.', choices=MODES),
     _at_start('diagnostics_period_s', 1.0, 'Period of /diagnostics [s].', bounds=(0.05, 60.0)),
+    Entry(
+        'calibration_file',
+        '',
+        "YAML with every view's pose; empty = config/cameras/<robot>.yaml of the package. It is "
+        'read again at ~/reset.',
+    ),
     Entry('instruction', '', 'What the robot is told until the topic `instruction` says so.'),
     Entry(
         'objects',
@@ -139,7 +140,6 @@ TABLE: tuple[Entry, ...] = (
     Entry('publish_trajectory_video', True, 'Publish the control video (when subscribed).'),
     Entry('publish_masks', True, 'Publish the object masks (when subscribed).'),
 )
-_BY_NAME = {entry.name: entry for entry in TABLE}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +148,6 @@ class Settings:
 
     checkpoint: str
     robot_file: str
-    calibration_file: str
     device: str
     num_threads: int
     task: str
@@ -156,6 +155,7 @@ class Settings:
     compressed_input: bool
     mode: str
     diagnostics_period_s: float
+    calibration_file: str
     instruction: str
     objects: tuple[str, ...]
     seed: int
@@ -174,15 +174,16 @@ class Settings:
     publish_masks: bool
 
 
-def declare(node: Node) -> None:
+def declare(node: Node, table: Sequence[Entry] = TABLE) -> None:
     """Declares the table on the node and keeps later changes to what the table allows.
 
     Raises:
         ConfigError: a value given at start-up is refused.
     """
-    for entry in TABLE:
+    for entry in table:
         _declare(node, entry)
-    node.add_on_set_parameters_callback(_check)
+    by_name = {entry.name: entry for entry in table}
+    node.add_on_set_parameters_callback(partial(_check, by_name))
 
 
 def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
@@ -220,9 +221,9 @@ def _declare(node: Node, entry: Entry) -> str:
     return str(value)
 
 
-def _check(parameters: list[Parameter]) -> SetParametersResult:
+def _check(by_name: Mapping[str, Entry], parameters: list[Parameter]) -> SetParametersResult:
     for parameter in parameters:
-        entry = _BY_NAME.get(parameter.name)
+        entry = by_name.get(parameter.name)
         refused = entry.check(parameter.value) if entry else ''
         if refused:
             return SetParametersResult(successful=False, reason=refused)

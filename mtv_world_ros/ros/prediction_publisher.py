@@ -84,6 +84,12 @@ class PredictionPublisher:
         )
         self._timer.cancel()
 
+    def subscriber_counts(self) -> dict[str, int]:
+        """Subscribers that each topic is connected to, as `subscribers.<topic>`."""
+        outputs = [self._joints, self._success, self._jaccard]
+        outputs += [publisher for view in self._views for publisher in view.publishers()]
+        return {f'subscribers.{o.topic_name}': o.get_subscription_count() for o in outputs}
+
     def add(self, result: Result) -> None:
         """Publishes a result after those before it.
 

@@ -121,8 +121,9 @@ class Reporter:
     def publish_diagnostics(self) -> None:
         """Publishes `/diagnostics`."""
         now_s = time.monotonic()
-        level, message = self._tally.level(now_s)
-        values = {**self._state(), **self._tally.values(now_s)}
+        state = self._state()
+        level, message = self._tally.level(now_s, num_policies=int(str(state['policies'])))
+        values = {**state, **self._tally.values(now_s)}
         self._publish(self._diagnostics, '', level, message, values)
 
     def _publish_report(self, state: str, values: Mapping[str, object]) -> None:

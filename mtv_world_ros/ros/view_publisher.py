@@ -54,6 +54,10 @@ class ViewPublisher:
         if settings.publish_masks:
             self._streams['mask'] = _Stream(node, f'~/{view}/mask', depth)
 
+    def publishers(self) -> list[Publisher]:
+        """All of them."""
+        return [p for stream in self._streams.values() for p in stream.publishers()]
+
     def wants(self, stream: str) -> bool:
         """Whether somebody subscribes to a stream: `predicted`, `trajectory` or `mask`."""
         return stream in self._streams and self._streams[stream].is_wanted()
@@ -88,7 +92,7 @@ class _Stream:
         self._compressed = create_publisher(node, CompressedImage, topic, self._depth)
 
     def is_wanted(self) -> bool:
-        return any(publisher.get_subscription_count() for publisher in self._publishers())
+        return any(publisher.get_subscription_count() for publisher in self.publishers())
 
     def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
         height, width = pixels.shape[:2]
@@ -106,6 +110,6 @@ class _Stream:
         self._scaled[1].header = header
         return self._scaled[1]
 
-    def _publishers(self) -> list[Publisher]:
+    def publishers(self) -> list[Publisher]:
         optional = [self._compressed] if self._compressed is not None else []
         return [self._image, self._info, *optional]

@@ -31,7 +31,8 @@ class Request:
             whether the next request shall.
         instruction: what the robot was told.
         objects: names of the objects; empty = those the instruction names.
-        seed: of the noise.
+        seed: of the noise of the first chunk after a reset; in imagine mode every further chunk
+            counts one up, over requests too.
         num_inference_steps: denoising steps a chunk.
         limits: what is too old or too long.
         received_s: when it came in [s], of `time.monotonic`.
@@ -94,6 +95,7 @@ class RolloutWorker:
         self._abandoned = False
         self._closing = False
         self._last: Scene | None = None
+        self._num_imagined = 0
         self._results: deque[Result] = deque()
         self._thread = Thread(target=self._run, name='rollouts')
 
@@ -131,7 +133,7 @@ class RolloutWorker:
                     self._put(Ended(request=request, state='reset', num_chunks=0))
             self._abandoned = self._running is not None
             self._pending = None
-            self._last = None
+            self._last, self._num_imagined = None, 0
 
     def take(self) -> list[Result]:
         """Returns the results since the last call, in order."""
@@ -195,7 +197,7 @@ class RolloutWorker:
         return ended('done')
 
     def _chunks(self, request: Request) -> Iterator[None]:
-        scene = self._start(request)
+        scene, num_before = self._start(request)
         trajectory = from_observation(
             request.trajectory, request.stamp_ns, scene.observation.stamp_ns, request.limits
         )
@@ -208,7 +210,7 @@ class RolloutWorker:
             scene.observation,
             trajectory,
             instruction=request.instruction,
-            seed=request.seed,
+            seed=request.seed + num_before,
             num_inference_steps=request.num_inference_steps,
             should_stop=self._should_stop,
         )
@@ -218,9 +220,12 @@ class RolloutWorker:
             if self._should_stop() and prediction.chunk + 1 < prediction.num_chunks:
                 raise RolloutPreempted('a newer trajectory arrived')
 
-    def _start(self, request: Request) -> Scene:
+    def _start(self, request: Request) -> tuple[Scene, int]:
+        """The scene to start from, and the chunks that were imagined before it."""
         with self._changed:
-            return (self._last if request.imagine else None) or request.scene
+            if request.imagine and self._last is not None:
+                return self._last, self._num_imagined
+            return request.scene, 0
 
     def _finish_chunk(self, request: Request, scene: Scene, prediction: Prediction) -> None:
         chunk = Chunk(
@@ -231,6 +236,7 @@ class RolloutWorker:
                 raise RolloutPreempted('the rollout was given up')
             if request.imagine:
                 self._last = replace(scene, observation=prediction.end_observation)
+                self._num_imagined += 1
             self._put(chunk)
 
     def _put(self, result: Result) -> None:

@@ -20,7 +20,7 @@ from mtv_world_ros.success.segmenter import ColourSegmenter
 
 VIEWS = ('low', 'high')
 WIDTH, HEIGHT, FPS, NUM_FRAMES = 48, 36, 5.0, 4
-OUT_OF_MEMORY, BLOCKS, CRASHES = 1001, 1002, 1003
+OUT_OF_MEMORY, BLOCKS, CRASHES = 1100, 1200, 1300
 
 
 class FakeWorldModel:
@@ -47,11 +47,11 @@ class FakeWorldModel:
     ):
         assert trajectory_frames.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
         assert positions.shape == (1 + NUM_FRAMES, 14)
-        if seed == OUT_OF_MEMORY:
+        if seed // 100 == OUT_OF_MEMORY // 100:
             raise ModelMemoryError('the device ran out of memory (fake)')
-        if seed == CRASHES:
+        if seed // 100 == CRASHES // 100:
             raise RuntimeError('a fault of the fake model')
-        while seed == BLOCKS:
+        while seed // 100 == BLOCKS // 100:
             if should_stop():
                 raise RolloutPreempted('stopped')
         frames = np.stack([np.roll(start_frame, k + 1, axis=2) for k in range(NUM_FRAMES)], axis=1)

@@ -11,7 +11,7 @@ from std_msgs.msg import Float32MultiArray, Float64, String
 from mtv_world_ros.ros.image_conversions import to_rgb
 from mtv_world_ros.ros.stamps import to_ns
 
-NUM_FRAMES, FRAME_NS, BLOCKS = 4, 200_000_000, 1002
+NUM_FRAMES, FRAME_NS, BLOCKS = 4, 200_000_000, 1200
 CHUNK_S = 0.8
 PREDICTED = {view: f'/world_model/{view}/predicted/image_raw' for view in ('low', 'high')}
 INFO = '/world_model/low/predicted/camera_info'

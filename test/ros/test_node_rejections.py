@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-OUT_OF_MEMORY, CRASHES = 1001, 1003
+OUT_OF_MEMORY, CRASHES = 1100, 1300
 
 
 @pytest.fixture(scope='module')

@@ -167,7 +167,7 @@ def test_wrong_parameter_at_start_is_one_clear_line(start, parameter, said):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_ends_cleanly_in_the_middle_of_a_rollout(start, new_client, ros, number):
     client = new_client
-    process = start('seed:=1002')  # the fake model goes on until it is told to stop
+    process = start('seed:=1200')  # the fake model goes on until it is told to stop
     client.connect_inputs(ros.INPUTS)
     client.send_scene()
     client.send_trajectory_and_wait_until_it_runs()
