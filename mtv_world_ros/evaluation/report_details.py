@@ -11,10 +11,10 @@ import numpy as np
 from mtv_world_ros.evaluation.charts import Bin, reliability_chart
 from mtv_world_ros.evaluation.evaluated import Evaluated, scores
 from mtv_world_ros.evaluation.markup import element, join, Markup, table
+from mtv_world_ros.evaluation.policy_score import wilson
 from mtv_world_ros.evaluation.report_numbers import badge, hue, letter, number
 
 _NUM_BINS = 5
-_WILSON_Z = 1.959964
 #: parts of metrics.json that have sections of their own
 _SHOWN = {'name', 'label', 'provenance', 'failed', 'notes', 'episodes', 'success'}
 _SHOWN |= {'views', 'overall', 'tasks', 'zero_shot'}
@@ -89,14 +89,6 @@ def _reliability(found: Evaluated, style: str) -> Markup | None:
         if (place == k).any()
     ]
     return reliability_chart('Share of real successes against the estimate', bins, style)
-
-
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """Returns the 95 % Wilson interval of a share of `count` > 0 (Wilson 1927)."""
-    share, z = hits / count, _WILSON_Z
-    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
-    return float(middle - half), float(middle + half)
 
 
 def status_section(evaluations: Sequence[Evaluated]) -> Markup:

@@ -16,7 +16,6 @@ from mtv_world_ros.evaluation.evaluate import evaluate
 from mtv_world_ros.evaluation.html_report import write_report
 from mtv_world_ros.evaluation.markup import element, Markup
 from mtv_world_ros.evaluation.report_clips import make_clip, outlined, OUTLINES
-from mtv_world_ros.evaluation.report_details import wilson
 from mtv_world_ros.evaluation.rollout_store import load_rollout, rollout_path
 
 EVIL_NAME = '<script>alert("name")<x onload=y>'
@@ -286,9 +285,3 @@ def test_text_is_escaped_and_markup_is_not():
         '<p title="&quot;&amp;">a&lt;b<br></p>'
     )
     assert element('img', src='x', hidden=False, controls=True) == '<img src="x" controls>'
-
-
-def test_wilson_interval_is_the_published_one():
-    # 8 of 10: .490 to .943 (Newcombe 1998 gives the same formula; R's prop.test, correct=FALSE)
-    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert wilson(0, 5)[0] == pytest.approx(0, abs=1e-12)
