@@ -25,6 +25,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='make a set for testing alone: any of view, task, object, comma-separated '
         '(new cameras, a task that is not of the 15, half of the objects unseen)',
     )
+    parser.add_argument(
+        '--moved-cameras',
+        type=float,
+        default=0.0,
+        metavar='SHARE',
+        help='share of the episodes whose cameras stand elsewhere; zero-shot views stay unseen',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
@@ -49,7 +56,7 @@ def _collect(arguments: argparse.Namespace) -> int:
         arguments.out,
         zero_shot=arguments.zero_shot,
         workers=arguments.workers,
-        config=CollectConfig(randomization=size),
+        config=CollectConfig(randomization=size, moved_share=arguments.moved_cameras),
         sheets=arguments.sheets,
     )
     return 0

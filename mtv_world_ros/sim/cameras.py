@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,46 @@ class CameraJitter:
     target_m: float = 0.008
     distance_m: float = 0.03
     angle_deg: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraMoves:
+    """How far cameras stand from the nominal ones; the defaults are those of zero-shot views.
+
+    Attributes:
+        azimuth: turn about the table to either side [deg].
+        elevation: change of the elevation [deg].
+        distance: factor on the distance.
+        visible_width: width of the view's plane through the target at the nominal distance [m].
+    """
+
+    azimuth: tuple[float, float] = (25.0, 55.0)
+    elevation: tuple[float, float] = (-6.0, 16.0)
+    distance: tuple[float, float] = (0.95, 1.2)
+    visible_width: float = 0.76
+
+
+#: of training sets: on either side of the angles that zero-shot views have, jitter left room
+TRAINING_MOVES = (
+    CameraMoves(
+        azimuth=(0.0, 22.0), elevation=(-8.0, 18.0), distance=(0.9, 1.25), visible_width=0.68
+    ),
+    CameraMoves(azimuth=(58.0, 75.0), elevation=(-8.0, 18.0), distance=(0.9, 1.25)),
+)
+
+
+def moved(spec: CameraSpec, moves: CameraMoves, generator: np.random.Generator) -> CameraSpec:
+    """Returns a camera that stands elsewhere and looks at the same point."""
+    side = float(generator.choice((-1.0, 1.0)))
+    factor = float(generator.uniform(*moves.distance))
+    return replace(
+        spec,
+        azimuth=spec.azimuth + side * float(generator.uniform(*moves.azimuth)),
+        elevation=spec.elevation + float(generator.uniform(*moves.elevation)),
+        distance=spec.distance * factor,
+        # the lens stays the same
+        visible_width=moves.visible_width * factor,
+    )
 
 
 def jittered(spec: CameraSpec, jitter: CameraJitter, generator: np.random.Generator) -> CameraSpec:

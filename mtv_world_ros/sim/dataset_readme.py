@@ -70,6 +70,8 @@ def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[s
         for side in ('width', 'height')
         if size[side] != getattr(plain, side)
     )
+    if share := card['config']['moved_share']:
+        options += f' --moved-cameras {share}'
     end = f'--seed {card["seed"]}{options} --out DIR'
     if card['kind'] == ZERO_SHOT_SET:
         return [f'mtv-world collect --zero-shot {kinds} --episodes {number} {end}'
@@ -100,6 +102,7 @@ def _other_configuration(config: Mapping[str, Any]) -> str:
     usual = json.loads(json.dumps(asdict(CollectConfig())))
     for side in ('width', 'height'):
         usual['randomization'][side] = config['randomization'][side]
+    usual['moved_share'] = config['moved_share']
     if config == usual:
         return ''
     return (
@@ -118,12 +121,15 @@ def _cameras(cameras: Mapping[str, CameraModel], config: Mapping[str, Any]) -> s
             (view, f'{camera.width} x {camera.height} px', f'{camera.K[0, 0]:.0f} px',
              f'({place}) m', f'{down:.0f} deg')
         )  # fmt: skip
-    jitter = config['randomization']['jitter']
+    jitter, share = config['randomization']['jitter'], config['moved_share']
+    moved = (
+        f' In {100 * share:.0f} % of the episodes all cameras stand elsewhere.' if share else ''
+    )
     return (
         _table(('view', 'image', 'focal length', 'position', 'looking down'), rows)
         + f'\n\nOf the first episode; every episode moves target (+-{jitter["target_m"]} m), '
         f'distance (+-{jitter["distance_m"]} m) and angles (+-{jitter["angle_deg"]} deg). Exact '
-        "intrinsics are on `camera_info`, poses in each episode's `calibration.yaml`."
+        "intrinsics are on `camera_info`, poses in each episode's `calibration.yaml`." + moved
     )
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 import time
 
+import numpy as np
+
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
+from mtv_world_ros.sim.cameras import CameraMoves, TRAINING_MOVES
 from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.files import GO_ON
@@ -15,19 +18,37 @@ from mtv_world_ros.sim.jobs import episode_seed, Job
 from mtv_world_ros.sim.randomize import RandomizationConfig
 from mtv_world_ros.sim.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.tasks import task_named
-from mtv_world_ros.sim.zero_shot import variant, ZeroShotConfig
+from mtv_world_ros.sim.zero_shot import variant, with_moved_cameras
 
 ROBOT_FILE = ('config', 'robots', 'yam_bimanual.yaml')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollectConfig:
-    """What is randomised, how the expert moves, how episodes are sampled."""
+    """What is randomised, how the expert moves, how episodes are sampled.
+
+    Attributes:
+        randomization: objects, light, cameras and their jitter.
+        expert: heights, speeds and timing.
+        record: sampling and noise.
+        zero_shot: where the cameras of zero-shot views stand.
+        moved_share: share of ordinary episodes whose cameras stand elsewhere too.
+        moves: ranges that such an episode chooses from; they leave zero-shot views unseen.
+    """
 
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
-    zero_shot: ZeroShotConfig = field(default_factory=ZeroShotConfig)
+    zero_shot: CameraMoves = CameraMoves()
+    moved_share: float = 0.0
+    moves: tuple[CameraMoves, ...] = TRAINING_MOVES
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.moved_share <= 1:
+            raise SimulatorError(
+                f'the share of episodes with moved cameras is {self.moved_share}; it must be in '
+                '[0, 1]; set --moved-cameras'
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +106,8 @@ class EpisodeMaker:
         task, randomization = variant(
             job.zero_shot, task_named(job.task), seed, config.randomization, config.zero_shot
         )
+        if job.zero_shot is None:
+            randomization = cameras_of(seed, config)
         sim = SimEpisode(self._robot, self._expert.home, randomization)
         try:
             return sim, simulate(sim, self._expert, task, seed, config.record, miss=job.miss)
@@ -101,3 +124,12 @@ class EpisodeMaker:
         except (OSError, EpisodeError) as error:
             raise SimulatorError(f"cannot write '{job.path}': {error}; {GO_ON}") from error
         return time.process_time() - started
+
+
+def cameras_of(seed: int, config: CollectConfig) -> RandomizationConfig:
+    """Returns the randomisation of an ordinary episode; some have their cameras moved."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
+    if rng.uniform() >= config.moved_share:
+        return config.randomization
+    moves = config.moves[rng.integers(len(config.moves))]
+    return with_moved_cameras(config.randomization, moves, rng)

@@ -3,38 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mtv_world_ros.errors import nearest, SimulatorError
-from mtv_world_ros.sim.cameras import CameraSpec
+from mtv_world_ros.sim.cameras import CameraMoves, moved
 from mtv_world_ros.sim.randomize import RandomizationConfig
 from mtv_world_ros.sim.shapes import SHAPES
-from mtv_world_ros.sim.tasks import ObjectRole, PickPlace, Range, Shake, Task, task_named
+from mtv_world_ros.sim.tasks import ObjectRole, PickPlace, Shake, Task, task_named
 
 #: what an episode shows that no training or test episode does (paper, "Zero-Shot Ability")
 KINDS = ('view', 'task', 'object')
 UNSEEN_TASK = 'random_pick_place'
 #: shapes that no task asks for
 UNSEEN_SHAPES = ('can', 'house')
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ZeroShotConfig:
-    """How far the new cameras are from the ones of training.
-
-    Attributes:
-        azimuth: turn about the table to either side [deg].
-        elevation: change of the elevation [deg].
-        distance: factor on the distance.
-        visible_width: width of the view's plane through the target at the nominal distance [m].
-    """
-
-    azimuth: Range = (25.0, 55.0)
-    elevation: Range = (-6.0, 16.0)
-    distance: Range = (0.95, 1.2)
-    visible_width: float = 0.76
 
 
 def kinds_named(text: str | Sequence[str]) -> tuple[str, ...]:
@@ -78,7 +61,7 @@ def variant(
     task: Task,
     seed: int,
     randomization: RandomizationConfig,
-    config: ZeroShotConfig,
+    moves: CameraMoves,
 ) -> tuple[Task, RandomizationConfig]:
     """Returns the task and the randomisation of one episode; as given where `kind` is None.
 
@@ -87,28 +70,22 @@ def variant(
         task: the task it is derived from.
         seed: of the episode.
         randomization: of training.
-        config: how far the new cameras are.
+        moves: how far the cameras of `view` stand from those of training.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     if kind == 'view':
-        cameras = tuple(_new_camera(spec, config, rng) for spec in randomization.cameras)
-        return task, replace(randomization, cameras=cameras)
+        return task, with_moved_cameras(randomization, moves, rng)
     if kind == 'object':
         return _with_unseen_objects(task, rng), randomization
     return task, randomization
 
 
-def _new_camera(spec: CameraSpec, config: ZeroShotConfig, rng: np.random.Generator) -> CameraSpec:
-    side = float(rng.choice((-1.0, 1.0)))
-    factor = float(rng.uniform(*config.distance))
-    return replace(
-        spec,
-        azimuth=spec.azimuth + side * float(rng.uniform(*config.azimuth)),
-        elevation=spec.elevation + float(rng.uniform(*config.elevation)),
-        distance=spec.distance * factor,
-        # the lens stays the same
-        visible_width=config.visible_width * factor,
-    )
+def with_moved_cameras(
+    randomization: RandomizationConfig, moves: CameraMoves, rng: np.random.Generator
+) -> RandomizationConfig:
+    """Returns the randomisation with every camera moved."""
+    cameras = tuple(moved(spec, moves, rng) for spec in randomization.cameras)
+    return replace(randomization, cameras=cameras)
 
 
 def _movable(task: Task) -> tuple[ObjectRole, ...]:

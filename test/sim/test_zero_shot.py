@@ -1,3 +1,4 @@
+from dataclasses import replace
 import json
 
 import numpy as np
@@ -6,9 +7,9 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.mcap_reader import read_episode, read_info
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.sim.cameras import camera_model, CAMERAS
+from mtv_world_ros.sim.cameras import camera_model, CameraJitter, CameraMoves, CAMERAS
 from mtv_world_ros.sim.collect import collect
-from mtv_world_ros.sim.episode_maker import CollectConfig
+from mtv_world_ros.sim.episode_maker import cameras_of, CollectConfig
 from mtv_world_ros.sim.jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.sim.randomize import draw_scene, RandomizationConfig
 from mtv_world_ros.sim.shapes import SHAPES
@@ -18,10 +19,9 @@ from mtv_world_ros.sim.zero_shot import (
     tasks_of,
     UNSEEN_SHAPES,
     variant,
-    ZeroShotConfig,
 )
 
-PLAIN, CONFIG = RandomizationConfig(), ZeroShotConfig()
+PLAIN, CONFIG = RandomizationConfig(), CameraMoves()
 ALL = tasks_named('all')
 
 
@@ -140,9 +140,36 @@ def test_a_zero_shot_set_is_for_testing_and_names_its_kinds(tmp_path):
     assert task_named(info.task).name in text
 
 
+def test_moved_cameras_of_training_leave_the_angles_of_zero_shot_views_unseen(tmp_path):
+    config = CollectConfig(
+        randomization=RandomizationConfig(width=96, height=72, cameras=CAMERAS[:1]),
+        moved_share=0.6,
+    )
+    turns = []
+    for seed in range(200):
+        (spec,) = cameras_of(seed, config).cameras
+        turns.append(abs(spec.azimuth - CAMERAS[0].azimuth))
+    turns = np.array(turns)
+    assert (turns > 0).mean() == pytest.approx(0.6, abs=0.1)
+    low, high = CameraMoves().azimuth
+    jitter = CameraJitter().angle_deg
+    assert not ((turns > low - jitter) & (turns < high + jitter)).any()
+    assert (turns > high).any() and ((turns > 5) & (turns < low)).any()
+
+    out = tmp_path / 'set'
+    small = replace(config, randomization=RandomizationConfig(width=96, height=72), moved_share=1)
+    collect('place_cup_plate', 1, 1, out, config=small, progress=False)
+    x, y, _ = read_episode(out / 'place_cup_plate_00000').cameras['low'].T_mount_camera[:3, 3]
+    azimuth = np.rad2deg(np.arctan2(x, y - CAMERAS[0].target[1]))
+    assert abs(azimuth - CAMERAS[0].azimuth) > 2 * jitter
+    text = (out / 'README.md').read_text()
+    assert '--width 96 --height 72 --moved-cameras 1' in text and 'stand elsewhere' in text
+
+
 @pytest.mark.parametrize(
     ('options', 'reason'),
     [
+        (['--moved-cameras', '1.5'], 'moved cameras is 1.5; it must be in [0, 1]'),
         (['--zero-shot', 'views'], "unknown zero-shot set 'views' (did you mean 'view'?)"),
         (['--task', 'stack_block_two'], "unknown task 'stack_block_two' (did you mean"),
         (['--episodes', '0'], 'both must be at least 1'),
