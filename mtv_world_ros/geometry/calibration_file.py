@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from mtv_world_ros.config_values import check_keys, read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.errors import CalibrationError, nearest
+from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.transforms import is_rigid, pose
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
@@ -29,14 +30,7 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
         CalibrationError: names the file, the view and what is wrong.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CalibrationError(
-            f"calibration file '{path}' does not exist; set 'calibration_file' to one"
-        )
-    try:
-        values = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"'{path}' is not valid YAML: {error}") from error
+    values = read_yaml(path, 'calibration file', 'calibration_file', error=CalibrationError)
     views = values.get('views') if isinstance(values, dict) else None
     if not isinstance(views, dict) or list(values) != ['views']:
         raise CalibrationError(f"'{path}' must hold 'views: {{<view>: {{...}}}}' and nothing else")
@@ -68,7 +62,7 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
 
 
 def _camera(view: str, row: Any, where: str) -> CameraModel:
-    _check_keys(row, where)
+    check_keys(row, _KEYS, _REQUIRED, where, error=CalibrationError)
     try:
         return CameraModel(
             view=view,
@@ -82,17 +76,6 @@ def _camera(view: str, row: Any, where: str) -> CameraModel:
         )
     except (ValueError, TypeError, CalibrationError) as error:
         raise CalibrationError(f'{where}: {error}') from error
-
-
-def _check_keys(row: Any, where: str) -> None:
-    if not isinstance(row, Mapping):
-        raise CalibrationError(f'{where}: expected keys and values, got {row!r}')
-    for key in row:
-        if key not in _KEYS:
-            raise CalibrationError(f"{where}: unknown key '{key}'{nearest(str(key), _KEYS)}")
-    for key in _REQUIRED:
-        if key not in row:
-            raise CalibrationError(f"{where}: key '{key}' is missing")
 
 
 def _intrinsics(value: Any) -> FloatArray:

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-import yaml
 
+from mtv_world_ros.config_values import check_keys, number, read_yaml, word
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import ConfigError, nearest, RobotError
+from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
@@ -46,8 +46,9 @@ def load_robot(path: Path | str) -> RobotModel:
         RobotError: the description cannot be used.
     """
     path = Path(path)
-    values = _read_yaml(path)
-    _check_keys(values, _KEYS, ('name', 'tools'), str(path))
+    values = check_keys(
+        read_yaml(path, 'robot file', 'robot_file'), _KEYS, ('name', 'tools'), str(path)
+    )
     if ('urdf' in values) == ('dh' in values):
         raise ConfigError(f"'{path}': give either 'urdf' or 'dh'")
     mimics = [_mimic(row, f'{path}: mimic') for row in _rows(values, 'mimic', str(path))]
@@ -69,50 +70,11 @@ def load_robot(path: Path | str) -> RobotModel:
     )
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
-    try:
-        values = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"'{path}' is not valid YAML: {error}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"'{path}' must hold keys and values, got {type(values).__name__}")
-    return values
-
-
-def _check_keys(
-    values: Any, known: tuple[str, ...], required: tuple[str, ...], where: str
-) -> None:
-    if not isinstance(values, Mapping):
-        raise ConfigError(f'{where}: expected keys and values, got {values!r}')
-    for key in values:
-        if key not in known:
-            raise ConfigError(f"{where}: unknown key '{key}'{nearest(str(key), known)}")
-    for key in required:
-        if key not in values:
-            raise ConfigError(f"{where}: key '{key}' is missing")
-
-
 def _rows(values: Mapping[str, Any], key: str, where: str) -> list[Any]:
     rows = values.get(key, [])
     if not isinstance(rows, list):
         raise ConfigError(f"{where}: '{key}' must be a list, got {rows!r}")
     return rows
-
-
-def _number(row: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    value = row.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ConfigError(f"{where}: '{key}' is {value!r}, must be a finite number")
-    return float(value)
-
-
-def _word(row: Mapping[str, Any], key: str, known: tuple[str, ...], where: str) -> str:
-    word = row.get(key, known[0])
-    if word not in known:
-        raise ConfigError(f"{where}: {key} '{word}' must be one of {', '.join(known)}")
-    return word
 
 
 def _pose(row: Mapping[str, Any], where: str) -> FloatArray:
@@ -123,25 +85,25 @@ def _pose(row: Mapping[str, Any], where: str) -> FloatArray:
 
 
 def _mimic(row: Any, where: str) -> Mimic:
-    _check_keys(row, _MIMIC_KEYS, ('joint', 'source'), where)
+    check_keys(row, _MIMIC_KEYS, ('joint', 'source'), where)
     return Mimic(
         joint=str(row['joint']),
         source=str(row['source']),
-        multiplier=_number(row, 'multiplier', 1.0, where),
-        offset=_number(row, 'offset', 0.0, where),
+        multiplier=number(row, 'multiplier', 1.0, where),
+        offset=number(row, 'offset', 0.0, where),
     )
 
 
 def _tool(row: Any, where: str) -> Tool:
-    _check_keys(row, _TOOL_KEYS, ('arm', 'link'), where)
+    check_keys(row, _TOOL_KEYS, ('arm', 'link'), where)
     where = f"{where}: arm '{row['arm']}'"
     return Tool(
         arm=str(row['arm']),
         link=str(row['link']),
         T_link_tool=_pose(row, where),
         gripper_joint=row.get('gripper_joint'),
-        gripper_closed=_number(row, 'gripper_closed', 0.0, where),
-        gripper_open=_number(row, 'gripper_open', 1.0, where),
+        gripper_closed=number(row, 'gripper_closed', 0.0, where),
+        gripper_open=number(row, 'gripper_open', 1.0, where),
     )
 
 
@@ -187,17 +149,17 @@ def _from_dh(values: Mapping[str, Any], base: str, where: str) -> pin.Model:
     model.name = str(values['name'])
     model.addFrame(pin.Frame(base, 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))
     for arm in arms:
-        _check_keys(arm, _ARM_KEYS, ('arm', 'joints'), f'{where}: dh')
+        check_keys(arm, _ARM_KEYS, ('arm', 'joints'), f'{where}: dh')
         _add_dh_arm(model, arm, f"{where}: dh arm '{arm['arm']}'")
     return model
 
 
 def _add_dh_arm(model: pin.Model, arm: Mapping[str, Any], where: str) -> None:
-    modified = _word(arm, 'convention', _CONVENTIONS, where) == 'modified'
+    modified = word(arm, 'convention', _CONVENTIONS, where) == 'modified'
     parent, placement = 0, pin.SE3(_pose(arm, where))
     for row in _rows(arm, 'joints', where):
-        _check_keys(row, _ROW_KEYS, ('joint', 'a', 'alpha', 'd', 'lower', 'upper'), where)
-        turns = _word(row, 'type', _ROW_TYPES, where) == 'revolute'
+        check_keys(row, _ROW_KEYS, ('joint', 'a', 'alpha', 'd', 'lower', 'upper'), where)
+        turns = word(row, 'type', _ROW_TYPES, where) == 'revolute'
         joint = pin.JointModelRZ() if turns else pin.JointModelPZ()
         before, after = _around_joint(row, modified, where)
         parent = _add_joint(model, parent, joint, placement * before, row, where)
@@ -205,7 +167,7 @@ def _add_dh_arm(model: pin.Model, arm: Mapping[str, Any], where: str) -> None:
         model.addFrame(pin.Frame(link, parent, 0, after, pin.FrameType.BODY))
         placement = after
     if 'gripper' in arm:
-        _check_keys(arm['gripper'], _GRIPPER_KEYS, _GRIPPER_KEYS, f'{where}: gripper')
+        check_keys(arm['gripper'], _GRIPPER_KEYS, _GRIPPER_KEYS, f'{where}: gripper')
         _add_joint(model, parent, pin.JointModelPZ(), placement, arm['gripper'], where)
 
 
@@ -215,7 +177,7 @@ def _around_joint(row: Mapping[str, Any], modified: bool, where: str) -> tuple[p
     The standard row is Rz(theta) Tz(d) Tx(a) Rx(alpha), the modified one (J. Craig, Introduction
     to Robotics, 3.4) Rx(alpha) Tx(a) Rz(theta) Tz(d); motions along and about one axis commute.
     """
-    a, alpha, d, theta = (_number(row, key, 0.0, where) for key in ('a', 'alpha', 'd', 'theta'))
+    a, alpha, d, theta = (number(row, key, 0.0, where) for key in ('a', 'alpha', 'd', 'theta'))
     turn = pin.SE3(denavit_hartenberg(0.0, 0.0, d, theta))
     twist = pin.SE3(denavit_hartenberg(a, alpha, 0.0, 0.0))
     return (twist * turn, pin.SE3.Identity()) if modified else (turn, twist)
@@ -225,7 +187,7 @@ def _add_joint(
     model: pin.Model, parent: int, joint: Any, placement: pin.SE3, row: Mapping[str, Any],
     where: str,
 ) -> int:  # fmt: skip
-    lower, upper = (_number(row, key, 0.0, where) for key in ('lower', 'upper'))
+    lower, upper = (number(row, key, 0.0, where) for key in ('lower', 'upper'))
     if lower >= upper:
         raise ConfigError(f"{where}: joint '{row['joint']}': lower {lower} is not below {upper}")
     free = np.full(1, np.inf)

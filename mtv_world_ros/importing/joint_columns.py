@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.config_values import check_keys, number, numbers, word
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.importing.yaml_keys import check_keys, number, numbers, word
 
 #: factor to rad or m
 UNITS = {'rad': 1.0, 'm': 1.0, 'deg': np.pi / 180, 'cm': 0.01, 'mm': 0.001}

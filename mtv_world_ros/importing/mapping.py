@@ -8,15 +8,13 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from mtv_world_ros.config_values import check_keys, number, read_yaml, text, word
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.importing.camera_parameters import CameraSource, parse_camera
 from mtv_world_ros.importing.joint_columns import JointColumn, parse_joints, UNITS
-from mtv_world_ros.importing.yaml_keys import check_keys, number, text, word
 from mtv_world_ros.resources import share_path
 
 _KEYS = ('robot', 'views', 'state', 'action', 'task', 'instruction', 'outcome',
@@ -91,7 +89,8 @@ def load_mapping(path: Path) -> DatasetMapping:
         ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
         RobotError, CalibrationError: what it names cannot be used.
     """
-    values, where = _read(path), str(path)
+    where = str(path)
+    values = read_yaml(path, 'mapping file', '--mapping')
     check_keys(values, _KEYS, ('robot', 'views', 'state', 'action'), where)
     robot_file = _robot_file(text(values, 'robot', '', where), path)
     robot = load_robot(robot_file)
@@ -117,18 +116,6 @@ def load_mapping(path: Path) -> DatasetMapping:
         jpeg_quality=int(_positive(values, 'jpeg_quality', 90, where)),
         key=_key([path, robot_file, *(s.calibration_file for s in sources.values())]),
     )
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    if not path.is_file():
-        raise ConfigError(f"mapping file '{path}' does not exist; name one with --mapping")
-    try:
-        values = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"'{path}' is not valid YAML: {error}") from error
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"'{path}' must hold keys and values, got {type(values).__name__}")
-    return values
 
 
 def _robot_file(name: str, path: Path) -> Path:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, MISSING, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-import yaml
-
+from mtv_world_ros.config_values import check_keys, read_yaml
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.local_vlm import LocalVlmConfig
 from mtv_world_ros.success.openai_chat import OpenAIConfig
@@ -43,10 +41,7 @@ def load_describer_config(path: Path) -> DescriberConfig:
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
     """
-    try:
-        values = yaml.safe_load(Path(path).read_text(encoding='utf-8')) or {}
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"describer file '{path}' cannot be read: {error}") from error
+    values = read_yaml(path, 'describer file', '--describer') or {}
     config = describer_config(values, str(path))
     folder = Path(path).parent
     near = {
@@ -79,17 +74,8 @@ _SECTIONS = {'openai': OpenAIConfig, 'local': LocalVlmConfig}
 
 def _read(kind: Any, values: Any, where: str) -> Any:
     known = {item.name: item for item in fields(kind)}
-    if not isinstance(values, Mapping):
-        raise ConfigError(f'{where}: expected keys and values, got {values!r}')
-    for key in values:
-        if key not in known:
-            raise ConfigError(
-                f"{where}: unknown key '{key}'{nearest(str(key), known)}; valid are "
-                f'{", ".join(known)}'
-            )
-    missing = [key for key, item in known.items() if item.default is MISSING and key not in values]
-    if missing:
-        raise ConfigError(f"{where}: '{missing[0]}' is missing")
+    required = [key for key, item in known.items() if item.default is MISSING]
+    check_keys(values, known, required, where)
     types = get_type_hints(kind)
     return kind(**{key: _value(key, v, types[key], where) for key, v in values.items()})
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from mtv_world_ros.config_values import check_keys, read_yaml
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.success.scene_objects import check_objects, SceneObject
@@ -62,15 +61,10 @@ def load_object_list(path: Path) -> ObjectList:
         ConfigError: the file cannot be read, or what it says is wrong.
     """
     source = f"object list '{path}'"
-    try:
-        values = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f'{source} cannot be read: {error}') from error
+    values = read_yaml(path, 'object list', 'list')
     if not isinstance(values, Mapping) or not values:
         raise ConfigError(f"{source} needs the key 'objects' or 'instructions'")
-    for key in values:
-        if key not in _KEYS:
-            raise ConfigError(f"{source}: unknown key '{key}'{nearest(str(key), _KEYS)}")
+    check_keys(values, _KEYS, (), source)
     listed = values.get('instructions') or {}
     if not isinstance(listed, Mapping):
         raise ConfigError(f"{source}: 'instructions' has to map each instruction to its objects")

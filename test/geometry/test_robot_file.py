@@ -182,7 +182,7 @@ def test_broken_files_are_named(tmp_path):
 @pytest.mark.parametrize(
     ('row', 'message'),
     [
-        ({'type': 'screw'}, "type 'screw' must be one of revolute, prismatic"),
+        ({'type': 'screw'}, "'type' is 'screw'; valid are revolute, prismatic"),
         ({'lower': 4}, 'lower 4.0 is not below 3.0'),
         ({'alfa': 1}, "unknown key 'alfa'.*did you mean 'alpha'"),
         ({'a': float('nan')}, "'a' is nan"),

@@ -97,7 +97,7 @@ def test_a_wrong_object_list_says_what_and_where(tmp_path, text, words):
         ('kind: list', "needs the key 'list'"),
         ('kind: [openai]', "'kind' is ['openai']; expected a text"),
         ('cach: x', "unknown key 'cach' (did you mean 'cache'?)"),
-        ('kind: openai\nopenai: {base_url: x}', "openai: 'model' is missing"),
+        ('kind: openai\nopenai: {base_url: x}', "openai: key 'model' is missing"),
         ('kind: openai\nopenai: {model: x, timeout: 3}', "did you mean 'timeout_s'?"),
         ('kind: openai\nopenai: {model: x, timeout_s: 0}', 'a positive number'),
         ('kind: openai\nopenai: {model: x, timeout_s: true}', 'a positive number'),

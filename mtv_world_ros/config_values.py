@@ -1,31 +1,66 @@
-"""Checks of the mapping file's values; every error says the key and what would be valid."""
+"""Values of YAML files, checked: every error says the file, the key and what would be valid."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
+
+
+def read_yaml(
+    path: Path | str, what: str, setting: str, *, error: type[MtvWorldError] = ConfigError
+) -> Any:
+    """Returns the plain values of a file.
+
+    Args:
+        path: the file.
+        what: what it is, e.g. `robot file`.
+        setting: what names it, e.g. `robot_file`.
+        error: raised instead of `ConfigError`.
+
+    Raises:
+        ConfigError: it cannot be read, or is not YAML.
+    """
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except FileNotFoundError as missing:
+        raise error(f"{what} '{path}' does not exist; set '{setting}' to one") from missing
+    except yaml.YAMLError as broken:
+        raise error(f"{what} '{path}' cannot be read, it is not valid YAML: {broken}") from broken
+    except (OSError, ValueError) as unread:
+        raise error(f"{what} '{path}' cannot be read: {unread}; set '{setting}'") from unread
 
 
 def check_keys(
-    values: Any, known: Iterable[str], required: Iterable[str], where: str
+    values: Any,
+    known: Iterable[str],
+    required: Iterable[str],
+    where: str,
+    *,
+    error: type[MtvWorldError] = ConfigError,
 ) -> Mapping[str, Any]:
-    """Returns `values` if it is a mapping with known and all required keys."""
+    """Returns `values` if it is a mapping with known and all required keys.
+
+    Raises:
+        ConfigError: or `error`, where it is not.
+    """
     if not isinstance(values, Mapping):
-        raise ConfigError(f'{where}: expected keys and values, got {values!r}')
+        raise error(f'{where}: expected keys and values, got {values!r}')
     known = list(known)
     for key in values:
         if key not in known:
-            raise ConfigError(
+            raise error(
                 f"{where}: unknown key '{key}'{nearest(str(key), known)}; known are "
                 f'{", ".join(known)}'
             )
     for key in required:
         if key not in values:
-            raise ConfigError(f"{where}: key '{key}' is missing")
+            raise error(f"{where}: key '{key}' is missing")
     return values
 
 
