@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -11,7 +10,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.resources import content_digest, share_path
 from mtv_world_ros.success.describer import Describer, InstructionDescriber
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.segmenter import Segmenter
@@ -31,12 +30,7 @@ def checkpoint_path(name: str | Path) -> Path:
 
 def fingerprint(checkpoint: str | Path) -> str:
     """Returns the checkpoint's name and a hash of its files: other weights, other name."""
-    digest = hashlib.sha256()
-    folder = checkpoint_path(checkpoint)
-    for file in sorted(path for path in folder.rglob('*') if path.is_file()):
-        digest.update(file.relative_to(folder).as_posix().encode())
-        digest.update(file.read_bytes())
-    return f'{checkpoint} ({digest.hexdigest()[:8]})'
+    return f'{checkpoint} ({content_digest(checkpoint_path(checkpoint))[:8]})'
 
 
 def robot_path(name: str | Path) -> Path:

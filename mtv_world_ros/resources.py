@@ -1,7 +1,8 @@
-"""Where the installed files that are not code lie: config, launch and resource folders."""
+"""Where files that are not code lie, and what tells one folder of them from another."""
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 import sys
 
@@ -38,3 +39,14 @@ def share_path(*parts: str) -> Path:
     searched = ', '.join(str(root) for root in roots)
     wanted = '/'.join(parts)
     raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")
+
+
+def content_digest(folder: Path) -> str:
+    """Returns the SHA-256 of a folder's files: other names or contents, another digest."""
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob('*') if path.is_file()):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        with file.open('rb') as opened:
+            while block := opened.read(2**24):
+                digest.update(block)
+    return digest.hexdigest()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.util import find_spec
 import json
 from pathlib import Path
 import shutil
+from threading import Lock
 from typing import Any
 
 from safetensors import SafetensorError
@@ -22,8 +25,8 @@ ADAPTER = 'pytorch_lora_weights.safetensors'
 BESIDE = ('ref_conv.', 'view_embedding', 'patch_embedding.')
 BESIDE_FILE = 'beside.safetensors'
 BASE_FILE = 'base.json'
-#: the paper's targets: queries, keys, values, outputs and the feed-forward layers
-TARGETS = ('to_q', 'to_k', 'to_v', 'to_out.0', 'ffn.net.0.proj', 'ffn.net.2')
+#: the paper's targets in every block: queries, keys, values, outputs, feed-forward layers
+TARGETS = r'blocks\.\d+\..*\.(to_q|to_k|to_v|to_out\.0|net\.0\.proj|net\.2)'
 _NAME = 'adapter'
 
 
@@ -42,7 +45,7 @@ def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: flo
     from peft import LoraConfig
 
     transformer.requires_grad_(False)
-    config: Any = LoraConfig(r=rank, lora_alpha=alpha, target_modules=list(TARGETS))  # type: ignore[arg-type]
+    config: Any = LoraConfig(r=rank, lora_alpha=alpha, target_modules=TARGETS)  # type: ignore[arg-type]
     transformer.add_adapter(config, adapter_name=_NAME)
     for parameter in beside(transformer).values():
         parameter.requires_grad_(True)
@@ -76,8 +79,28 @@ def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:
     save_file({n: t.detach().contiguous() for n, t in tensors.items()}, file, metadata)
 
 
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """An adapter in memory that is known to fit a transformer; without anything: none.
+
+    Attributes:
+        path: where it was read; None = none.
+        factors: of the layers that it changes, by name.
+        whole: the weights beside it, by name.
+    """
+
+    path: Path | None
+    factors: Mapping[str, Factors]
+    whole: Mapping[str, Tensor]
+
+
+_NONE = Adapter(None, {}, {})
+
+
 class Adapters:
     """Exchanges the adapter of a loaded transformer; the weights under it are not touched.
+
+    Reading one is safe in another thread than the one that exchanges them.
 
     Args:
         transformer: loaded, without an adapter.
@@ -86,10 +109,16 @@ class Adapters:
     def __init__(self, transformer: MultiViewWanTransformer) -> None:
         self._transformer = transformer
         self._beside = {n: p.detach().clone() for n, p in beside(transformer).items()}
-        self.current: Path | None = None
+        self._held = _NONE
+        self._lock = Lock()
 
-    def use(self, path: Path | None) -> None:
-        """Takes another adapter, or none; where that fails, the one before stays.
+    @property
+    def current(self) -> Path | None:
+        """Where the adapter in use was read; None = there is none."""
+        return self._held.path
+
+    def read(self, path: Path | None) -> Adapter:
+        """Returns an adapter that `use` takes at once, whatever becomes of its files.
 
         Args:
             path: a folder of ours, or a LoRA file of DiffSynth-Studio or VideoX-Fun; None = none.
@@ -99,15 +128,35 @@ class Adapters:
             ConfigError: peft is not installed.
         """
         if path is None:
-            factors, whole = {}, {}
-        else:
-            _check_peft()
-            factors, whole = self._read(path)
+            return _NONE
+        _check_peft()
+        with self._lock:
+            return Adapter(path, *self._read(path))
+
+    def use(self, adapter: Adapter | Path | None) -> None:
+        """Takes another adapter, or none; where that fails, the one before stays.
+
+        Args:
+            adapter: what `read` gave, or what it takes.
+
+        Raises:
+            CheckpointError: it cannot be read, or is for another model.
+            ConfigError: peft is not installed.
+        """
+        wanted = adapter if isinstance(adapter, Adapter) else self.read(adapter)
+        with self._lock:
+            try:
+                self._exchange(wanted)
+            except Exception:
+                self._exchange(self._held)
+                raise
+            self._held = wanted
+
+    def _exchange(self, adapter: Adapter) -> None:
         self._transformer.unload_lora()
-        self._fill({**self._beside, **whole})
-        if factors:
-            self._inject(factors)
-        self.current = path
+        self._fill({**self._beside, **adapter.whole})
+        if adapter.factors:
+            self._inject(adapter.factors)
 
     def merge(self) -> None:
         """Adds the adapter into the weights for good: faster, and no exchange from then on."""
@@ -158,7 +207,7 @@ class Adapters:
         for name, parameter in beside(self._transformer).items():
             parameter.copy_(whole[name])
 
-    def _inject(self, factors: dict[str, Factors]) -> None:
+    def _inject(self, factors: Mapping[str, Factors]) -> None:
         transformer = self._transformer
         tensors = {}
         for name, pair in factors.items():

@@ -21,7 +21,7 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     decode_frames,
 )
-from mtv_world_ros.model.lora import Adapters
+from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
@@ -60,6 +60,8 @@ class DiffusionWorldModel:
         self.device = torch.device(device)
         self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
         self._adapters = Adapters(self.transformer)
+        #: of the checkpoint; None = it has none
+        self.own_adapter = checkpoint.adapter
         self.use_adapter(checkpoint.adapter)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self.scheduler = checkpoint.scheduler
@@ -71,14 +73,26 @@ class DiffusionWorldModel:
         if self.image_encoder is not None:
             self.image_encoder.to(self.device, dtype)
 
-    def use_adapter(self, path: Path | None) -> None:
+    def read_adapter(self, path: Path | None) -> Adapter:
+        """Returns an adapter that fits, for `use_adapter`; also while a prediction runs.
+
+        Args:
+            path: see `Adapters.read`; None = none.
+
+        Raises:
+            CheckpointError: it cannot be read or is for another model.
+            ConfigError: peft is not installed.
+        """
+        return self._adapters.read(path)
+
+    def use_adapter(self, adapter: Adapter | Path | None) -> None:
         """Exchanges the LoRA adapter, not while a prediction runs; None = none.
 
         Raises:
             CheckpointError: it cannot be read or is for another model; the one before stays.
         """
-        if path != self._adapters.current:
-            self._adapters.use(path)
+        if adapter != self._adapters.current:
+            self._adapters.use(adapter)
 
     def predict(
         self,

@@ -16,6 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.adapter import AdapterSwitch
 from mtv_world_ros.ros.inputs import Inputs
 from mtv_world_ros.ros.loading import load_cameras, load_named_pipeline, reload_cameras
 from mtv_world_ros.ros.observation_buffer import FreshnessLimits, ObservationBuffer
@@ -49,6 +50,7 @@ class WorldModelNode(Node):
         pipeline = load(self._settings)
         self._spec, self._robot = pipeline.spec, pipeline.robot
         self._worker = RolloutWorker(pipeline, lambda: self._results.trigger())
+        self._adapter = AdapterSwitch(self, pipeline.world_model, self._worker.run_between)
         self._buffer = ObservationBuffer(
             cameras=load_cameras(self._settings, self._spec),
             joint_names=self._robot.joint_names,
@@ -83,11 +85,8 @@ class WorldModelNode(Node):
         )
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/imagine', self._on_imagine)
-        self.create_timer(
-            self._settings.diagnostics_period_s,
-            self._on_period,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._settings.diagnostics_period_s, self._on_period, clock=steady)
         back = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
@@ -183,6 +182,7 @@ class WorldModelNode(Node):
         return {
             'mode': 'imagine' if self._maker.imagine else 'observe',
             'checkpoint': self._settings.checkpoint,
+            'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
             **self._inputs.publisher_counts(),

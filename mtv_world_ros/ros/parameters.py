@@ -92,6 +92,12 @@ TABLE: tuple[Entry, ...] = (
         "YAML with every view's pose; empty = config/cameras/<robot>.yaml of the package. It is "
         'read again at ~/reset.',
     ),
+    Entry(
+        'adapter',
+        '',
+        "LoRA adapter, taken between rollouts: folder or file; empty = the checkpoint's, none = "
+        'without.',
+    ),
     Entry('instruction', '', 'What the robot is told until the topic `instruction` says so.'),
     Entry(
         'objects',
@@ -156,6 +162,7 @@ class Settings:
     mode: str
     diagnostics_period_s: float
     calibration_file: str
+    adapter: str
     instruction: str
     objects: tuple[str, ...]
     seed: int

@@ -92,6 +92,7 @@ class RolloutWorker:
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
+        self._between: Callable[[], None] | None = None
         self._abandoned = False
         self._closing = False
         self._last: Scene | None = None
@@ -121,6 +122,12 @@ class RolloutWorker:
             if self._pending is not None:
                 self._put(Ended(request=self._pending, state='preempted', num_chunks=0))
             self._pending = request
+            self._changed.notify_all()
+
+    def run_between(self, job: Callable[[], None]) -> None:
+        """Runs a job that must not raise, never during a rollout; it replaces a waiting one."""
+        with self._changed:
+            self._between = job
             self._changed.notify_all()
 
     def reset(self) -> None:
@@ -159,12 +166,16 @@ class RolloutWorker:
                 self._running, self._abandoned = None, False
 
     def _next(self) -> Request | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._closing or self._pending is not None)
-            if self._closing:
-                return None
-            self._running, self._pending = self._pending, None
-            return self._running
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._between or self._pending)
+                if self._closing:
+                    return None
+                job, self._between = self._between, None
+                if job is None:
+                    self._running, self._pending = self._pending, None
+                    return self._running
+            job()
 
     def _should_stop(self) -> bool:
         with self._changed:

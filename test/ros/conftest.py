@@ -14,7 +14,7 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
@@ -180,6 +180,12 @@ class Client:
         request = SetParameters.Request(parameters=parameters)
         results = self.call(SetParameters, '/world_model/set_parameters', request).results
         return next((r.reason for r in results if not r.successful), '')
+
+    def get(self, name):
+        """Returns a text parameter of the node."""
+        request = GetParameters.Request(names=[name])
+        answer = self.call(GetParameters, '/world_model/get_parameters', request)
+        return answer.values[0].string_value
 
     def now_ns(self):
         return self.node.get_clock().now().nanoseconds
