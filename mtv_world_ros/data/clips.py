@@ -6,7 +6,7 @@ V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -221,19 +221,28 @@ def clip_starts(recording: Recording, spec: WorldModelSpec) -> np.ndarray:
     return np.array(whole, dtype=int)
 
 
-def cut_clip(recording: Recording, start: int, spec: WorldModelSpec) -> Clip:
+def cut_clip(
+    recording: Recording, start: int, spec: WorldModelSpec, num_frames: int | None = None
+) -> Clip:
     """Cuts the clip that starts at recorded frame `start`.
+
+    Args:
+        recording: the episode.
+        start: recorded frame.
+        spec: of the model; its clock counts.
+        num_frames: frames that follow the first one; default: those of a chunk.
 
     Raises:
         EpisodeError: the recording ends or has a gap within the clip.
     """
-    index = frame_indices(recording, start, spec)
+    count = spec.num_frames if num_frames is None else num_frames
+    index = frame_indices(recording, start, spec, count)
     if index is None:
         raise EpisodeError(
-            f"'{recording.path}': no whole clip of {spec.num_frames} frames at {spec.fps} Hz "
+            f"'{recording.path}': no whole clip of {count} frames at {spec.fps} Hz "
             f'starts at frame {start}'
         )
-    times = np.arange(spec.num_frames + 1) / spec.fps
+    times = np.arange(count + 1) / spec.fps
     ids = recording.object_ids
     return Clip(
         cameras=recording.cameras,
@@ -242,6 +251,22 @@ def cut_clip(recording: Recording, start: int, spec: WorldModelSpec) -> Clip:
         frames=recording.frames[:, index],
         object_ids=None if ids is None else ids[:, index],
         positions=commanded(recording, start, times),
+    )
+
+
+def chunk_of(clip: Clip, chunk: int, num_frames: int) -> Clip:
+    """Returns chunk number `chunk` of a clip of several, with the frame before it.
+
+    Its first position is the command that was due then, as in a rollout of chained chunks.
+    """
+    first = chunk * num_frames
+    window = slice(first, first + num_frames + 1)
+    return replace(
+        clip,
+        times=clip.times[: num_frames + 1],
+        frames=clip.frames[:, window],
+        object_ids=None if clip.object_ids is None else clip.object_ids[:, window],
+        positions=clip.positions[window],
     )
 
 

@@ -44,6 +44,11 @@ class Conditioning:
         held = {name: value for name, value in values.items() if value is not None}
         return replace(self, **{n: v.expand(count, *v.shape[1:]) for n, v in held.items()})
 
+    def in_dtype(self, dtype: torch.dtype) -> Conditioning:
+        """Returns the same with the latents of videos and images in a number format."""
+        names = ('control', 'start_control', 'start', 'reference')
+        return replace(self, **{name: getattr(self, name).to(dtype) for name in names})
+
 
 def encode_frames(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
     """Returns (B, V, C, F, h, w) latents of (B, V, T, H, W, 3) uint8 RGB frames."""

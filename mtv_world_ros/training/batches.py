@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -15,18 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data.clips import Clip, clip_starts, cut_clip, Recording
+from mtv_world_ros.data.clips import chunk_of, clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.rendering.trajectory_video import (
-    render_trajectory_video,
-    TrajectoryVideoConfig,
-)
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.segmenter import Segmenter
-from mtv_world_ros.training.config import AugmentConfig
+from mtv_world_ros.training.config import AugmentConfig, SelfRolloutConfig
+from mtv_world_ros.training.controls import ControlMaker
+from mtv_world_ros.training.leads import Lead, lead_before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +38,8 @@ class Batch:
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, or None where some clip has none.
         actions: what `ActionEncoding` gives, where they are not drawn.
+        leads: B of them, what comes before the clips that are to start from the model's own
+            prediction, None for the others; empty = none is.
     """
 
     frames: Tensor
@@ -46,6 +47,7 @@ class Batch:
     trajectory: Tensor | None
     object_ids: Tensor | None
     actions: Tensor | None = None
+    leads: tuple[Lead | None, ...] = ()
 
 
 class _Sample(NamedTuple):
@@ -56,6 +58,7 @@ class _Sample(NamedTuple):
     trajectory: ByteArray | None
     object_ids: ByteArray | None
     actions: np.ndarray | None
+    lead: Lead | None
 
 
 class BatchSource:
@@ -74,6 +77,7 @@ class BatchSource:
         batch_size: int,
         seed: int,
         actions: ActionEncoding | None = None,
+        self_rollout: SelfRolloutConfig = SelfRolloutConfig(),
     ) -> None:
         self._starts = [(r, clip_starts(r, spec)) for r in recordings]
         self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
@@ -83,9 +87,15 @@ class BatchSource:
                 f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s); '
                 'record longer ones or lower video.num_frames'
             )
-        self._spec, self._robot, self._segmenter = spec, robot, segmenter
-        self._rendering, self._object_mask, self._augment = rendering, object_mask, augment
-        self._batch_size, self._seed, self._actions = batch_size, seed, actions
+        self.controls = ControlMaker(
+            robot=robot,
+            segmenter=segmenter,
+            rendering=rendering,
+            object_mask=object_mask,
+            actions=actions,
+        )
+        self._spec, self._augment, self._self_rollout = spec, augment, self_rollout
+        self._batch_size, self._seed = batch_size, seed
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._ahead: tuple[int, Future[Batch]] | None = None
@@ -110,7 +120,7 @@ class BatchSource:
 
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((self._seed, step))
-        samples = [self._sample(rng) for _ in range(self._batch_size)]
+        samples = [self._sample(rng, step) for _ in range(self._batch_size)]
         encoded = [s.actions for s in samples if s.actions is not None]
         return Batch(
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
@@ -118,25 +128,30 @@ class BatchSource:
             trajectory=_stack([s.trajectory for s in samples]),
             object_ids=_stack([s.object_ids for s in samples]),
             actions=torch.from_numpy(collate(encoded)) if encoded else None,
+            leads=tuple(s.lead for s in samples),
         )
 
-    def _sample(self, rng: np.random.Generator) -> _Sample:
+    def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
         recording, starts = self._choose(rng)
-        clip = cut_clip(recording, int(starts[rng.integers(len(starts))]), self._spec)
-        trajectory = actions = None
-        if self._actions is None:
-            names = clip.objects or objects_from_instruction(recording.instruction)
-            trajectory = self._draw(clip, names)
+        start = int(starts[rng.integers(len(starts))])
+        lead = lead_before(recording, start, self._spec, self._self_rollout, step, rng)
+        if lead is None:
+            clip = cut_clip(recording, start, self._spec)
         else:
-            actions = self._actions.encode(self._robot, clip.positions)
+            clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        names = clip.objects or objects_from_instruction(recording.instruction)
+        trajectory, actions = self.controls.make(clip, names, clip.frames[:, 0])
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
-            frames = frames[..., rng.permutation(3)]
+            colours = rng.permutation(3)
+            frames = frames[..., colours]
+            lead = lead and replace(lead, colours=tuple(colours.tolist()))
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions)
+        lead = lead and replace(lead, names=names)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
         """An episode and the starts of its clips; failed ones as often as they are asked for."""
@@ -145,19 +160,6 @@ class BatchSource:
         if share is not None and self._failed and rng.random() < share:
             pool = self._failed
         return pool[rng.integers(len(pool))]
-
-    def _draw(self, clip: Clip, names: tuple[str, ...]) -> ByteArray:
-        masks = None
-        if self._object_mask:
-            masks = self._segmenter.segment(clip.frames[:, :1], names).masks[:, :, 0]
-        return render_trajectory_video(
-            cameras=clip.cameras,
-            robot=self._robot,
-            positions=clip.positions,
-            times=clip.times,
-            object_masks=masks,
-            config=self._rendering,
-        ).frames
 
 
 def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:

@@ -117,6 +117,32 @@ class AugmentConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SelfRolloutConfig:
+    """Clips that start where the model's own rollout ended; see `self_rollout.py`.
+
+    Attributes:
+        share: probability of such a clip, where the episode is long enough before it; 0 = off.
+        steps: denoising steps of the rollout.
+        max_chunks: longest rollout; from 1 on, all lengths are as likely.
+        start_step: training step from which on it is done.
+    """
+
+    share: float = 0.0
+    steps: int = 1
+    max_chunks: int = 3
+    start_step: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ConfigError(f'self_rollout.share is {self.share}; it must be in 0 .. 1')
+        for name in ('steps', 'max_chunks'):
+            if getattr(self, name) < 1:
+                raise ConfigError(
+                    f'self_rollout.{name} is {getattr(self, name)}; it must be at least 1'
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OptimizerConfig:
     """AdamW with warm-up, a constant stretch and a linear decay to zero."""
 
@@ -142,6 +168,7 @@ class TrainingConfig:
         rendering: how trajectory videos look.
         objective: the loss.
         augment: disturbances.
+        self_rollout: clips that start from the model's own predictions.
         optimizer: steps and rates.
     """
 
@@ -152,6 +179,7 @@ class TrainingConfig:
     rendering: TrajectoryVideoConfig = TrajectoryVideoConfig()
     objective: ObjectiveConfig = ObjectiveConfig()
     augment: AugmentConfig = AugmentConfig()
+    self_rollout: SelfRolloutConfig = SelfRolloutConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
 
     def as_dict(self) -> dict[str, Any]:

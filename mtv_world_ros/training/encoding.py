@@ -68,12 +68,13 @@ def encode_batch(
     ids = None if batch.object_ids is None else batch.object_ids.to(device)
     return EncodedBatch(
         clean=clean,
-        conditioning=_condition(encoders, batch, device),
+        conditioning=condition_batch(encoders, batch, device),
         weights=_weights(pixel_weights(frames, ids, objective), encoders.autoencoder, clean),
     )
 
 
-def _condition(encoders: Encoders, batch: Batch, device: torch.device) -> Conditioning:
+def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> Conditioning:
+    """Returns what the clips of a batch are denoised under."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
     if batch.actions is None:
         assert batch.trajectory is not None

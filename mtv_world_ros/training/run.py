@@ -137,6 +137,7 @@ def train(
         batch_size=config.optimizer.batch_size,
         seed=seed,
         actions=actions,
+        self_rollout=config.self_rollout,
     )
     trained_on = {
         'episodes': len(recordings),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 import json
 import math
@@ -24,6 +25,7 @@ from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.training.encoding import Encoders
 from mtv_world_ros.training.loss import batch_loss
+from mtv_world_ros.training.self_rollout import SelfRollout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,13 +121,36 @@ class Trainer:
         Raises:
             TrainingError: the loss is not finite; the last saved state stays whole.
         """
+        rollout = SelfRollout(
+            source.controls,
+            self.encoders,
+            build_scheduler(self.config.scheduler),
+            num_inference_steps=self.config.self_rollout.steps,
+            seed=self.seed,
+            device=self.device,
+        )
         while self.step < self.config.optimizer.steps:
-            report = self._train_step(source.batch(self.step))
+            batch = source.batch(self.step)
+            if any(batch.leads):
+                with self.averaged() as transformer:
+                    batch = rollout.apply(batch, self.step, transformer)
+            report = self._train_step(batch)
             self.step += 1
             yield report
             if self.step % save_every == 0 or self.step == self.config.optimizer.steps:
                 self.save_state()
                 on_save(self.step)
+
+    @contextmanager
+    def averaged(self) -> Iterator[MultiViewWanTransformer]:
+        """Lends the worker with averaged weights, which are those that will serve."""
+        parameters = list(self.worker.parameters())
+        self.ema.store(parameters)
+        self.ema.copy_to(parameters)
+        try:
+            yield self.worker
+        finally:
+            self.ema.restore(parameters)
 
     def loss(self, batch: Batch, step: int) -> Tensor:
         """The loss of a batch with the noise of a step."""

@@ -1,0 +1,136 @@
+"""Start frames of the model's own making, so that long rollouts hold.
+
+A model that only ever sees recorded start frames meets its own errors first in a chain of chunks,
+and they add up. Here some clips start where the model's own rollout of the chunks before ended,
+made as serving makes it, while the target stays the recording: it learns to carry on from its own
+pictures. Self-Forcing (Huang et al. 2025, arXiv:2506.08009) and Ctrl-World's successors train on
+self-made context; as in the latter, no gradient passes through the rollout.
+
+Shape letters: B batch, V views, T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from mtv_world_ros.data.clips import chunk_of
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.model.actions import collate
+from mtv_world_ros.model.conditioning import decode_frames
+from mtv_world_ros.model.parts import Scheduler
+from mtv_world_ros.model.sampler import sample_latents
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.controls import ControlMaker
+from mtv_world_ros.training.encoding import condition_batch, Encoders
+from mtv_world_ros.training.leads import Lead
+
+
+class SelfRollout:
+    """Replaces the start frames of a batch's clips that have a lead.
+
+    Args:
+        controls: makes trajectory videos or actions of what was imagined.
+        encoders: on the device that trains.
+        scheduler: noise levels and step rule of serving.
+        num_inference_steps: denoising steps a chunk.
+        seed: of the noise.
+        device: where the model is.
+    """
+
+    def __init__(
+        self,
+        controls: ControlMaker,
+        encoders: Encoders,
+        scheduler: Scheduler,
+        *,
+        num_inference_steps: int,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self._controls, self._encoders, self._scheduler = controls, encoders, scheduler
+        self._steps, self._seed, self._device = num_inference_steps, seed, device
+
+    def apply(self, batch: Batch, step: int, transformer: MultiViewWanTransformer) -> Batch:
+        """Returns the batch with its leads imagined; the same step gives the same batch.
+
+        Args:
+            batch: clips.
+            step: of the training; the noise depends on it.
+            transformer: imagines; best with averaged weights, which are those that will serve.
+        """
+        leads = {i: lead for i, lead in enumerate(batch.leads) if lead is not None}
+        if not leads:
+            return batch
+        starts = {i: np.ascontiguousarray(lead.clip.frames[:, 0]) for i, lead in leads.items()}
+        for left in range(max(lead.num_chunks for lead in leads.values()), 0, -1):
+            now = {i: lead for i, lead in leads.items() if lead.num_chunks >= left}
+            chunks = [lead.num_chunks - left for lead in now.values()]
+            chunk_batch = self._batch(list(now.values()), chunks, [starts[i] for i in now])
+            seeds = [_noise_seed(self._seed, step, i, left) for i in now]
+            ends = self._imagine(chunk_batch, seeds, transformer)
+            starts |= dict(zip(now, ends, strict=True))
+        return self._replaced(batch, leads, starts)
+
+    def _batch(
+        self, leads: Sequence[Lead], chunks: Sequence[int], starts: Sequence[ByteArray]
+    ) -> Batch:
+        """Chunk number `chunks[i]` of each lead, from a given start frame, as a batch."""
+        clips = [
+            chunk_of(lead.clip, chunk, lead.num_frames)
+            for lead, chunk in zip(leads, chunks, strict=True)
+        ]
+        made = [
+            self._controls.make(clip, lead.names, start)
+            for clip, lead, start in zip(clips, leads, starts, strict=True)
+        ]
+        videos = [video for video, _ in made if video is not None]
+        actions = [encoded for _, encoded in made if encoded is not None]
+        return Batch(
+            frames=torch.from_numpy(np.stack([clip.frames for clip in clips])),
+            start_frame=torch.from_numpy(np.stack(starts)),
+            trajectory=torch.from_numpy(np.stack(videos)) if videos else None,
+            object_ids=None,
+            actions=torch.from_numpy(collate(actions)) if actions else None,
+        )
+
+    def _imagine(
+        self, batch: Batch, seeds: Sequence[int], transformer: MultiViewWanTransformer
+    ) -> list[ByteArray]:
+        """The (V, H, W, 3) last frame of each chunk."""
+        with torch.inference_mode():
+            conditioning = condition_batch(self._encoders, batch, self._device)
+            latents = sample_latents(
+                transformer,
+                self._scheduler,
+                conditioning.in_dtype(transformer.dtype),
+                seeds=seeds,
+                num_inference_steps=self._steps,
+                should_stop=lambda: False,
+            )
+            last = decode_frames(self._encoders.autoencoder, latents)[:, :, -1]
+        return list(last.cpu().numpy())
+
+    def _replaced(
+        self, batch: Batch, leads: dict[int, Lead], starts: dict[int, ByteArray]
+    ) -> Batch:
+        last = [lead.num_chunks for lead in leads.values()]
+        made = self._batch(list(leads.values()), last, [starts[i] for i in leads])
+        start_frame = batch.start_frame.clone()
+        trajectory = None if batch.trajectory is None else batch.trajectory.clone()
+        for row, (index, lead) in enumerate(leads.items()):
+            # the rollout was made in true colours, which segmenters know
+            start_frame[index] = made.start_frame[row][..., list(lead.colours)]
+            if trajectory is not None and made.trajectory is not None:
+                trajectory[index] = made.trajectory[row]
+        # encoded actions do not depend on pictures
+        return replace(batch, start_frame=start_frame, trajectory=trajectory)
+
+
+def _noise_seed(seed: int, step: int, index: int, left: int) -> int:
+    sequence = np.random.SeedSequence((seed, step, index, left))
+    return int(sequence.generate_state(1, np.uint32)[0])
