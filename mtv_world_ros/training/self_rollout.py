@@ -2,9 +2,11 @@
 
 A model that only ever sees recorded start frames meets its own errors first in a chain of chunks,
 and they add up. Here some clips start where the model's own rollout of the chunks before ended,
-made as serving makes it, while the target stays the recording: it learns to carry on from its own
-pictures. Self-Forcing (Huang et al. 2025, arXiv:2506.08009) and Ctrl-World's successors train on
-self-made context; as in the latter, no gradient passes through the rollout.
+made as serving makes it, without gradient, while the target stays the recording: it learns to
+carry on from its own pictures. So do Resampling Forcing (arXiv:2512.15702: self-made, detached
+history, flow matching towards the recording) and BAgger (arXiv:2512.12080); Self Forcing
+(arXiv:2506.08009) and PersistWorld (arXiv:2603.25685) roll out likewise and judge the result
+otherwise, by a critic and by rewards.
 
 Shape letters: B batch, V views, T frames, H W pixels.
 """
