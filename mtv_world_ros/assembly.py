@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.errors import CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
+from mtv_world_ros.policies.config import load_policy_config
+from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import content_digest, share_path
 from mtv_world_ros.success.describer import Describer, InstructionDescriber
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from mtv_world_ros.success.vlm_describer import Chat
 
 BUNDLED = 'bundled'
+#: makes a policy for the scene of a task and a seed (-1 = not known); most do not look at either
+PolicyMaker = Callable[[str, int], Policy]
 
 
 def checkpoint_path(name: str | Path) -> Path:
@@ -130,6 +135,48 @@ def _robot_of(card: Any, robot: str | Path | None) -> RobotModel:
             f"'{model.name}'; use the trained one or train on this robot's episodes"
         )
     return model
+
+
+def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
+    """Returns what makes the policy of a name.
+
+    Args:
+        name: YAML file, name of one in `config/policies`, or a scripted policy such as
+            `expert-noise-0.02`.
+        robot: whose joints it moves.
+
+    Raises:
+        ConfigError, PolicyError: no such policy, or its file is wrong.
+    """
+    path = Path(name)
+    if str(name).startswith('expert'):
+        return _scripted(str(name), robot)
+    if path.suffix not in ('.yaml', '.yml'):
+        path = share_path('config', 'policies', f'{name}.yaml')
+    config = load_policy_config(path)
+    if isinstance(config, str):
+        return _scripted(config, robot)
+    made = config.make(robot)
+    return lambda task, scene_seed: made
+
+
+def _scripted(variant: str, robot: RobotModel) -> PolicyMaker:
+    from mtv_world_ros.sim.expert import Expert
+    from mtv_world_ros.sim.policy_variant import parse_variant
+    from mtv_world_ros.sim.scripted_policy import scripted_policy
+
+    parse_variant(variant)
+    expert = Expert(robot)
+
+    def make(task: str, scene_seed: int) -> Policy:
+        if not task or scene_seed < 0:
+            raise PolicyError(
+                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
+                "'scene_seed' to those of the recorded episode"
+            )
+        return scripted_policy(variant, task, scene_seed, expert)
+
+    return make
 
 
 def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:

@@ -10,6 +10,7 @@ from mtv_world_ros.cli import (
     demo,
     doctor,
     evaluate,
+    imagine,
     import_dataset,
     import_weights,
     replay,
@@ -18,7 +19,18 @@ from mtv_world_ros.cli import (
 )
 from mtv_world_ros.errors import MtvWorldError
 
-COMMANDS = (demo, replay, collect, train, evaluate, report, doctor, import_dataset, import_weights)
+COMMANDS = (
+    demo,
+    replay,
+    imagine,
+    collect,
+    train,
+    evaluate,
+    report,
+    doctor,
+    import_dataset,
+    import_weights,
+)
 
 
 def main(argv: list[str] | None = None) -> int:

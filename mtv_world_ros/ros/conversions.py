@@ -10,6 +10,7 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiArrayLayout
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
+from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.ros.rejection import Reason, rejected_as, Rejection
@@ -43,6 +44,19 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
         return JointTrajectory(
             joint_names=tuple(names), times=times, positions=positions, velocities=velocities
         )
+
+
+def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
+    """Message of a trajectory whose times count from the header's stamp; inverse of the above."""
+    message = JointTrajectoryMsg(header=header, joint_names=list(trajectory.joint_names))
+    for row, seconds in enumerate(trajectory.times):
+        point = JointTrajectoryPoint(positions=array('d', trajectory.positions[row].tolist()))
+        if trajectory.velocities is not None:
+            point.velocities = array('d', trajectory.velocities[row].tolist())
+        after = point.time_from_start
+        after.sec, after.nanosec = divmod(round(float(seconds) * NANO), NANO)
+        message.points.append(point)
+    return message
 
 
 def _rows(message: JointTrajectoryMsg, field: str) -> FloatArray:

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.assembly import (
+    assemble_policy,
+    checkpoint_path,
+    load_pipeline,
+    PolicyMaker,
+    robot_path,
+)
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.policy_parameters import PolicySettings
 from mtv_world_ros.ros.rejection import Reason, rejected_as
 
 
@@ -26,7 +36,9 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
     )
 
 
-def load_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
+def load_cameras(
+    settings: Settings | PolicySettings, spec: WorldModelSpec
+) -> tuple[CameraModel, ...]:
     """Loads the calibrated camera of every view, in the model's order.
 
     Raises:
@@ -46,7 +58,9 @@ def load_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraModel,
     return tuple(cameras[view] for view in spec.views)
 
 
-def reload_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
+def reload_cameras(
+    settings: Settings | PolicySettings, spec: WorldModelSpec
+) -> tuple[CameraModel, ...]:
     """The same while the node runs.
 
     Raises:
@@ -54,3 +68,18 @@ def reload_cameras(settings: Settings, spec: WorldModelSpec) -> tuple[CameraMode
     """
     with rejected_as(Reason.CAMERA_INFO_INVALID):
         return load_cameras(settings, spec)
+
+
+def load_spec(checkpoint: str) -> WorldModelSpec:
+    """Returns what a checkpoint takes and gives, without loading it."""
+    return spec_of(read_card(checkpoint_path(checkpoint)))
+
+
+def load_named_robot(settings: PolicySettings) -> RobotModel:
+    """Loads the robot that is set, by default the checkpoint's."""
+    return load_robot(robot_path(settings.robot_file or load_spec(settings.checkpoint).robot))
+
+
+def load_named_policy(settings: PolicySettings) -> PolicyMaker:
+    """Returns how the policy that is set is made."""
+    return assemble_policy(settings.policy, load_named_robot(settings))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import ctypes
+import os
 import signal
 import sys
 from typing import TypeVar
@@ -12,9 +14,24 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from mtv_world_ros.demo.child_processes import PARENT_VARIABLE
 from mtv_world_ros.errors import MtvWorldError
 
+_PR_SET_PDEATHSIG = 1
 AnyNode = TypeVar('AnyNode', bound=Node)
+
+
+def end_with_parent() -> None:
+    """Lets this process get SIGINT when the one that started it is gone, even if it was killed.
+
+    Only where that one asks for it (`demo.child_processes`), and only on Linux.
+    """
+    parent = os.environ.pop(PARENT_VARIABLE, '')
+    if not parent or not sys.platform.startswith('linux'):
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    if os.getppid() != int(parent):  # gone before that was said
+        sys.exit(1)
 
 
 def spin_forever(node: Node) -> None:
@@ -42,6 +59,7 @@ def run(
     Returns:
         The exit status: 1 after a user error, whose text goes to stderr, else 0.
     """
+    end_with_parent()
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
     try:

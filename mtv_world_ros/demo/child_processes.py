@@ -1,0 +1,72 @@
+"""Starts and stops the package's nodes as processes that do not outlive the one they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+
+#: tells a node whose child it is: it ends with that process, however that ends
+PARENT_VARIABLE = 'MTV_WORLD_PARENT'
+_STOP_S = 30.0
+
+
+def private_domain() -> dict[str, str]:
+    """The environment with a ROS domain of its own, unless one is set."""
+    environment = dict(os.environ)
+    environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 100)))
+    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    return environment
+
+
+def module_command(name: str, *arguments: str) -> list[str]:
+    """Command that runs a module of `mtv_world_ros.ros`."""
+    return [sys.executable, '-m', f'mtv_world_ros.ros.{name}', *arguments]
+
+
+def ros_arguments(
+    parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None
+) -> list[str]:
+    """Command-line arguments that set parameters (empty texts are left out) and rename topics."""
+    flags = ['--ros-args']
+    for name, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        flags += ['-p', f'{name}:={text}'] if text else []
+    for name, other in (remaps or {}).items():
+        flags += ['-r', f'{name}:={other}']
+    return flags
+
+
+def start_process(
+    name: str, command: Sequence[str], logs: Path, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Starts a node in a session of its own; it writes to `logs/<name>.log`.
+
+    To be called from the main thread: the node ends with the thread that started it.
+    """
+    parent = {PARENT_VARIABLE: str(os.getpid())}
+    with (logs / f'{name}.log').open('wb') as log:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**(os.environ if environment is None else environment), **parent},
+            start_new_session=True,
+        )
+
+
+def stop_process(process: subprocess.Popen[bytes] | None) -> None:
+    """Ends a node with SIGINT and waits for it; kills it where that does not help."""
+    if process is None or process.poll() is not None:
+        return
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,84 @@
+"""Which policy: YAML read into dataclasses, unknown keys refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+from mtv_world_ros.config_values import check_keys, read_yaml, text
+from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.policy import Policy
+
+KINDS = ('scripted', 'python')
+
+
+class PolicyConfig(Protocol):
+    """What describes a policy and makes it."""
+
+    def make(self, robot: RobotModel) -> Policy:
+        """Returns the policy for a robot."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PythonPolicyConfig:
+    """A policy in Python code of the user's.
+
+    Attributes:
+        factory: `package.module:function`; called with the arguments it returns a `Policy`.
+        arguments: by keyword.
+    """
+
+    factory: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def make(self, robot: RobotModel) -> Policy:
+        """Calls the factory.
+
+        Raises:
+            ConfigError: there is no such function, or it does not take the arguments.
+        """
+        del robot
+        module, _, function = self.factory.partition(':')
+        try:
+            return getattr(import_module(module), function)(**self.arguments)
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"policy factory '{self.factory}' cannot be used: {error}; it must be "
+                "'package.module:function' of something that Python finds (PYTHONPATH)"
+            ) from error
+
+
+def load_policy_config(path: Path) -> PolicyConfig | str:
+    """Reads a file like those in `config/policies`.
+
+    Returns:
+        The configuration; of a scripted policy its name.
+
+    Raises:
+        ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
+    """
+    values = read_yaml(path, 'policy file', 'policy')
+    return policy_config(values, str(path))
+
+
+def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | str:
+    """Returns the configuration that plain values describe; see `load_policy_config`."""
+    if not isinstance(values, Mapping) or 'kind' not in values:
+        raise ConfigError(f"{where}: expected a key 'kind': {', '.join(KINDS)}")
+    kind, rest = values['kind'], {k: v for k, v in values.items() if k != 'kind'}
+    if kind not in KINDS:
+        raise ConfigError(
+            f"{where}: kind '{kind}' is none{nearest(str(kind), KINDS)}; valid are "
+            f'{", ".join(KINDS)}'
+        )
+    if kind == 'scripted':
+        check_keys(rest, ('variant',), (), where)
+        return text(rest, 'variant', 'expert', where)
+    check_keys(rest, ('factory', 'arguments'), ('factory',), where)
+    arguments = check_keys(rest.get('arguments') or {}, rest.get('arguments') or (), (), where)
+    return PythonPolicyConfig(factory=text(rest, 'factory', '', where), arguments=arguments)

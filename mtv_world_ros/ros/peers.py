@@ -1,0 +1,90 @@
+"""Other nodes as one node sees them: what they say in `/diagnostics`, services, parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.ros.conversions import values_of
+
+#: a service that does not answer within this long is gone [s]
+_ANSWER_S = 30.0
+
+
+class Peers:
+    """Keeps the newest diagnostics of every node, and talks to their services.
+
+    Args:
+        node: owner of the subscription and the clients.
+        spin_once: handles callbacks for a moment; raises where waiting makes no sense any more.
+    """
+
+    def __init__(self, node: Node, spin_once: Callable[[], None]) -> None:
+        self._node, self._spin_once = node, spin_once
+        self._clients: dict[str, Client] = {}
+        self._heard: dict[str, tuple[float, dict[str, str]]] = {}
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
+
+    def silence_s(self, name: str) -> float:
+        """For how long a node has said nothing [s]; infinite = never heard."""
+        heard = self._heard.get(name)
+        return float('inf') if heard is None else time.monotonic() - heard[0]
+
+    def state(self, name: str) -> Mapping[str, str]:
+        """What a node said of itself last."""
+        return self._heard[name][1] if name in self._heard else {}
+
+    def forget(self, name: str) -> None:
+        """Forgets what a node said: what it says next is new."""
+        self._heard.pop(name, None)
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+        """Spins until the condition holds.
+
+        Raises:
+            ConfigError: it does not in time.
+        """
+        end_s = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > end_s:
+                raise ConfigError(f'waited {timeout_s:g} s in vain for {what}')
+            self._spin_once()
+
+    def call(self, kind: Any, name: str, request: Any, wait_s: float = _ANSWER_S) -> Any:
+        """Calls a service and returns its answer.
+
+        Raises:
+            ConfigError: it is not there, or does not answer, in time.
+        """
+        if name not in self._clients:
+            self._clients[name] = self._node.create_client(kind, name)
+        client = self._clients[name]
+        self.wait(client.service_is_ready, f"service '{name}'; is its node running?", wait_s)
+        future = client.call_async(request)
+        self.wait(future.done, f"an answer of service '{name}'", _ANSWER_S)
+        return future.result()
+
+    def set_parameters(self, node: str, values: Mapping[str, object]) -> None:
+        """Sets parameters of a node.
+
+        Raises:
+            ConfigError: it refuses one, or is not there.
+        """
+        parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
+        request = SetParameters.Request(parameters=parameters)
+        results = self.call(SetParameters, f'{node}/set_parameters', request).results
+        for name, result in zip(values, results, strict=True):
+            if not result.successful:
+                raise ConfigError(f"'{node}' refuses parameter '{name}': {result.reason}")
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._heard[status.name] = (time.monotonic(), values_of(status))

@@ -1,0 +1,74 @@
+"""Counts faults and publishes a node's `~/report` and `/diagnostics`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+from mtv_world_ros.ros.conversions import to_diagnostics, to_status
+from mtv_world_ros.ros.stamps import make_header
+from mtv_world_ros.ros.view_publisher import create_publisher
+
+#: a fault shows as a warning for this long [s]
+_WARN_S = 5.0
+
+
+class StatusPublisher:
+    """What a node beside the world model has to say.
+
+    Attributes:
+        counts: whatever is counted, by name.
+
+    Args:
+        node: owner of the publishers and the logger.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.counts: Counter[str] = Counter()
+        self._last: tuple[float, str] | None = None
+        self._report = create_publisher(node, DiagnosticArray, '~/report', 100)
+        self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
+
+    def fault(self, kind: str, text: str) -> None:
+        """Counts a fault; `/diagnostics` warns of it for a while."""
+        self.counts[f'faults.{kind}'] += 1
+        self._last = (time.monotonic(), f'{kind}: {text}')
+        self._node.get_logger().warning(f'{kind}: {text}')
+
+    def report(self, state: str, values: Mapping[str, object]) -> None:
+        """Publishes a report at once."""
+        status = to_status(
+            f'{self._node.get_name()}: episode',
+            '',
+            DiagnosticStatus.OK,
+            state,
+            {'state': state, **values},
+        )
+        self._report.publish(to_diagnostics(self._header(), status))
+
+    def publish_diagnostics(self, state: Mapping[str, object], warning: str = '') -> None:
+        """Publishes `/diagnostics`: the state, the counts and the last fault.
+
+        Args:
+            state: keys and values.
+            warning: what is wrong right now; empty = nothing.
+        """
+        values = {**state, **dict(sorted(self.counts.items()))}
+        if self._last is not None:
+            age = time.monotonic() - self._last[0]
+            values |= {'last_fault': self._last[1], 'last_fault_age_s': age}
+            if not warning and age < _WARN_S:
+                warning = self._last[1]
+        level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
+        name = self._node.get_name()
+        status = to_status(name, '', level, warning or 'ready', values)
+        self._diagnostics.publish(to_diagnostics(self._header(), status))
+
+    def _header(self) -> Header:
+        return make_header(self._node.get_clock().now().nanoseconds)
