@@ -77,7 +77,7 @@ class BatchSource:
         batch_size: int,
         seed: int,
         actions: ActionEncoding | None = None,
-        self_rollout: SelfRolloutConfig = SelfRolloutConfig(),
+        self_rollout: SelfRolloutConfig | None = None,
     ) -> None:
         self._starts = [(r, clip_starts(r, spec)) for r in recordings]
         self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
@@ -94,7 +94,8 @@ class BatchSource:
             object_mask=object_mask,
             actions=actions,
         )
-        self._spec, self._augment, self._self_rollout = spec, augment, self_rollout
+        self._spec, self._augment = spec, augment
+        self._self_rollout = self_rollout or SelfRolloutConfig()
         self._batch_size, self._seed = batch_size, seed
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)

@@ -64,7 +64,7 @@ def seen_batches(monkeypatch: pytest.MonkeyPatch) -> list:
     seen = []
     apply = self_rollout.SelfRollout.apply
 
-    def watched(self, batch, step, transformer):  # noqa: ANN001, ANN202
+    def watched(self, batch, step, transformer):
         given = apply(self, batch, step, transformer)
         seen.append((batch, given))
         return given
