@@ -62,6 +62,7 @@ def load_pipeline(
     dtype: str = 'auto',
     num_threads: int = 0,
     segmenter: str = 'auto',
+    serving: str = '',
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -74,14 +75,18 @@ def load_pipeline(
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
         num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
+        serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
+            `ServingOptions`.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
     from mtv_world_ros.model.runtime import choose_dtype, set_num_threads
+    from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
 
+    options = ServingOptions.parse(serving)
     set_num_threads(num_threads)
     number_format = choose_dtype(dtype, device)
     loaded = load_checkpoint(checkpoint_path(checkpoint), dtype=number_format)
@@ -90,6 +95,7 @@ def load_pipeline(
         device=device,
         dtype=number_format,
         robot=_robot_of(loaded.card, robot),
+        serving=options,
     )
     return assemble(
         loaded.card,

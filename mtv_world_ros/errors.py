@@ -38,6 +38,10 @@ class CheckpointError(MtvWorldError):
     """A checkpoint folder is incomplete or is for another model."""
 
 
+class ModelError(MtvWorldError):
+    """The model cannot go on; the rollout was dropped."""
+
+
 class ModelMemoryError(MtvWorldError):
     """The device ran out of memory; the rollout was dropped."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import re
 from typing import NamedTuple, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter
+from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, add_serving
 from mtv_world_ros.cli.provenance import provenance
 from mtv_world_ros.errors import ConfigError
 
@@ -77,6 +77,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_dtype(parser)
     add_model_options(parser)
+    add_serving(parser)
     add_segmenter(parser)
     parser.set_defaults(handler=_evaluate)
 
@@ -182,6 +183,7 @@ def _score(
         device=arguments.device,
         dtype=arguments.dtype,
         segmenter=arguments.segmenter,
+        serving=arguments.serving,
     )
     pipeline = load(num_threads=arguments.threads)
     threads = arguments.threads or max(_usable_cores() // max(arguments.workers, 1), 1)

@@ -18,6 +18,16 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', type=int, default=0)
 
 
+def add_serving(parser: argparse.ArgumentParser) -> None:
+    """Adds `--serving`."""
+    parser.add_argument(
+        '--serving',
+        default='',
+        metavar='"NAME=VALUE ..."',
+        help='what makes the model faster or smaller, e.g. "context_parallel=2"',
+    )
+
+
 def add_segmenter(parser: argparse.ArgumentParser) -> None:
     """Adds `--segmenter`."""
     parser.add_argument(
@@ -48,4 +58,5 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
         dtype=arguments.dtype,
         num_threads=arguments.threads,
         segmenter=arguments.segmenter,
+        serving=arguments.serving,
     )

@@ -11,6 +11,7 @@ from mtv_world_ros.cli.options import (
     add_dtype,
     add_model_options,
     add_segmenter,
+    add_serving,
     pipeline_of,
 )
 
@@ -32,6 +33,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_dtype(parser)
     add_model_options(parser)
     add_segmenter(parser)
+    add_serving(parser)
     parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
 
 

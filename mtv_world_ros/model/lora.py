@@ -98,16 +98,20 @@ _NONE = Adapter(None, {}, {})
 
 
 class Adapters:
-    """Exchanges the adapter of a loaded transformer; the weights under it are not touched.
+    """Exchanges the adapter of a loaded transformer; the weights under it come back as they were.
 
     Reading one is safe in another thread than the one that exchanges them.
 
     Args:
         transformer: loaded, without an adapter.
+        fuse: add the adapter into the weights: no cost a step, and a compiled transformer stays
+            compiled. What it changes is kept on the CPU meanwhile.
     """
 
-    def __init__(self, transformer: MultiViewWanTransformer) -> None:
-        self._transformer = transformer
+    def __init__(self, transformer: MultiViewWanTransformer, *, fuse: bool = False) -> None:
+        self._transformer, self._fused = transformer, fuse
+        #: the weights under a fused adapter, by module
+        self._under: dict[str, Tensor] = {}
         self._beside = {n: p.detach().clone() for n, p in beside(transformer).items()}
         self._held = _NONE
         self._lock = Lock()
@@ -129,7 +133,8 @@ class Adapters:
         """
         if path is None:
             return _NONE
-        _check_peft()
+        if not self._fused:
+            _check_peft()
         with self._lock:
             return Adapter(path, *self._read(path))
 
@@ -153,15 +158,26 @@ class Adapters:
             self._held = wanted
 
     def _exchange(self, adapter: Adapter) -> None:
-        self._transformer.unload_lora()
         self._fill({**self._beside, **adapter.whole})
+        if self._fused:
+            self._fuse(adapter.factors)
+            return
+        self._transformer.unload_lora()
         if adapter.factors:
             self._inject(adapter.factors)
 
-    def merge(self) -> None:
-        """Adds the adapter into the weights for good: faster, and no exchange from then on."""
-        self._transformer.fuse_lora()
-        self._transformer.unload_lora()
+    @torch.no_grad()
+    def _fuse(self, factors: Mapping[str, Factors]) -> None:
+        """Adds factors into the weights, in place, and takes out what was fused before."""
+        for name in self._under.keys() - factors.keys():
+            self._transformer.get_submodule(name).weight.copy_(self._under.pop(name))
+        for name, (a, b) in factors.items():
+            weight: Any = self._transformer.get_submodule(name).weight
+            if name not in self._under:
+                self._under[name] = weight.detach().to('cpu', copy=True)
+            # added in float32: the format of the weights rounds the sum alone
+            change = b.to(weight.device).float() @ a.to(weight.device).float()
+            weight.copy_(self._under[name].to(weight.device).float() + change)
 
     def _read(self, path: Path) -> tuple[dict[str, Factors], dict[str, Tensor]]:
         if path.is_file():

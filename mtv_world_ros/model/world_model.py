@@ -21,13 +21,17 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     decode_frames,
 )
+from mtv_world_ros.model.followers import Followers
 from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
+from mtv_world_ros.model.serving import ServingOptions
 
 if TYPE_CHECKING:
     from mtv_world_ros.geometry.robot import RobotModel
+
+_PLAIN = ServingOptions()
 
 
 class DiffusionWorldModel:
@@ -38,9 +42,11 @@ class DiffusionWorldModel:
         device: e.g. `cpu` or `cuda`.
         dtype: of the transformer's computations.
         robot: the trained one; needed where the checkpoint takes actions that are not drawn.
+        serving: what makes it faster or smaller.
 
     Raises:
         CheckpointError: it is needed and missing.
+        ConfigError: the serving options are not for this machine.
     """
 
     def __init__(
@@ -50,6 +56,7 @@ class DiffusionWorldModel:
         device: str = 'cpu',
         dtype: torch.dtype = torch.float32,
         robot: RobotModel | None = None,
+        serving: ServingOptions = _PLAIN,
     ) -> None:
         if checkpoint.actions is not None and robot is None:
             raise CheckpointError(
@@ -59,10 +66,13 @@ class DiffusionWorldModel:
         self.actions, self.robot = checkpoint.actions, robot
         self.device = torch.device(device)
         self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
-        self._adapters = Adapters(self.transformer)
+        self._adapters = Adapters(self.transformer, fuse=serving.fuse_lora)
         #: of the checkpoint; None = it has none
         self.own_adapter = checkpoint.adapter
-        self.use_adapter(checkpoint.adapter)
+        self._adapters.use(checkpoint.adapter)
+        self._followers = None
+        if serving.context_parallel > 1:
+            self._followers = Followers(self.transformer, serving.context_parallel)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self.scheduler = checkpoint.scheduler
         self.card = checkpoint.card
@@ -93,6 +103,13 @@ class DiffusionWorldModel:
         """
         if adapter != self._adapters.current:
             self._adapters.use(adapter)
+            if self._followers is not None:
+                self._followers.send_weights()
+
+    def close(self) -> None:
+        """Ends the processes that it started, if any; it is not to be used any more."""
+        if self._followers is not None:
+            self._followers.close()
 
     def predict(
         self,

@@ -1,0 +1,58 @@
+"""A process that shares the transformer's sequence with the one that predicts.
+
+Started by `Followers`; commands come as lines of JSON, tensors by torch.distributed. It ends with
+its input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import json
+import sys
+from typing import Any
+
+import torch
+
+from mtv_world_ros.model.context_parallel import join, open_store, receive, split
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+
+
+def main() -> None:
+    """Follows until the input ends."""
+    lines = map(json.loads, sys.stdin)
+    start = next(lines)
+    torch.set_num_threads(start['num_threads'])
+    device = torch.device(start['device'])
+    join(open_store(start['port']), start['rank'], start['size'], device)
+    with torch.inference_mode():
+        _follow(lines, start['config'], device, getattr(torch, start['dtype']))
+
+
+def _follow(
+    lines: Iterator[dict[str, Any]], config: Any, device: torch.device, dtype: torch.dtype
+) -> None:
+    transformer: Any = None
+    for line in lines:
+        tensors = receive(line['tensors'], device)
+        if line['command'] == 'run':
+            transformer(**tensors)
+        elif transformer is None:
+            transformer = _build(config, tensors, device, dtype)
+        else:
+            transformer.load_state_dict(tensors)
+
+
+def _build(
+    config: Any, weights: dict[str, torch.Tensor], device: torch.device, dtype: torch.dtype
+) -> MultiViewWanTransformer:
+    with torch.device('meta'):
+        transformer: Any = MultiViewWanTransformer.from_config(config)
+    transformer.load_state_dict(weights, assign=True)
+    place(transformer, device, dtype).eval()
+    split(transformer)
+    return transformer
+
+
+if __name__ == '__main__':
+    main()
