@@ -1,4 +1,4 @@
-"""Episodes scored one after the other, or by several processes at once."""
+"""Jobs scored one after the other, or by several processes at once."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 import os
 import signal
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Job
 from mtv_world_ros.evaluation.tables import plain
 
 #: scores as plain values, or why there are none
@@ -20,12 +19,31 @@ Outcome = dict[str, Any] | str
 #: libraries that start threads read these when they are loaded
 _THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
+Job = TypeVar('Job')
+
+
+class Scores(Protocol):
+    """What a job gives."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values."""
+        ...
+
+
+class Scorer(Protocol):
+    """Scores one job after the other."""
+
+    def score(self, job: Any) -> Scores:
+        """Returns a job's scores; raises MtvWorldError where there are none."""
+        ...
+
+
 #: of this process, if it is a worker
-_scorer: EpisodeScorer | MtvWorldError | None = None
+_scorer: Scorer | MtvWorldError | None = None
 
 
 def score_all(
-    jobs: Sequence[Job], make_scorer: Callable[[], EpisodeScorer], workers: int, threads: int
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
 ) -> Iterator[tuple[Job, Outcome]]:
     """Yields jobs with their outcome, as they are done.
 
@@ -48,15 +66,16 @@ def score_all(
 
 
 def _score_here(
-    jobs: Sequence[Job], make_scorer: Callable[[], EpisodeScorer]
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer]
 ) -> Iterator[tuple[Job, Outcome]]:
     scorer = make_scorer() if jobs else None
     for job in jobs:
         assert scorer is not None
-        yield job, _outcome(scorer, job)
+        yield job, outcome_of(scorer, job)
 
 
-def _outcome(scorer: EpisodeScorer, job: Job) -> Outcome:
+def outcome_of(scorer: Scorer, job: Any) -> Outcome:
+    """Returns a job's scores as plain values, or why there are none."""
     try:
         return plain(scorer.score(job).as_json())
     except MtvWorldError as error:
@@ -64,7 +83,7 @@ def _outcome(scorer: EpisodeScorer, job: Job) -> Outcome:
 
 
 def _score_in_processes(
-    jobs: Sequence[Job], make_scorer: Callable[[], EpisodeScorer], workers: int, threads: int
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
 ) -> Iterator[tuple[Job, Outcome]]:
     # spawned, not forked: torch's and OpenCV's threads do not survive a fork
     pool = ProcessPoolExecutor(
@@ -99,7 +118,7 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start(make_scorer: Callable[[], EpisodeScorer], threads: int) -> None:
+def _start(make_scorer: Callable[[], Scorer], threads: int) -> None:
     """Prepares a worker; what goes wrong is told by its first job."""
     global _scorer
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
@@ -112,8 +131,8 @@ def _start(make_scorer: Callable[[], EpisodeScorer], threads: int) -> None:
         _scorer = error
 
 
-def _score(job: Job) -> Outcome:
+def _score(job: Any) -> Outcome:
     if isinstance(_scorer, MtvWorldError):
         return str(_scorer)
     assert _scorer is not None
-    return _outcome(_scorer, job)
+    return outcome_of(_scorer, job)

@@ -177,11 +177,11 @@ class SimEpisode:
             goals=tuple(np.asarray(goal) for goal in scene.goals),
         )
 
-    def observe(self) -> SimObservation:
-        """Renders all views and evaluates the task's predicate now."""
+    def observe(self, *, rendering: bool = True) -> SimObservation:
+        """Renders all views, unless told not to, and evaluates the task's predicate now."""
         positions = self.positions()
         self._seen.append((self.object_poses(), positions))
-        images, masks = self._render() if self._rendering else ({}, {})
+        images, masks = self._render() if self._rendering and rendering else ({}, {})
         return SimObservation(
             time_s=self.time_s,
             images=images,

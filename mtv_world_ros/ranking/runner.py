@@ -1,0 +1,142 @@
+"""Runs a policy on an episode twice: in the simulator and in imagination."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import time
+
+import numpy as np
+
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.ranking.imagined import ImaginedWorld, judge
+from mtv_world_ros.ranking.job import Job
+from mtv_world_ros.ranking.living import Life, live, World
+from mtv_world_ros.ranking.result import Judged, Result
+from mtv_world_ros.ranking.simulated import SimulatedWorld
+from mtv_world_ros.sim.episode import SimEpisode
+from mtv_world_ros.sim.expert import Expert
+from mtv_world_ros.sim.scripted_policy import scripted_policy
+
+#: (policy, task, seed, expert) -> policy; has to be picklable for several processes
+MakePolicy = Callable[[str, str, int, Expert], Policy]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutConfig:
+    """How episodes are lived.
+
+    Attributes:
+        num_inference_steps: denoising steps a chunk.
+        max_chunks: answers of the policy at most.
+    """
+
+    num_inference_steps: int = 1
+    max_chunks: int = 8
+
+    def __post_init__(self) -> None:
+        if min(self.num_inference_steps, self.max_chunks) < 1:
+            raise ConfigError(
+                f'{self.num_inference_steps} denoising steps and {self.max_chunks} chunks: both '
+                'must be at least 1 (--steps, --max-chunks)'
+            )
+
+
+class RolloutRunner:
+    """Runs jobs one after the other in one process.
+
+    Args:
+        pipeline: imagines and judges; its robot is the simulator's.
+        config: how episodes are lived.
+        make_policy: makes a policy for an episode.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, config: RolloutConfig, make_policy: MakePolicy = scripted_policy
+    ) -> None:
+        self.pipeline, self.config, self._make_policy = pipeline, config, make_policy
+        self._expert = Expert(pipeline.robot)
+        self._sim = SimEpisode(pipeline.robot, self._expert.home)
+
+    def score(self, job: Job) -> Result:
+        """Returns what a policy reached.
+
+        Raises:
+            PolicyError: the policy cannot answer.
+            MtvWorldError: the episode cannot be simulated or imagined.
+        """
+        policy = self._make_policy(job.policy, job.task, job.seed, self._expert)
+        world = SimulatedWorld(self._sim, self.pipeline.spec.fps, job.seed, job.task)
+        real = self._live(policy, world, world, job)
+        ever, final = world.outcome()
+        begun = time.perf_counter()
+        seen = judge(
+            self.pipeline,
+            world.last_start,
+            world.last_frames,
+            world.last_positions,
+            world.instruction,
+        )
+        judging_s = time.perf_counter() - begun
+        imagined, life, imagining_s = self._imagine(policy, world, job)
+        return Result(
+            policy=job.policy,
+            task=job.task,
+            index=job.index,
+            seed=job.seed,
+            ever=ever,
+            final=final,
+            imagined=imagined,
+            seen=Judged.of(seen),
+            num_chunks=real.num_chunks,
+            num_imagined=life.num_chunks,
+            is_over=real.is_over and life.is_over,
+            seconds={
+                'policy': real.policy_s,
+                'physics': world.physics_s,
+                'rendering': world.rendering_s,
+                'judging the simulated frames': judging_s,
+                'imagining': imagining_s,
+            },
+        )
+
+    def _imagine(
+        self, policy: Policy, simulated: SimulatedWorld, job: Job
+    ) -> tuple[Judged, Life, float]:
+        """From the simulator's first observation on; the estimate, and the time it took [s]."""
+        world = ImaginedWorld(
+            self.pipeline,
+            simulated.instruction,
+            seed=job.seed,
+            num_inference_steps=self.config.num_inference_steps,
+        )
+        begun = time.perf_counter()
+        life = self._live(policy, world, simulated, job)
+        seconds = time.perf_counter() - begun
+        if world.success is None:
+            nothing = Judged(
+                probability=np.nan,
+                interval=(np.nan, np.nan),
+                jaccard=(),
+                reasons=('abstains: the policy gave no answer',),
+            )
+            return nothing, life, seconds
+        return Judged.of(world.success), life, seconds
+
+    def _live(self, policy: Policy, world: World, simulated: SimulatedWorld, job: Job) -> Life:
+        policy.reset(seed=job.seed)
+        return live(
+            policy,
+            world,
+            simulated.start,
+            simulated.instruction,
+            chunk_s=self.pipeline.spec.chunk_seconds,
+            max_chunks=self.config.max_chunks,
+        )
+
+
+def make_runner(make_pipeline: Callable[[], Pipeline], config: RolloutConfig) -> RolloutRunner:
+    """Returns a runner of scripted policies; picklable with `functools.partial`."""
+    return RolloutRunner(make_pipeline(), config)
