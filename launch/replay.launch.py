@@ -31,7 +31,9 @@ def generate_launch_description():
         DeclareLaunchArgument('rate', default_value='1.0', description='of playing'),
         DeclareLaunchArgument('pace', default_value='realtime', description='or burst'),
         DeclareLaunchArgument('checkpoint', default_value='', description='empty = bundled'),
-        DeclareLaunchArgument('num_inference_steps', default_value='', description='empty = 4'),
+        DeclareLaunchArgument(
+            'num_inference_steps', default_value='', description="empty = the checkpoint's"
+        ),
     ]
     node = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(

@@ -271,6 +271,7 @@ class WorldModelSpec:
         width: frame width [px].
         height: frame height [px].
         robot: name of the robot it was trained with.
+        num_inference_steps: denoising steps it is made for.
     """
 
     views: tuple[str, ...]
@@ -279,6 +280,7 @@ class WorldModelSpec:
     width: int
     height: int
     robot: str
+    num_inference_steps: int = 4
 
     @property
     def chunk_seconds(self) -> float:

@@ -124,7 +124,7 @@ class Pipeline:
         *,
         instruction: str = '',
         seed: int = 0,
-        num_inference_steps: int = 4,
+        num_inference_steps: int = 0,
         should_stop: Callable[[], bool] = _never,
     ) -> Iterator[Prediction]:
         """Yields the predicted chunks, each as soon as it is ready.
@@ -134,7 +134,7 @@ class Pipeline:
             trajectory: times count from the observation's stamp.
             instruction: what the robot was told; names the objects unless they are given.
             seed: of the noise; chunk k uses `seed + k`.
-            num_inference_steps: denoising steps a chunk.
+            num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
             should_stop: asked between denoising steps.
 
         Raises:
@@ -151,7 +151,8 @@ class Pipeline:
         names = self.objects or objects_from_instruction(instruction)
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
         positions = resample(trajectory, observation.positions, times)
-        request = _Request(names, instruction, num_inference_steps, should_stop)
+        num_steps = num_inference_steps or spec.num_inference_steps
+        request = _Request(names, instruction, num_steps, should_stop)
         for chunk in range(num_chunks):
             first = chunk * spec.num_frames
             window = slice(first, first + spec.num_frames + 1)
@@ -166,6 +167,7 @@ class Pipeline:
                 chunk=chunk,
                 num_chunks=num_chunks,
                 segmenter=self.segmenter.name,
+                num_inference_steps=num_steps,
             )
             yield prediction
             start = prediction.end_observation

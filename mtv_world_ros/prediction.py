@@ -31,6 +31,7 @@ class Prediction:
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
         segmenter: name of what found the masks.
+        num_inference_steps: denoising steps.
         seconds: time spent by stage [s].
     """
 
@@ -44,6 +45,7 @@ class Prediction:
     chunk: int
     num_chunks: int
     segmenter: str = ''
+    num_inference_steps: int = 0
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     @property

@@ -29,10 +29,12 @@ class CountingWorldModel(PersistenceWorldModel):
         super().__init__(spec)
         self.trajectories: list[np.ndarray] = []
         self.seeds: list[int] = []
+        self.num_steps: list[int] = []
 
     def predict(self, start_frame, trajectory_frames, *, seed, **options):
         self.trajectories.append(trajectory_frames)
         self.seeds.append(seed)
+        self.num_steps.append(options['num_inference_steps'])
         held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
         steps = np.arange(1, held.shape[1] + 1)[None, :, None, None, None]
         return np.minimum(held.astype(int) + steps, 255).astype(np.uint8)
@@ -102,6 +104,17 @@ def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(
     assert np.array_equal(first.end_observation.frames, second.rollout.start_frame)
     end_ns = recording.stamp_ns + 1_600_000_000
     assert first.end_observation.stamp_ns == end_ns
+
+
+@pytest.mark.parametrize(('asked', 'made_for', 'expected'), [(0, 2, 2), (7, 2, 7), (0, 4, 4)])
+def test_denoises_in_the_steps_that_the_model_is_made_for_unless_told_otherwise(
+    recording: Recording, asked: int, made_for: int, expected: int
+) -> None:
+    world_model = CountingWorldModel(replace(SPEC, num_inference_steps=made_for))
+    options = {'num_inference_steps': asked} if asked else {}
+    (chunk,) = imagine(assemble(CARD, world_model), recording, 1.6, **options)
+    assert world_model.num_steps == [expected]
+    assert chunk.num_inference_steps == expected
 
 
 def test_chunks_of_one_rollout_have_seeds_of_their_own(

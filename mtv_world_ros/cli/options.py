@@ -14,7 +14,12 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = cores minus 1')
-    parser.add_argument('--steps', type=int, default=4, help='denoising steps')
+    parser.add_argument(
+        '--steps',
+        type=_num_steps,
+        default=0,
+        help='denoising steps; 0 = those the checkpoint is made for, else 4',
+    )
     parser.add_argument('--seed', type=int, default=0)
 
 
@@ -26,6 +31,13 @@ def add_serving(parser: argparse.ArgumentParser) -> None:
         metavar='"NAME=VALUE ..."',
         help='what makes the model faster or smaller, e.g. "context_parallel=2"',
     )
+
+
+def _num_steps(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more, or 0')
+    return number
 
 
 def add_segmenter(parser: argparse.ArgumentParser) -> None:

@@ -55,7 +55,7 @@ class ImagineOptions:
     robot: str = ''
     device: str = 'cpu'
     num_threads: int = 0
-    num_inference_steps: int = 4
+    num_inference_steps: int = 0
     segmenter: str = 'colour'
 
 

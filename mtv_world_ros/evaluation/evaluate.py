@@ -98,6 +98,8 @@ def evaluate(
         EpisodeError: no episode can be used.
     """
     config, out = config_from(options), Path(out)
+    if not config.num_inference_steps:  # results say the number
+        config = replace(config, num_inference_steps=pipeline.spec.num_inference_steps)
     run = _Run(pipeline, out, name, config, parallel, describer)
     jobs = make_jobs(episode_paths, zero_shot, config.seed)
     results, failed = [], {}

@@ -87,7 +87,7 @@ def replay_offline(
     *,
     calibration: Path | None = None,
     seed: int = 0,
-    num_inference_steps: int = 4,
+    num_inference_steps: int = 0,
     limits: ReplayLimits | None = None,
     overwrite: bool = True,
     show_progress: bool = True,
@@ -103,7 +103,7 @@ def replay_offline(
         out: folder for the predictions; appears only when all is written.
         calibration: camera calibration; default: the one in the episode's folder.
         seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
-        num_inference_steps: denoising steps a chunk.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         limits: what is too old or out of sync.
         overwrite: replace an existing folder of predictions.
         show_progress: draw a progress bar.

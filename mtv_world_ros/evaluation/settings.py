@@ -19,7 +19,7 @@ class EvaluationConfig:
         mode: `observe`: every chunk from the real frames at its start; `imagine`: chunks chained
             from the episode's first frame.
         seed: of the noise, of the choice of shuffled actions, of the bootstrap.
-        num_inference_steps: denoising steps.
+        num_inference_steps: denoising steps; 0 = those the model is made for.
         actions: of `controls.ACTIONS`: everything is imagined once with each.
         ceiling: score the recorded frames too, as they are and through the autoencoder.
         use_ids: score against the recorded identities instead of the segmenter's masks of the
@@ -32,7 +32,7 @@ class EvaluationConfig:
 
     mode: str = 'observe'
     seed: int = 0
-    num_inference_steps: int = 4
+    num_inference_steps: int = 0
     actions: tuple[str, ...] = ('true', 'shuffled')
     ceiling: bool = True
     use_ids: bool = False

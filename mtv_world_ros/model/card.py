@@ -24,8 +24,14 @@ _CARD_KEYS = {
     'rendering': dict,
     'trained_on': dict,
 }
-#: what only models with text need: the instruction, what to keep away from and how strongly
-_OPTIONAL_KEYS = {'prompt': str, 'negative_prompt': str, 'guidance_scale': (int, float)}
+#: what only models with text need: the instruction, what to keep away from and how strongly; and
+#: the denoising steps that a distilled model is made for
+_OPTIONAL_KEYS = {
+    'prompt': str,
+    'negative_prompt': str,
+    'guidance_scale': (int, float),
+    'num_inference_steps': int,
+}
 
 
 def read_card(folder: Path) -> dict[str, Any]:
@@ -57,6 +63,7 @@ def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
         width=card['width'],
         height=card['height'],
         robot=card['robot'],
+        num_inference_steps=card.get('num_inference_steps', 4),
     )
 
 
@@ -66,6 +73,19 @@ def check_card(card: Mapping[str, Any], path: Path) -> None:
     Raises:
         CheckpointError: missing, unknown or ill-typed keys.
     """
+    _check_keys(card, path)
+    num_steps = card.get('num_inference_steps', 1)
+    if num_steps < 1:
+        raise CheckpointError(
+            f"'{path}': num_inference_steps is {num_steps}; it must be at least 1"
+        )
+    if card['control'] not in CONTROLS:
+        raise CheckpointError(
+            f"'{path}': control '{card['control']}' is not one of {', '.join(CONTROLS)}"
+        )
+
+
+def _check_keys(card: Mapping[str, Any], path: Path) -> None:
     known = {**_CARD_KEYS, **_OPTIONAL_KEYS}
     for key in card:
         if key not in known:
@@ -77,7 +97,3 @@ def check_card(card: Mapping[str, Any], path: Path) -> None:
             raise CheckpointError(f"'{path}': key '{key}' is missing")
         if not isinstance(card[key], kind):
             raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
-    if card['control'] not in CONTROLS:
-        raise CheckpointError(
-            f"'{path}': control '{card['control']}' is not one of {', '.join(CONTROLS)}"
-        )

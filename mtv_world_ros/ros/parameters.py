@@ -106,7 +106,12 @@ TABLE: tuple[Entry, ...] = (
         'Names of the objects, e.g. red block; [""] = the ones the instruction names.',
     ),
     Entry('seed', 0, 'Seed of the noise; chunk k uses seed + k.', bounds=(0, 2**31 - 1)),
-    Entry('num_inference_steps', 4, 'Denoising steps a chunk.', bounds=(1, 1000)),
+    Entry(
+        'num_inference_steps',
+        0,
+        'Denoising steps a chunk; 0 = those the checkpoint is made for, else 4.',
+        bounds=(0, 1000),
+    ),
     Entry('max_image_age_s', 0.5, 'Older images reject a trajectory [s].', bounds=_AGE),
     Entry(
         'max_joint_state_age_s', 0.5, 'Older joint states reject a trajectory [s].', bounds=_AGE

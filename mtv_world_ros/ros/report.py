@@ -33,6 +33,8 @@ def chunk_values(chunk: Chunk, sent: Sent, settings: Settings) -> dict[str, obje
     }
     values |= {f'stage_s.{_key(stage)}': s for stage, s in prediction.seconds.items()}
     values['stage_s.publish'] = sent.publish_s
+    # the request may leave it to the checkpoint
+    values['num_inference_steps'] = prediction.num_inference_steps
     return values | _estimate_values(chunk)
 
 

@@ -146,6 +146,7 @@ def test_a_model_of_another_class_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
+        ({'num_inference_steps': 0}, 'num_inference_steps is 0; it must be at least 1'),
         ({'fsp': 5.0}, r"unknown key 'fsp' \(did you mean 'fps'\?\)"),
         ({'fps': 'five'}, "'fps' is 'five'"),
         ({'views': None}, "'views' is None"),

@@ -313,7 +313,7 @@ def test_joints_are_matched_by_name_in_any_order_with_others_between(client, ros
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('num_inference_steps', 0, 'out of range'),
+        ('num_inference_steps', -1, 'out of range'),
         ('seed', -1, 'out of range'),
         ('max_image_age_s', 0.0, 'out of range'),
         ('max_view_skew_s', float('nan'), 'out of range'),
