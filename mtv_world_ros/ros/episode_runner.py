@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Iterator, Sequence
 import json
 from pathlib import Path
-import subprocess
 import sys
 import time
 from typing import Any
@@ -20,9 +19,9 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
-from mtv_world_ros.demo.child_processes import module_command, start_process, stop_process
-from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.ros.conversions import values_of
+from mtv_world_ros.ros.episode_recording import predicted_topics, Recording
 from mtv_world_ros.ros.episode_start import EpisodeStart, LiveCameras, recorded_start
 from mtv_world_ros.ros.peers import Peers
 from mtv_world_ros.ros.policy_loop import GOOD_ENDS
@@ -31,8 +30,6 @@ from mtv_world_ros.ros.status_publisher import StatusPublisher
 
 #: topics of what an episode starts from lie under this name, apart from a robot's own
 START = 'start'
-_PREDICTED = ('predicted/image_raw', 'predicted/camera_info')
-_WORLD_TOPICS = ('predicted/joint_states', 'success', 'jaccard', 'report')
 _PERIOD_S = 0.5
 
 
@@ -56,7 +53,7 @@ class EpisodeRunner(Node):
         self._peers = Peers(self, self._spin_once)
         self._ended: dict[str, str] | None = None
         self._awaited = ''
-        self._recorder: subprocess.Popen[bytes] | None = None
+        self._recording = Recording(options.out, self._peers)
         self._results: list[dict[str, Any]] = []
         policy_report = f'{options.policy_node}/report'
         self.create_subscription(DiagnosticArray, policy_report, self._on_report, 100)
@@ -85,6 +82,7 @@ class EpisodeRunner(Node):
             lambda: self._peers.silence_s(self._name(options.policy_node)) < timeout,
             f"the node '{options.policy_node}'",
         )
+        self._connect()
         for number, start in enumerate(self._starts()):
             result = self._run_one(number, start)
             self._results.append(result)
@@ -97,26 +95,25 @@ class EpisodeRunner(Node):
 
     def close(self) -> None:
         """Closes the record of a running episode, and the node."""
-        self._stop_recorder()
+        self._recording.stop()
         self.destroy_node()
 
     # one episode
 
     def _run_one(self, number: int, start: EpisodeStart) -> dict[str, Any]:
-        bag = self._options.out / f'episode_{number:05d}'
         begin_s = time.monotonic()
-        result: dict[str, Any] = {'episode': number, 'start': start.source, 'bag': str(bag)}
+        bag = self._recording.begin()
+        result: dict[str, Any] = {'episode': number, 'start': start.source, 'bag': bag}
+        begun_s = time.monotonic()
         try:
-            self._record(bag)
-            begun_s = time.monotonic()
             seen = self._live_out(number, start)
             result['episode_s'] = round(time.monotonic() - begun_s, 3)
         finally:
-            self._stop_recorder()
+            self._recording.end()
         result['total_s'] = round(time.monotonic() - begin_s, 3)
         how = seen['how']
         self._status.counts[f'episodes_{how}'] += 1
-        if how not in GOOD_ENDS:
+        if how not in (*GOOD_ENDS, 'max_seconds'):
             self._status.fault(how, seen.get('text', ''))
         kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
         return {**result, **{key: seen.get(key, '') for key in kept}}
@@ -192,46 +189,28 @@ class EpisodeRunner(Node):
         self._wait_for(lambda: not live.missing(), 'images, camera_infos and joint states')
         return live.start(self._options.instruction)
 
-    # recording
-
-    def _record(self, bag: Path) -> None:
+    def _connect(self) -> None:
         """Starts the recorder and waits until everything that is published will reach it."""
         options = self._options
-        if options.no_record:
-            self._wait_for(lambda: self._is_connected([]), 'subscribers of the start')
-            return
-        views, world = options.views, options.world_model
-        predicted = [f'{world}/{view}/{stream}' for view in views for stream in _PREDICTED]
-        predicted += [f'{world}/{topic}' for topic in _WORLD_TOPICS]
-        topics = [*predicted, *(o.topic_name for o in self._outputs.values())]
-        topics += ['joint_trajectory', 'instruction', f'{options.policy_node}/report']
-        command = module_command('recorder', str(bag), *topics, '/diagnostics')
-        command += ['--overwrite', '--stamp', 'header']
-        logs = options.out / 'logs'
-        logs.mkdir(exist_ok=True)
-        log = logs / f'recorder_{bag.name}.log'
-        self._recorder = start_process(log.stem, command, logs)
-        self._wait_for(lambda: self._is_recording(log), f"the recorder; see '{log}'")
-        self._peers.forget(self._name(world))
-        reported = [t for t in predicted if not t.endswith('/report')]
-        self._wait_for(lambda: self._is_connected(reported), 'connections to the recorder')
+        shown = [output.topic_name for output in self._outputs.values()]
+        least = 2  # the world model and the policy
+        if not options.no_record:
+            predicted = predicted_topics(options.world_model, options.views)
+            others = [*shown, 'joint_trajectory', 'instruction', '/diagnostics']
+            others += [f'{node}/report' for node in (options.world_model, options.policy_node)]
+            self._recording.start([*predicted, *others])
+            self._peers.forget(self._name(options.world_model))
+            self._wait_for(lambda: self._are_recorded(predicted), 'connections to the recorder')
+            least = 3
+        outputs = self._outputs.values()
+        self._wait_for(
+            lambda: min(o.get_subscription_count() for o in outputs) >= least,
+            f'{least} subscribers of {shown}',
+        )
 
-    def _is_recording(self, log: Path) -> bool:
-        if self._recorder is not None and self._recorder.poll() is not None:
-            raise EpisodeError(f"the recorder ended early; see '{log}'")
-        return ': recording' in log.read_text(errors='replace')
-
-    def _is_connected(self, topics: Sequence[str]) -> bool:
-        """Whether the world model has subscribers of all topics, and the start has its own."""
-        state = self._peers.state(self._name(self._options.world_model))
-        lonely = [t for t in topics if state.get(f'subscribers.{t}', '0') == '0']
-        least = 2 if self._options.no_record else 3  # world model, policy and recorder
-        counts = [output.get_subscription_count() for output in self._outputs.values()]
-        return bool(state) and not lonely and min(counts) >= least
-
-    def _stop_recorder(self) -> None:
-        stop_process(self._recorder)
-        self._recorder = None
+    def _are_recorded(self, topics: Sequence[str]) -> bool:
+        is_heard = bool(self._peers.state(self._name(self._options.world_model)))
+        return is_heard and not self._peers.unconnected(topics)
 
     # plumbing
 

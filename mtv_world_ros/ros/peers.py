@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import time
 from typing import Any
 
@@ -41,6 +41,15 @@ class Peers:
     def state(self, name: str) -> Mapping[str, str]:
         """What a node said of itself last."""
         return self._heard[name][1] if name in self._heard else {}
+
+    def unconnected(self, topics: Iterable[str]) -> list[str]:
+        """Those of the topics of which a node says that its publisher has no subscriber yet.
+
+        Two that know of each other from the graph may still not be connected, and what is
+        published until then is lost.
+        """
+        states = [state for _, state in self._heard.values()]
+        return [t for t in topics if any(s.get(f'subscribers.{t}') == '0' for s in states)]
 
     def forget(self, name: str) -> None:
         """Forgets what a node said: what it says next is new."""

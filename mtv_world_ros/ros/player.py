@@ -21,6 +21,7 @@ from rosgraph_msgs.msg import Clock
 from mtv_world_ros.data.bag_reader import BagMessage, BagReader
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.ros.conversions import values_of
+from mtv_world_ros.ros.peers import Peers
 from mtv_world_ros.ros.raw_headers import has_header, message_class, read_stamp, with_stamp
 from mtv_world_ros.ros.running import run
 from mtv_world_ros.ros.stamps import NANO, to_stamp
@@ -59,6 +60,7 @@ class Player(Node):
             self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
+        self._peers = Peers(self, lambda: self._executor.spin_once(timeout_sec=0.05))
         self._counts: Counter[str] = Counter()
         self._first_ns = 0
 
@@ -97,14 +99,22 @@ class Player(Node):
             if publisher.msg_type is message_class(TRAJECTORY)
         ]
         end_s = time.monotonic() + self._options.wait_timeout
-        while lonely := [topic for topic in needed if not self.count_subscribers(topic)]:
+        while lonely := self._lonely(needed):
             if time.monotonic() > end_s:
                 raise ConfigError(
-                    f'nobody subscribes to {lonely} after {self._options.wait_timeout:g} s; is '
+                    f'nobody is connected to {lonely} after {self._options.wait_timeout:g} s; is '
                     'the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
                 )
             self._executor.spin_once(timeout_sec=0.05)
         self._wait_until_settled(end_s)
+
+    def _lonely(self, topics: list[str]) -> list[str]:
+        """Topics without subscriber, as far as the graph, or their publisher, can tell."""
+        lonely = [topic for topic in topics if not self.count_subscribers(topic)]
+        if self._options.lock_step and not lonely:
+            node = self._options.report_topic.split('/')[-2]
+            lonely = [] if self._peers.state(node) else [f'/diagnostics of {node}']
+        return lonely or self._peers.unconnected(topics)
 
     def _wait_until_settled(self, end_s: float) -> None:
         """Until all subscriptions that the graph knows are connected and none changes."""

@@ -207,7 +207,10 @@ class PolicyLoop:
             self._why_waiting = 'the rollout is done, but of its chunk there was no report'
             return
         num_frames = int(said['frames'])
-        stamps = chunk_stamps(before.stamp_ns, num_frames, self._spec.fps)
+        # beside a real robot the world model starts from frames newer than those answered
+        is_strict = self._settings.mode == 'imagine'
+        start_ns = before.stamp_ns if is_strict else int(said['observation_stamp_ns'])
+        stamps = chunk_stamps(start_ns, num_frames, self._spec.fps)
         missing = self._frames.missing(stamps)
         unexpected = self._frames.unexpected(stamps)
         if unexpected:

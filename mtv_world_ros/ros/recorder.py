@@ -26,8 +26,10 @@ from mtv_world_ros.ros.running import run
 #: messages kept while the disk is busy
 _DEPTH = 2000
 #: after a stop signal, silence for this long means that everything arrived [s]
-_SILENCE_S = 0.5
-_LONGEST_DRAIN_S = 10.0
+SILENCE_S = 0.5
+LONGEST_DRAIN_S = 10.0
+#: nodes say these as long as they live
+_ENDLESS = ('/diagnostics', '/clock')
 #: topics that are not there yet are looked for this often [s]
 _LOOK_PERIOD_S = 0.05
 
@@ -36,28 +38,30 @@ class Recorder(Node):
     """Subscribes to topics as their publishers offer them and writes what comes.
 
     Args:
-        options: of the command line, see `_parse`.
+        options: of the command line, see `parse`.
+        name: of the node.
 
     Raises:
         EpisodeError: the folder exists already or cannot be written.
     """
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__('recorder')
+    def __init__(self, options: argparse.Namespace, name: str = 'recorder') -> None:
+        super().__init__(name)
         self._options = options
         self._pending = [self.resolve_topic_name(topic) for topic in options.topics]
         self._optional = [self.resolve_topic_name(topic) for topic in options.if_published]
         self._taken: list[Subscription] = []
+        self._declared: list[tuple[str, str, Qos]] = []
         self._next_look_s = 0.0
         self._end_s = float('inf')
         self._is_announced = False
         self._counts: Counter[str] = Counter()
         self._last_stamp_ns = 0
-        self._last_message_s = 0.0
+        self.last_message_s = 0.0
         self._stopping = False
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._writer = BagWriter(options.out, overwrite=options.overwrite)
+        self._writer = self._open()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
@@ -68,20 +72,30 @@ class Recorder(Node):
             ConfigError: a topic has no publisher in time.
         """
         begin_s = time.monotonic()
-        with self._writer:
-            while not self._stopping and time.monotonic() < self._end_s:
-                self._connect()
-                self._check_patience(time.monotonic() - begin_s)
-                self._executor.spin_once(timeout_sec=0.05)
-            if self._stopping:
-                self._drain()
+        while not self._stopping and time.monotonic() < self._end_s:
+            self._connect()
+            self._check_patience(time.monotonic() - begin_s)
+            self._executor.spin_once(timeout_sec=0.05)
+            self._after_spin()
+        if self._stopping:
+            self._drain()
+        if self._writer is not None:
+            self._writer.close()
         counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
         self.get_logger().info(f"recorded '{self._options.out}': {counted or 'nothing'}")
 
     def close(self) -> None:
         """Drops a record that was not finished, and ends the node."""
-        self._writer.abort()
+        if self._writer is not None:
+            self._writer.abort()
         self.destroy_node()
+
+    def _open(self) -> BagWriter | None:
+        """What is recorded into from the start."""
+        return BagWriter(self._options.out, overwrite=self._options.overwrite)
+
+    def _after_spin(self) -> None:
+        """What is to be done now and then."""
 
     def _on_signal(self, *_: object) -> None:
         self._stopping = True
@@ -119,15 +133,14 @@ class Recorder(Node):
         latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        self._writer.declare(
-            topic,
-            msgtype,
-            Qos(
-                reliability=reliability.name.lower(),
-                durability=durability.name.lower(),
-                depth=offers[0].depth or 10,
-            ),
+        offered = Qos(
+            reliability=reliability.name.lower(),
+            durability=durability.name.lower(),
+            depth=offers[0].depth or 10,
         )
+        self._declared.append((topic, msgtype, offered))
+        if self._writer is not None:
+            self._writer.declare(topic, msgtype, offered)
         taken = self.create_subscription(
             message_class(msgtype),
             topic,
@@ -141,6 +154,8 @@ class Recorder(Node):
         by_header = self._options.stamp == 'header'
 
         def write(data: bytes) -> None:
+            if self._writer is None:
+                return
             now_ns = self.get_clock().now().nanoseconds
             stamp_ns = now_ns
             if by_header:
@@ -149,18 +164,20 @@ class Recorder(Node):
                 stamp_ns = self._last_stamp_ns or now_ns
             self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
             self._counts[topic] += 1
-            self._last_message_s = time.monotonic()
+            if topic not in _ENDLESS:
+                self.last_message_s = time.monotonic()
 
         return write
 
     def _drain(self) -> None:
-        end_s = time.monotonic() + _LONGEST_DRAIN_S
-        self._last_message_s = time.monotonic()
-        while time.monotonic() < min(self._last_message_s + _SILENCE_S, end_s):
+        end_s = time.monotonic() + LONGEST_DRAIN_S
+        self.last_message_s = time.monotonic()
+        while time.monotonic() < min(self.last_message_s + SILENCE_S, end_s):
             self._executor.spin_once(timeout_sec=0.05)
 
 
-def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(prog='recorder', description=__doc__)
     add = parser.add_argument
     add('out', type=Path, help='folder to make; it appears when the record is complete')
@@ -188,7 +205,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> int:
     """Records until SIGINT or SIGTERM; returns the exit status."""
     arguments = list(sys.argv if args is None else ('recorder', *args))
-    options = _parse(remove_ros_args(arguments)[1:])
+    options = parse(remove_ros_args(arguments)[1:])
     return run(
         lambda: Recorder(options),
         arguments,

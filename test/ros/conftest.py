@@ -380,3 +380,5 @@ COMPRESSED = CompressedImage
 IMAGE = Image
 INFO = CameraInfo
 STRING = String
+REPORT = DiagnosticArray
+TRIGGER = Trigger

@@ -12,6 +12,7 @@ from mtv_world_ros.resources import share_path
     ('name', 'arguments'),
     [
         ('world_model.launch.py', ('params_file', 'mode', 'calibration_file', 'large_images')),
+        ('policy_in_the_loop.launch.py', ('policy', 'episodes', 'max_chunks', 'live')),
         ('replay.launch.py', ('episode', 'calibration_file', 'rate', 'pace')),
     ],
 )

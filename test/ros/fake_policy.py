@@ -1,0 +1,61 @@
+"""A policy node whose policy goes wrong at its second answer, in the way that the task says."""
+
+import os
+import sys
+import time
+
+import numpy as np
+
+from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.ros.policy_node import main
+
+LATE_S = 2.5
+
+
+class FakePolicy:
+    """Turns the first joint by 0.01 rad a second; its answers are longer than a chunk."""
+
+    name = 'fake'
+
+    def __init__(self, task):
+        self._task, self._num_answers = task, 0
+
+    def reset(self, *, seed):
+        self._num_answers = 0
+
+    def act(self, observation, instruction):
+        self._num_answers += 1
+        times = np.linspace(0.3, 1.2, 4)
+        positions = np.repeat(observation.positions[None], 4, axis=0)
+        positions[:, 0] += 0.01 * times
+        names = JOINTS
+        if self._num_answers == 4:
+            return None
+        if self._num_answers == 2:
+            FAULTS.get(self._task, lambda: None)()
+            if self._task == 'nan':
+                positions[1, 3] = np.nan
+            if self._task == 'other_robot':
+                names = tuple(f'panda_joint{k}' for k in range(14))
+        return JointTrajectory(joint_names=names, times=times, positions=positions)
+
+
+def crash():
+    raise RuntimeError('a fault of the fake policy')
+
+
+FAULTS = {
+    'late': lambda: time.sleep(LATE_S),
+    'slow': lambda: time.sleep(1.0),
+    'crashes': crash,
+    'dies': lambda: os._exit(3),
+}
+JOINTS = tuple(
+    f'{arm}_{joint}'
+    for arm in ('left', 'right')
+    for joint in (*(f'joint{n}' for n in range(1, 7)), 'gripper')
+)
+
+
+if __name__ == '__main__':
+    sys.exit(main(load=lambda settings: lambda task, scene_seed: FakePolicy(task)))
