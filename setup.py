@@ -59,7 +59,7 @@ setup(
         'zstandard>=0.22',
     ],
     extras_require={
-        'train': ['tensorboard>=2.21'],
+        'train': ['accelerate>=1.15', 'tensorboard>=2.21'],
         # Vision-language models that name objects: behind a server, or here.
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.

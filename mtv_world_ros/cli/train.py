@@ -16,7 +16,14 @@ if TYPE_CHECKING:
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
-    parser = commands.add_parser('train', help='train a world model on a folder of episodes')
+    parser = commands.add_parser(
+        'train',
+        help='train a world model on a folder of episodes',
+        description='Several processes, GPUs or machines train together when a launcher starts '
+        'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
+        'accelerate launch with the same -m. optimizer.batch_size is that of all of them '
+        'together: they see the same clips as one would.',
+    )
     parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
     parser.add_argument('--out', type=Path, help='resumes what is there')
     parser.add_argument('--preset', default='small', help='name or YAML file')
@@ -46,7 +53,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
-    parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all cores')
+    parser.add_argument(
+        '--threads', type=int, default=0, help='CPU threads a process; 0 = its share of all cores'
+    )
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
     parser.set_defaults(handler=_train)
 
@@ -73,7 +82,9 @@ def _train(arguments: argparse.Namespace) -> int:
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
-    torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
+    processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
+    cores = max(1, len(os.sched_getaffinity(0)) // processes)
+    torch.set_num_threads(arguments.threads or cores)
     folder = train(
         config,
         select(arguments.dataset, arguments.split, default='train').paths,

@@ -1,13 +1,13 @@
-"""Batches by step number: the same step gives the same batch, so a resumed run is exact.
+"""Batches by step and clip number: the same numbers give the same clip, in whatever process.
 
 Shape letters: B batch, V views, T frames, H W pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import cv2
@@ -36,10 +36,13 @@ class Batch:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model is shown it.
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
-        object_ids: (B, V, 1 + T, H, W) uint8, or None where some clip has none.
+        object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         actions: what `ActionEncoding` gives, where they are not drawn.
         leads: B of them, what comes before the clips that are to start from the model's own
             prediction, None for the others; empty = none is.
+        step: of the training, from 0.
+        numbers: of its clips within the step's whole batch, which processes and accumulation
+            split; each clip's noise depends on its own.
     """
 
     frames: Tensor
@@ -48,6 +51,17 @@ class Batch:
     object_ids: Tensor | None
     actions: Tensor | None = None
     leads: tuple[Lead | None, ...] = ()
+    step: int = 0
+    numbers: Sequence[int] = ()
+
+    def parts(self, count: int) -> Iterator[Batch]:
+        """Yields its clips in so many batches, as even as can be."""
+        size = len(self.numbers)
+        for index in range(count):
+            chosen = slice(size * index // count, size * (index + 1) // count)
+            values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'step'}
+            held = {name: v if v is None else v[chosen] for name, v in values.items()}
+            yield replace(self, **held)
 
 
 class _Sample(NamedTuple):
@@ -62,7 +76,21 @@ class _Sample(NamedTuple):
 
 
 class BatchSource:
-    """Cuts, draws and disturbs clips; one batch is prepared while the last one trains."""
+    """Cuts, draws and disturbs clips; one batch is prepared while the last one trains.
+
+    Args:
+        recordings: where clips come from.
+        spec: what the model takes and gives.
+        robot: of the recordings.
+        segmenter: finds the objects of the first frames.
+        rendering: how trajectory videos look.
+        object_mask: whether they carry the objects' masks.
+        augment: disturbances.
+        batch_size: clips of a step, over all processes.
+        seed: of choice and disturbances.
+        actions: how positions become actions, where they are not drawn.
+        numbers: the clips of a step that this process makes; None: all.
+    """
 
     def __init__(
         self,
@@ -78,7 +106,9 @@ class BatchSource:
         seed: int,
         actions: ActionEncoding | None = None,
         self_rollout: SelfRolloutConfig | None = None,
+        numbers: Sequence[int] | None = None,
     ) -> None:
+        self._numbers = range(batch_size) if numbers is None else numbers
         self._starts = [(r, clip_starts(r, spec)) for r in recordings]
         self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
         if not self._starts:
@@ -94,9 +124,8 @@ class BatchSource:
             object_mask=object_mask,
             actions=actions,
         )
-        self._spec, self._augment = spec, augment
+        self._spec, self._augment, self._seed = spec, augment, seed
         self._self_rollout = self_rollout or SelfRolloutConfig()
-        self._batch_size, self._seed = batch_size, seed
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._ahead: tuple[int, Future[Batch]] | None = None
@@ -120,14 +149,16 @@ class BatchSource:
         self._pool.shutdown(cancel_futures=True)
 
     def _make(self, step: int) -> Batch:
-        rng = np.random.default_rng((self._seed, step))
-        samples = [self._sample(rng, step) for _ in range(self._batch_size)]
+        seeds = [(self._seed, step, number) for number in self._numbers]
+        samples = [self._sample(np.random.default_rng(seed), step) for seed in seeds]
         encoded = [s.actions for s in samples if s.actions is not None]
         return Batch(
+            step=step,
+            numbers=self._numbers,
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
             trajectory=_stack([s.trajectory for s in samples]),
-            object_ids=_stack([s.object_ids for s in samples]),
+            object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
             actions=torch.from_numpy(collate(encoded)) if encoded else None,
             leads=tuple(s.lead for s in samples),
         )
@@ -161,6 +192,14 @@ class BatchSource:
         if share is not None and self._failed and rng.random() < share:
             pool = self._failed
         return pool[rng.integers(len(pool))]
+
+
+def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
+    """Zero ids in place of missing ones, where another clip has some; they weigh the same."""
+    known = next((part for part in ids if part is not None), None)
+    if known is None:
+        return list(ids)
+    return [np.zeros_like(known) if part is None else part for part in ids]
 
 
 def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:

@@ -21,6 +21,7 @@ from mtv_world_ros.model.image_encoder import ImageEncoder
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.training.batches import Batch
 from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.objective import latent_weights, pixel_weights, pooled_weights
 
 
@@ -97,7 +98,7 @@ def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor
 
 
 def drop_conditions(
-    conditioning: Conditioning, augment: AugmentConfig, generator: torch.Generator
+    conditioning: Conditioning, augment: AugmentConfig, draws: Draws
 ) -> Conditioning:
     """Takes the control, the start image or its CLIP tokens from some samples, each by chance.
 
@@ -113,7 +114,7 @@ def drop_conditions(
     for names, probability in dropped.items():
         if probability == 0:  # nothing is drawn: runs without dropout keep their noise
             continue
-        kept = torch.rand(len(conditioning.control), generator=generator) >= probability
+        kept = draws.uniform() >= probability
         for name in names:
             value = getattr(conditioning, name)
             if value is not None:

@@ -9,8 +9,15 @@ from mtv_world_ros.model.action_features import EE_MLP
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.batches import Batch
 from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.training.objective import add_noise, draw_sigmas, sample_loss, sigma_weights
+from mtv_world_ros.training.objective import (
+    add_noise,
+    draw_sigmas,
+    Loss,
+    sample_loss,
+    sigma_weights,
+)
 
 
 def batch_loss(
@@ -18,28 +25,28 @@ def batch_loss(
     encoders: Encoders,
     batch: Batch | EncodedBatch,
     config: TrainingConfig,
-    generator: torch.Generator,
+    draws: Draws,
     device: torch.device,
-) -> Tensor:
-    """Returns the loss of a batch.
+) -> Loss:
+    """Returns the loss of a batch, as sums over its clips.
 
     Args:
         transformer: on `device`, in the number format of forward and backward.
         encoders: on `device`.
         batch: clips, or what a latent cache holds of them.
         config: the preset.
-        generator: on the CPU; noise levels, noise and what is dropped are drawn from it.
+        draws: of its clips; noise levels, noise and what is dropped come from them.
         device: where to compute.
     """
     objective, dtype = config.objective, transformer.dtype
     if isinstance(batch, Batch):
         batch = encode_batch(encoders, batch, objective, device)
     clean = batch.clean
-    sigmas = draw_sigmas(len(clean), objective, generator)
-    noise = torch.randn(clean.shape, generator=generator).to(device)
+    sigmas = draw_sigmas(draws, objective)
+    noise = draws.normal(*clean.shape[1:]).to(device)
     noisy = add_noise(clean, noise, sigmas.to(device))
-    kept = _kept(len(clean), config, generator, device)
-    cond = drop_conditions(batch.conditioning, config.augment, generator)
+    kept = _kept(draws, config, device)
+    cond = drop_conditions(batch.conditioning, config.augment, draws)
     predicted = transformer(
         noisy.to(dtype),
         (sigmas * 1000).to(device),
@@ -57,10 +64,8 @@ def batch_loss(
     return sample_loss(predicted, target, batch.weights, objective.huber_delta, by_sigma)
 
 
-def _kept(
-    count: int, config: TrainingConfig, generator: torch.Generator, device: torch.device
-) -> Tensor | None:
+def _kept(draws: Draws, config: TrainingConfig, device: torch.device) -> Tensor | None:
     """(B,) bool, False where a sample goes without its actions."""
     if config.video.control != EE_MLP:
         return None
-    return (torch.rand(count, generator=generator) >= config.augment.action_dropout).to(device)
+    return (draws.uniform() >= config.augment.action_dropout).to(device)

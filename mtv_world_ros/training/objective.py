@@ -6,25 +6,43 @@ Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w la
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 import torch.nn.functional as F
 
 from mtv_world_ros.training.config import ObjectiveConfig
+from mtv_world_ros.training.draws import Draws
 
 #: RGB difference (of 255) from which a pixel counts as changed
 CHANGE_THRESHOLD = 24
 
 
-def draw_sigmas(count: int, config: ObjectiveConfig, generator: torch.Generator) -> Tensor:
-    """Returns (count,) noise levels in (0, 1], shifted towards high noise.
+class Loss(NamedTuple):
+    """A sum of weighted errors and the sum of its weights; their ratio is the loss.
+
+    Both are sums over clips, so that a batch may be split among processes and in accumulated
+    parts: the sums of the parts have the ratio, and the gradients, of the whole.
+    """
+
+    total: Tensor
+    weight: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """The loss of these clips alone."""
+        return self.total / self.weight
+
+
+def draw_sigmas(draws: Draws, config: ObjectiveConfig) -> Tensor:
+    """Returns (B,) noise levels in (0, 1], shifted towards high noise.
 
     `sigma' = s * sigma / (1 + (s - 1) * sigma)` as in Wan's schedule.
     """
-    uniform = torch.rand(count, generator=generator).clamp_min(1e-3)
+    uniform = draws.uniform().clamp_min(1e-3)
     shifted = config.sigma_shift * uniform / (1 + (config.sigma_shift - 1) * uniform)
-    full = torch.rand(count, generator=generator) < config.full_noise_share
+    full = draws.uniform() < config.full_noise_share
     return torch.where(full, torch.ones(()), shifted)
 
 
@@ -98,8 +116,8 @@ def sample_loss(
     weights: Tensor,
     delta: float | None,
     by_sample: Tensor | None = None,
-) -> Tensor:
-    """Returns the weighted mean loss between predicted and clean latents.
+) -> Loss:
+    """Returns the weighted loss between predicted and clean latents.
 
     Args:
         predicted: (B, V, C, T, h, w).
@@ -115,4 +133,4 @@ def sample_loss(
         error = F.huber_loss(predicted, clean, reduction='none', delta=delta) / delta
     if by_sample is not None:
         error = error * by_sample.reshape(-1, *[1] * (error.ndim - 1))
-    return (error * weights).sum() / weights.sum()
+    return Loss((error * weights).sum(), weights.sum())

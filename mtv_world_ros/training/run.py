@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 import json
 from pathlib import Path
-import time
 
 import torch
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from mtv_world_ros.data.clips import Recording
@@ -22,10 +19,9 @@ from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.training.actions import kept_actions
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.trainer import mean_loss, Trainer
-
-#: losses averaged for the progress bar and the log
-_WINDOW = 50
+from mtv_world_ros.training.log import TrainingLog
+from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.trainer import Trainer
 
 
 def find_episodes(dataset: Path) -> list[Path]:
@@ -100,6 +96,9 @@ def train(
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
+    Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
+    clips, and the main one alone writes; `out` and `cache` must be the same for all.
+
     Args:
         config: the preset.
         dataset: folder with episode folders in it, or the episode folders.
@@ -117,14 +116,30 @@ def train(
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
     """
+    processes = Processes(device)
     out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
-    recordings, skipped = load_recordings(
-        spread(paths, num_episodes), spec_of(config), robot, cache or out / 'cache'
-    )
-    (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
-    actions = kept_actions(
-        out, config.video.control, recordings, spec_of(config), robot, initial=initial
+    with processes.main_first():
+        recordings, skipped = load_recordings(
+            spread(paths, num_episodes), spec_of(config), robot, cache or out / 'cache'
+        )
+        actions = kept_actions(
+            out, config.video.control, recordings, spec_of(config), robot, initial=initial
+        )
+    trained_on: dict[str, object] = {
+        'episodes': len(recordings),
+        'skipped': len(skipped),
+        'tasks': sorted({recording.task for recording in recordings}),
+    }
+    trainer = Trainer(
+        config,
+        out,
+        seed=seed,
+        device=device,
+        dtype=dtype,
+        trained_on=trained_on,
+        actions=actions,
+        processes=processes,
     )
     source = BatchSource(
         recordings,
@@ -138,67 +153,35 @@ def train(
         seed=seed,
         actions=actions,
         self_rollout=config.self_rollout,
+        numbers=trainer.clips,
     )
-    trained_on = {
-        'episodes': len(recordings),
-        'skipped': len(skipped),
-        'clips': source.num_clips,
-        'tasks': sorted({recording.task for recording in recordings}),
-    }
-    trainer = Trainer(
-        config,
-        out,
-        seed=seed,
-        device=device,
-        dtype=dtype,
-        trained_on=trained_on,
-        actions=actions,
-    )
-    resumed = trainer.load_state()
+    trained_on['clips'] = source.num_clips
+    with processes.main_first():
+        resumed = trainer.load_state()
     if initial is not None and not resumed:
         trainer.start_from(initial)
-    tqdm.write(
-        f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
-        f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '
-        f'{trainer.step}'
-    )
+    if processes.is_main:
+        (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
+        tqdm.write(
+            f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
+            f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '
+            f'{trainer.step}; {processes.count} processes'
+        )
     try:
-        _loop(trainer, source, out, save_every)
+        _loop(trainer, source, save_every)
     finally:
         source.close()
     return out / 'checkpoint'
 
 
-def _loop(trainer: Trainer, source: BatchSource, out: Path, save_every: int) -> None:
+def _loop(trainer: Trainer, source: BatchSource, save_every: int) -> None:
+    folder, is_main = trainer.folder, trainer.processes.is_main
     total = trainer.config.optimizer.steps
-    recent: deque[float] = deque(maxlen=_WINDOW)
-    started = time.time()
-    with (
-        tqdm(total=total, initial=trainer.step, desc='training', unit='step') as bar,
-        SummaryWriter(str(out / 'tensorboard')) as board,
-        (out / 'log.jsonl').open('a') as log,
-    ):
+    with TrainingLog(folder, step=trainer.step, total=total, active=is_main) as log:
         reports = trainer.run(
             source,
             save_every=save_every,
-            on_save=lambda _: trainer.export(out / 'checkpoint'),
+            on_save=lambda _: trainer.export(folder / 'checkpoint'),
         )
         for report in reports:
-            recent.append(report.loss)
-            bar.update()
-            if report.step % 10 and report.step != total:
-                continue
-            average = mean_loss(list(recent))
-            bar.set_postfix(loss=f'{average:.4f}')
-            board.add_scalar('loss', average, report.step)
-            board.add_scalar('learning_rate', report.learning_rate, report.step)
-            board.add_scalar('grad_norm', report.grad_norm, report.step)
-            row = {
-                'step': report.step,
-                'loss': round(average, 6),
-                'learning_rate': report.learning_rate,
-                'grad_norm': round(report.grad_norm, 4),
-                'seconds': round(time.time() - started, 1),
-            }
-            log.write(json.dumps(row) + '\n')
-            log.flush()
+            log.add(report)

@@ -73,7 +73,7 @@ class SelfRollout:
             now = {i: lead for i, lead in leads.items() if lead.num_chunks >= left}
             chunks = [lead.num_chunks - left for lead in now.values()]
             chunk_batch = self._batch(list(now.values()), chunks, [starts[i] for i in now])
-            seeds = [_noise_seed(self._seed, step, i, left) for i in now]
+            seeds = [_noise_seed(self._seed, step, batch.numbers[i], left) for i in now]
             ends = self._imagine(chunk_batch, seeds, transformer)
             starts |= dict(zip(now, ends, strict=True))
         return self._replaced(batch, leads, starts)

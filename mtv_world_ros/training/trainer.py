@@ -1,41 +1,59 @@
-"""The trainer: one loop, resumable at any step, with averaged weights and honest logs."""
+"""The trainer: one loop, resumable at any step, in one process or many."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-import json
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
+import time
 
-from diffusers.training_utils import EMAModel
-from safetensors.torch import load_file, save_file
 import torch
-from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.actions import transformer_arguments
 from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import Encoders
 from mtv_world_ros.training.loss import batch_loss
+from mtv_world_ros.training.objective import Loss
+from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.self_rollout import SelfRollout
+from mtv_world_ros.training.state import load_state, read_card, save_state, STATE
+from mtv_world_ros.training.weights import Weights
+
+#: losses averaged for the progress bar and the log
+_WINDOW = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepReport:
-    """What a step did: its number (from 1), loss, learning rate and gradient norm."""
+    """What a step did.
+
+    Attributes:
+        step: its number, from 1.
+        loss: over all clips of the step, of all processes.
+        average: of the recent losses.
+        learning_rate: that it was made with.
+        grad_norm: before it was shortened.
+        seconds: that it took, waiting included.
+        waited: seconds of it without the next batch.
+    """
 
     step: int
     loss: float
+    average: float
     learning_rate: float
     grad_norm: float
+    seconds: float = math.nan
+    waited: float = math.nan
 
 
 def learning_rate(step: int, config: OptimizerConfig) -> float:
@@ -49,6 +67,9 @@ def learning_rate(step: int, config: OptimizerConfig) -> float:
 class Trainer:
     """Trains the transformer of a preset.
 
+    Every process computes the clips of `clips`, a share of each step's; errors, weights and
+    float32 gradients are summed over the processes, so that all of them make the same step.
+
     Args:
         config: the preset.
         folder: where state, logs and checkpoints go.
@@ -57,6 +78,10 @@ class Trainer:
         dtype: of forward and backward; master weights stay float32.
         trained_on: what stands in the checkpoint's card.
         actions: how positions become actions, where the preset's control does not draw them.
+        processes: that train together; None: those that the launcher started.
+
+    Raises:
+        TrainingError: fewer clips a step than processes times accumulated parts.
     """
 
     def __init__(
@@ -69,31 +94,39 @@ class Trainer:
         dtype: torch.dtype,
         trained_on: dict[str, object],
         actions: ActionEncoding | None = None,
+        processes: Processes | None = None,
     ) -> None:
         torch.manual_seed(seed)
+        settings = config.optimizer
+        self.processes = processes or Processes(device)
+        self.clips = self._clips(settings)
         self.config, self.folder, self.seed = config, Path(folder), seed
-        self.device = torch.device(device)
+        self.device = self.processes.device
         self.trained_on, self.actions = trained_on, actions
         autoencoder = build_autoencoder(config.autoencoder)
         self.autoencoder = place(autoencoder, self.device, torch.float32)
         self.encoders = Encoders(autoencoder=self.autoencoder)
         transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
-        self.master = place(transformer, self.device, torch.float32)
-        self.worker = place(copy_of(self.master), self.device, dtype)
-        self.ema = EMAModel(
-            self.master.parameters(),
-            decay=config.optimizer.ema_decay,
-            use_ema_warmup=True,
-            power=0.75,
-        )
+        if settings.gradient_checkpointing:
+            transformer.enable_gradient_checkpointing()
+        self.weights = Weights(transformer, self.device, dtype, settings.ema_decay)
         self.optimizer = torch.optim.AdamW(
-            self.master.parameters(),
-            lr=config.optimizer.learning_rate,
+            self.weights.parameters,
+            lr=settings.learning_rate,
             betas=(0.9, 0.95),
-            weight_decay=config.optimizer.weight_decay,
+            weight_decay=settings.weight_decay,
         )
         self.step = 0
-        self._share_weights()
+        self._recent: deque[float] = deque(maxlen=_WINDOW)
+
+    def _clips(self, settings: OptimizerConfig) -> range:
+        count, parts = self.processes.count, settings.accumulation
+        if settings.batch_size < count * parts:
+            raise TrainingError(
+                f'optimizer.batch_size is {settings.batch_size}, less than {count} processes x '
+                f'{parts} accumulated parts; raise it, or start fewer processes'
+            )
+        return self.processes.share(settings.batch_size)
 
     def start_from(self, folder: Path) -> None:
         """Takes the weights of a checkpoint of the same architecture; the optimizer starts anew.
@@ -102,24 +135,30 @@ class Trainer:
             CheckpointError: the folder holds no checkpoint.
             TrainingError: its transformer is of another shape.
         """
-        weights = load_checkpoint(folder).transformer.state_dict()
+        given = load_checkpoint(folder).transformer.state_dict()
         try:
-            self.master.load_state_dict(weights)
+            self.weights.worker.load_state_dict(given)
         except RuntimeError as error:
             raise TrainingError(
                 f"'{folder}' does not fit the preset's transformer: {error}; give --preset the "
                 'one it was trained with, or leave --init out'
             ) from error
-        self.ema.shadow_params = [p.detach().clone() for p in self.master.parameters()]
-        self._share_weights()
+        self.weights.load(given)
+        self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
 
     def run(
         self, source: BatchSource, *, save_every: int, on_save: Callable[[int], None]
     ) -> Iterator[StepReport]:
         """Trains to `config.optimizer.steps`, yielding a report a step.
 
+        Args:
+            source: makes the clips of `clips`.
+            save_every: steps between saved states.
+            on_save: called with the step after each, in the main process alone.
+
         Raises:
-            TrainingError: the loss is not finite; the last saved state stays whole.
+            TrainingError: the loss is not finite, a state cannot be written, or another process
+                is gone; the last saved state stays whole.
         """
         rollout = SelfRollout(
             source.controls,
@@ -130,86 +169,94 @@ class Trainer:
             device=self.device,
         )
         while self.step < self.config.optimizer.steps:
+            started = time.perf_counter()
             batch = source.batch(self.step)
+            waited = time.perf_counter() - started
             if any(batch.leads):
-                with self.averaged() as transformer:
+                with self.weights.lent() as transformer:
                     batch = rollout.apply(batch, self.step, transformer)
-            report = self._train_step(batch)
+            report = self.train_step(batch)
             self.step += 1
-            yield report
-            if self.step % save_every == 0 or self.step == self.config.optimizer.steps:
+            yield replace(report, seconds=time.perf_counter() - started, waited=waited)
+            due = self.step % save_every == 0 or self.step == self.config.optimizer.steps
+            if due and self.processes.is_main:
                 self.save_state()
                 on_save(self.step)
 
-    @contextmanager
-    def averaged(self) -> Iterator[MultiViewWanTransformer]:
-        """Lends the worker with averaged weights, which are those that will serve."""
-        parameters = list(self.worker.parameters())
-        self.ema.store(parameters)
-        self.ema.copy_to(parameters)
-        try:
-            yield self.worker
-        finally:
-            self.ema.restore(parameters)
+    def loss(self, batch: Batch) -> Loss:
+        """The loss of a batch, or of a part of one."""
+        draws = Draws(self.seed, batch.step, batch.numbers)
+        worker = self.weights.worker
+        return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
 
-    def loss(self, batch: Batch, step: int) -> Tensor:
-        """The loss of a batch with the noise of a step."""
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
-        return batch_loss(self.worker, self.encoders, batch, self.config, generator, self.device)
+    def gradients(self, batch: Batch) -> float:
+        """Leaves the gradients of a step in the float32 weights and returns the step's loss.
 
-    def _train_step(self, batch: Batch) -> StepReport:
-        loss = self.loss(batch, self.step)
-        if not torch.isfinite(loss):
+        Args:
+            batch: this process's part of the step's clips.
+
+        Raises:
+            TrainingError: the loss is not finite, or another process is gone.
+        """
+        sums = torch.zeros(2, device=self.device)
+        for parameter in self.weights.parameters:
+            parameter.grad = None
+        for part in batch.parts(self.config.optimizer.accumulation):
+            loss = self.loss(part)
+            sums += torch.stack([loss.total.detach(), loss.weight]).float()
+            loss.total.backward()
+            self.weights.collect()
+        total, weight = self.processes.summed(sums).tolist()
+        if not math.isfinite(total / weight):
             raise TrainingError(
-                f'the loss is {loss.item()} at step {self.step}; the last good state is in '
-                f"'{self.folder / 'state'}'; lower optimizer.learning_rate"
+                f'the loss is {total / weight} at step {self.step}; the last good state is in '
+                f"'{self.folder / STATE}'; lower optimizer.learning_rate"
             )
-        loss.backward()
-        for master, worker in zip(self.master.parameters(), self.worker.parameters(), strict=True):
-            master.grad = None if worker.grad is None else worker.grad.float()
-            worker.grad = None
-        settings = self.config.optimizer
-        norm = torch.nn.utils.clip_grad_norm_(self.master.parameters(), settings.max_grad_norm)
+        found = [p.grad for p in self.weights.parameters if p.grad is not None]
+        self.processes.sum_into(found)
+        torch._foreach_div_(found, weight)
+        return total / weight
+
+    def train_step(self, batch: Batch) -> StepReport:
+        """Makes a step with this process's part of its clips."""
+        loss = self.gradients(batch)
+        settings, parameters = self.config.optimizer, self.weights.parameters
+        norm = torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
         rate = learning_rate(self.step, settings)
         for group in self.optimizer.param_groups:
             group['lr'] = rate
         self.optimizer.step()
-        self.ema.step(self.master.parameters())
-        self._share_weights()
+        self.weights.ema.step(parameters)
+        self.weights.share()
+        self._recent.append(loss)
         return StepReport(
-            step=self.step + 1, loss=loss.item(), learning_rate=rate, grad_norm=norm.item()
+            step=self.step + 1,
+            loss=loss,
+            average=math.fsum(self._recent) / len(self._recent),
+            learning_rate=rate,
+            grad_norm=norm.item(),
         )
-
-    @torch.no_grad()
-    def _share_weights(self) -> None:
-        for worker, master in zip(self.worker.parameters(), self.master.parameters(), strict=True):
-            worker.copy_(master)
 
     def save_state(self) -> None:
         """Writes everything a resumed run needs, whole or not at all."""
-        target = self.folder / 'state'
-        partial = self.folder / 'state.partial'
-        partial.mkdir(parents=True, exist_ok=True)
-        tensors = {f'master.{k}': v.contiguous() for k, v in self.master.state_dict().items()}
-        tensors |= {f'ema.{i}': p.contiguous() for i, p in enumerate(self.ema.shadow_params)}
-        for index, state in self.optimizer.state_dict()['state'].items():
-            tensors |= {f'adam.{index}.{k}': v.contiguous() for k, v in state.items()}
-        save_file(tensors, partial / 'state.safetensors')
         card = {
             'step': self.step,
-            'ema_step': self.ema.optimization_step,
             'seed': self.seed,
             'control': self.config.video.control,
+            'recent': list(self._recent),
         }
-        (partial / 'state.json').write_text(json.dumps(card))
-        _swap(partial, target)
+        save_state(self.folder, self.weights, self.optimizer, card)
 
     def load_state(self) -> bool:
-        """Continues from the saved state; returns whether there was one."""
-        folder = self.folder / 'state'
-        if not (folder / 'state.json').is_file():
+        """Continues from the saved state; returns whether there was one.
+
+        Raises:
+            TrainingError: it is damaged, or of another model, seed or control.
+        """
+        card = read_card(self.folder)
+        if card is None:
             return False
-        card = json.loads((folder / 'state.json').read_text())
+        folder = self.folder / STATE
         if card['seed'] != self.seed:
             raise TrainingError(
                 f"'{folder}' was trained with seed {card['seed']}, this run has {self.seed}; "
@@ -221,53 +268,19 @@ class Trainer:
                 f"'{folder}' was trained with control '{trained}', this run has '{control}'; "
                 'give --control the same, or another --out'
             )
-        tensors = load_file(folder / 'state.safetensors')
-        self.master.load_state_dict(
-            {k[7:]: v for k, v in tensors.items() if k.startswith('master.')}
-        )
-        self.ema.shadow_params = [
-            tensors[f'ema.{i}'].to(self.device) for i in range(len(self.ema.shadow_params))
-        ]
-        self.ema.optimization_step = card['ema_step']
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith('adam.'):
-                _, index, name = key.split('.')
-                state.setdefault(int(index), {})[name] = value
-        whole = self.optimizer.state_dict()
-        self.optimizer.load_state_dict({'state': state, 'param_groups': whole['param_groups']})
+        load_state(self.folder, self.weights, self.optimizer)
+        self._recent.extend(card.get('recent', []))
         self.step = card['step']
-        self._share_weights()
         return True
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
         """Writes the averaged weights as a checkpoint."""
-        averaged = copy_of(self.master)
-        self.ema.copy_to(averaged.parameters())
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
-        scheduler = build_scheduler(self.config.scheduler)
         parts = Checkpoint(
-            transformer=averaged,
+            transformer=self.weights.averaged(),
             autoencoder=self.autoencoder,
-            scheduler=scheduler,
+            scheduler=build_scheduler(self.config.scheduler),
             card=card,
             actions=self.actions,
         )
         save_checkpoint(parts, folder, dtype=dtype)
-
-
-def _swap(partial: Path, target: Path) -> None:
-    """Puts a finished folder under its name; the old one stays whole until then."""
-    old = target.with_name(target.name + '.old')
-    if target.exists():
-        target.rename(old)
-    partial.rename(target)
-    if old.exists():
-        for file in old.iterdir():
-            file.unlink()
-        old.rmdir()
-
-
-def mean_loss(losses: list[float]) -> float:
-    """Mean of the recent losses; NaN where there is none."""
-    return math.fsum(losses) / len(losses) if losses else math.nan

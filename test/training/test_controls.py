@@ -21,6 +21,7 @@ from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.actions import fit_actions
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.loss import _kept
 from mtv_world_ros.training.objective import pooled_weights
 from mtv_world_ros.training.run import spec_of, train
@@ -199,11 +200,11 @@ def test_weights_bring_the_statistics_they_were_trained_with(
 
 
 def test_one_action_in_twenty_is_dropped_with_ee_mlp_alone(tiny: TrainingConfig) -> None:
-    generator = torch.Generator().manual_seed(0)
-    kept = _kept(4000, with_control(tiny, 'ee_mlp'), generator, torch.device('cpu'))
+    draws = Draws(0, 0, range(4000))
+    kept = _kept(draws, with_control(tiny, 'ee_mlp'), torch.device('cpu'))
     # three standard deviations of 4,000 draws
     assert 1 - kept.float().mean().item() == pytest.approx(0.05, abs=0.0104)
-    assert _kept(10, with_control(tiny, 'policy2vec'), generator, torch.device('cpu')) is None
+    assert _kept(draws, with_control(tiny, 'policy2vec'), torch.device('cpu')) is None
 
 
 def test_an_unknown_control_is_refused() -> None:

@@ -10,6 +10,7 @@ import torch
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import drop_conditions
 
 COUNT = 2000
@@ -31,7 +32,7 @@ def conditions() -> Conditioning:
 
 def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
     augment = AugmentConfig(control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3)
-    out = drop_conditions(conditions(), augment, torch.Generator().manual_seed(0))
+    out = drop_conditions(conditions(), augment, Draws(0, 0, range(COUNT)))
     gone = {
         name: (getattr(out, name) == 0).flatten(1).all(1)
         for name in ('control', 'start_control', 'start', 'reference', 'image')
@@ -48,10 +49,9 @@ def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
 
 
 def test_without_dropout_nothing_is_drawn() -> None:
-    generator = torch.Generator().manual_seed(0)
-    before = generator.get_state()
-    drop_conditions(conditions(), AugmentConfig(), generator)
-    assert torch.equal(generator.get_state(), before)
+    draws = Draws(0, 0, range(COUNT))
+    drop_conditions(conditions(), AugmentConfig(), draws)
+    assert torch.equal(draws.uniform(), Draws(0, 0, range(COUNT)).uniform())
 
 
 @pytest.mark.parametrize(

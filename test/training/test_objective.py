@@ -9,6 +9,7 @@ import torch
 
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.training.config import ObjectiveConfig
+from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
@@ -24,7 +25,7 @@ CONFIG = ObjectiveConfig()
 def test_noise_levels_follow_wans_shift() -> None:
     """Without the share at full noise, the median of sigma' is s * .5 / (1 + (s - 1) * .5)."""
     config = ObjectiveConfig(full_noise_share=0.0, sigma_shift=5.0)
-    sigmas = draw_sigmas(20_000, config, torch.Generator().manual_seed(0))
+    sigmas = draw_sigmas(Draws(0, 0, range(20_000)), config)
     assert sigmas.min() > 0
     assert sigmas.max() <= 1
     assert abs(sigmas.median().item() - 5 * 0.5 / 3) < 0.01
@@ -64,9 +65,9 @@ def test_loss_is_zero_for_the_truth_and_counts_by_weight() -> None:
     clean = torch.zeros(1, 1, 1, 1, 1, 2)
     wrong = torch.tensor([1.0, 0.0]).reshape(clean.shape)
     light, heavy = torch.tensor([1.0, 3.0]), torch.tensor([3.0, 1.0])
-    assert sample_loss(clean, clean, light.reshape(clean.shape), 0.1) == 0
-    low = sample_loss(wrong, clean, light.reshape(clean.shape), 0.1)
-    high = sample_loss(wrong, clean, heavy.reshape(clean.shape), 0.1)
+    assert sample_loss(clean, clean, light.reshape(clean.shape), 0.1).mean == 0
+    low = sample_loss(wrong, clean, light.reshape(clean.shape), 0.1).mean
+    high = sample_loss(wrong, clean, heavy.reshape(clean.shape), 0.1).mean
     torch.testing.assert_close(high, 3 * low)
 
 
@@ -87,4 +88,4 @@ def test_without_delta_the_error_is_squared_and_samples_count_by_noise_level() -
     clean = torch.zeros(2, 1, 1, 1, 1, 2)
     wrong = torch.tensor([[1.0, 2.0], [3.0, 0.0]]).reshape(clean.shape)
     loss = sample_loss(wrong, clean, torch.ones_like(clean), None, torch.tensor([1.0, 0.5]))
-    assert loss.item() == pytest.approx((1 + 4 + 0.5 * 9) / 4)
+    assert loss.mean.item() == pytest.approx((1 + 4 + 0.5 * 9) / 4)

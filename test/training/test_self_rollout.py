@@ -83,7 +83,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
     """Serving the exported weights over the same chunks gives the start frames bit for bit."""
     trainer = make_trainer(rolling, tmp_path)
     with torch.no_grad():  # an untrained model holds its start frame; this one does not
-        for averaged in trainer.ema.shadow_params:
+        for averaged in trainer.weights.ema.shadow_params:
             averaged.add_(0.05 * torch.randn_like(averaged))
     trainer.export(tmp_path / 'checkpoint', dtype=torch.float32)
     seeds = []

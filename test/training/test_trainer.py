@@ -43,9 +43,11 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
     assert resumed.load_state()
     assert resumed.step == 2
     assert first[:2] + run(resumed, source) == losses
-    for one, other in zip(whole.master.parameters(), resumed.master.parameters(), strict=True):
+    for one, other in zip(whole.weights.parameters, resumed.weights.parameters, strict=True):
         assert torch.equal(one, other)
-    for one, other in zip(whole.ema.shadow_params, resumed.ema.shadow_params, strict=True):
+    for one, other in zip(
+        whole.weights.ema.shadow_params, resumed.weights.ema.shadow_params, strict=True
+    ):
         assert torch.equal(one, other)
 
 
@@ -66,12 +68,12 @@ def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: Robo
     )
     trainer = make(config, tmp_path)
     batch = source.batch(0)
-    before = trainer.loss(batch, 0).item()
-    for _ in range(60):
-        trainer._train_step(batch)
+    before = trainer.loss(batch).mean.item()
+    for step in range(60):
+        trainer.train_step(replace(batch, step=step))
         trainer.step += 1
     source.close()
-    assert trainer.loss(batch, 0).item() < 0.5 * before
+    assert trainer.loss(batch).mean.item() < 0.5 * before
 
 
 def _spec(config: TrainingConfig):
@@ -88,14 +90,14 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(
     next(reports)
     next(reports)
     with torch.no_grad():
-        next(trainer.worker.parameters()).fill_(float('nan'))
+        next(trainer.weights.worker.parameters()).fill_(float('nan'))
     with pytest.raises(TrainingError, match=r'the loss is nan at step 2.*learning_rate'):
         next(reports)
     state = json.loads((tmp_path / 'state' / 'state.json').read_text())
     assert state['step'] == 1 or state['step'] == 2
     resumed = make(tiny, tmp_path)
     assert resumed.load_state()
-    assert all(torch.isfinite(p).all() for p in resumed.master.parameters())
+    assert all(torch.isfinite(p).all() for p in resumed.weights.parameters)
 
 
 def test_a_state_of_another_seed_is_refused(
@@ -181,9 +183,9 @@ def test_a_run_may_start_from_the_weights_of_a_checkpoint(
     second.start_from(tmp_path / 'checkpoint')
     assert second.step == 0
     for averaged, weight, worker in zip(
-        first.ema.shadow_params,
-        second.master.parameters(),
-        second.worker.parameters(),
+        first.weights.ema.shadow_params,
+        second.weights.parameters,
+        second.weights.worker.parameters(),
         strict=True,
     ):
         assert torch.equal(averaged, weight) and torch.equal(weight, worker)

@@ -1,0 +1,91 @@
+"""What a training reports: a progress bar, `log.jsonl` and TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import time
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from mtv_world_ros.training.trainer import StepReport
+
+#: steps a row of the log stands for
+_EVERY = 10
+
+
+class TrainingLog:
+    """Writes what steps did; a resumed one goes on where the saved state ends.
+
+    Args:
+        folder: gets `log.jsonl` and `tensorboard/`.
+        step: that the training starts from; what was logged after it is made again.
+        total: steps of the training.
+        active: False writes nothing, for processes but the main one.
+    """
+
+    def __init__(self, folder: Path, *, step: int, total: int, active: bool = True) -> None:
+        self._total, self._active = total, active
+        self._bar = tqdm(
+            total=total, initial=step, desc='training', unit='step', disable=not active
+        )
+        self._started = time.time()
+        self._seconds = self._waited = 0.0
+        if active:
+            self._file = _cut(folder / 'log.jsonl', step).open('a')
+            self._board = SummaryWriter(str(folder / 'tensorboard'), purge_step=step + 1)
+
+    def __enter__(self) -> TrainingLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+        if self._active:
+            self._file.close()
+            self._board.close()
+
+    def add(self, report: StepReport) -> None:
+        """Counts a step; every tenth one, and the last, is written."""
+        self._bar.update()
+        self._seconds += report.seconds
+        self._waited += report.waited
+        if not self._active or (report.step % _EVERY and report.step != self._total):
+            return
+        self._bar.set_postfix(loss=f'{report.average:.4f}')
+        row = {
+            'loss': round(report.average, 6),
+            'learning_rate': report.learning_rate,
+            'grad_norm': round(report.grad_norm, 4),
+            'wait_share': round(self._waited / max(self._seconds, 1e-9), 4),
+            'seconds': round(time.time() - self._started, 1),
+        }
+        self._seconds = self._waited = 0.0
+        self.write(report.step, row)
+
+    def write(self, step: int, row: dict[str, Any]) -> None:
+        """Writes numbers of a step."""
+        if not self._active:
+            return
+        self._file.write(json.dumps({'step': step, **row}) + '\n')
+        self._file.flush()
+        for name, value in row.items():
+            if name != 'seconds':
+                self._board.add_scalar(name, value, step)
+
+
+def _cut(file: Path, step: int) -> Path:
+    """Drops the rows after a step, and one that was cut off in the middle."""
+    if file.is_file():
+        kept = []
+        for line in file.read_text().splitlines(keepends=True):
+            try:
+                row = json.loads(line)
+            except json.JSONDecodeError:
+                break
+            if row['step'] > step:
+                break
+            kept.append(line)
+        file.write_text(''.join(kept))
+    return file

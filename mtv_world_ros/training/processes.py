@@ -1,0 +1,91 @@
+"""The processes that train one model together: one, or as many as the launcher started."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+import os
+
+from accelerate import PartialState
+from accelerate.utils import reduce
+import torch
+from torch import Tensor
+
+from mtv_world_ros.errors import TrainingError
+
+#: numbers that are summed over the processes in one go
+_BUCKET = 2**24
+
+
+class Processes:
+    """Which part of the work is this process's, and sums over all of them.
+
+    Started with `torchrun` or `accelerate launch` there are several, on one machine or many;
+    otherwise there is one. Each holds the whole model and trains a share of every step's clips.
+
+    Args:
+        device: `cpu`, or `cuda` for a device a process.
+    """
+
+    def __init__(self, device: str) -> None:
+        chosen = torch.device(device)
+        # accelerate would choose the number of threads anew
+        os.environ.setdefault('OMP_NUM_THREADS', str(torch.get_num_threads()))
+        self._state = PartialState(cpu=chosen.type == 'cpu')
+        self.number: int = self._state.process_index
+        self.count: int = self._state.num_processes
+        self.device: torch.device = chosen if self.count == 1 else self._state.device
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this is the one that writes."""
+        return self.number == 0
+
+    def share(self, count: int) -> range:
+        """Returns this process's part of `count` clips, as even as can be."""
+        return range(count * self.number // self.count, count * (self.number + 1) // self.count)
+
+    def summed(self, tensor: Tensor) -> Tensor:
+        """Returns the sum of a tensor over the processes.
+
+        Raises:
+            TrainingError: another process is gone.
+        """
+        if self.count == 1:
+            return tensor
+        try:
+            return reduce(tensor, 'sum')  # type: ignore[return-value]
+        except RuntimeError as error:
+            raise TrainingError(
+                f'process {self.number} of {self.count} lost another one: {error}; look for its '
+                'own message, then run the same command again: it goes on from the last state'
+            ) from error
+
+    def sum_into(self, tensors: Sequence[Tensor]) -> None:
+        """Puts the sums over the processes in place of the tensors, all of one number format."""
+        if self.count == 1:
+            return
+        for bucket in _buckets(tensors):
+            flat = self.summed(torch.cat([tensor.flatten() for tensor in bucket]))
+            parts = flat.split([tensor.numel() for tensor in bucket])
+            for tensor, part in zip(bucket, parts, strict=True):
+                tensor.copy_(part.view_as(tensor))
+
+    @contextmanager
+    def main_first(self) -> Iterator[None]:
+        """Lets the main process through the block before the others, which find what it left."""
+        with self._state.main_process_first():
+            yield
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    bucket: list[Tensor] = []
+    size = 0
+    for tensor in tensors:
+        if bucket and size + tensor.numel() > _BUCKET:
+            yield bucket
+            bucket, size = [], 0
+        bucket.append(tensor)
+        size += tensor.numel()
+    if bucket:
+        yield bucket

@@ -1,0 +1,118 @@
+"""Several processes make the steps that one makes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+import json
+import os
+from pathlib import Path
+import runpy
+import subprocess
+import sys
+
+import pytest
+from safetensors.torch import load_file
+import torch
+import yaml
+
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.trainer import Trainer
+
+SCRIPT = Path(__file__).with_name('train_recorded.py')
+ROOT = Path(__file__).parents[2]
+
+
+def preset(config: TrainingConfig, folder: Path) -> Path:
+    """Three clips a step, two processes: one gets two of them."""
+    values = json.loads(json.dumps(asdict(config)))
+    values['optimizer'] |= {'batch_size': 3, 'steps': 3, 'max_grad_norm': 1e9}
+    file = folder / 'preset.yaml'
+    file.write_text(yaml.safe_dump(values))
+    return file
+
+
+def test_two_processes_make_the_steps_of_one(
+    tiny: TrainingConfig, episode: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = [str(episode.parent), str(preset(tiny, tmp_path))]
+    two, one = tmp_path / 'two', tmp_path / 'one'
+    launcher = ['-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2']
+    started = subprocess.run(
+        [sys.executable, *launcher, str(SCRIPT), str(two), *arguments],
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'CUDA_VISIBLE_DEVICES': ''},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert started.returncode == 0, started.stderr
+    computed = Trainer.gradients
+    monkeypatch.setattr(sys, 'argv', [str(SCRIPT), str(one), *arguments])
+    try:
+        runpy.run_path(str(SCRIPT), run_name='__main__')
+    finally:
+        Trainer.gradients = computed
+    whole = load_file(one / 'first-0.safetensors')
+    parts = [load_file(two / f'first-{number}.safetensors') for number in (0, 1)]
+    assert sorted(len(part['frames']) for part in parts) == [1, 2]
+    for name, expected in whole.items():
+        if not name.startswith('gradient.'):  # the clips, to the byte
+            assert torch.equal(torch.cat([part[name] for part in parts]), expected)
+            continue
+        assert torch.equal(parts[0][name], parts[1][name])
+        torch.testing.assert_close(parts[0][name], expected, rtol=1e-4, atol=1e-6)
+    states = [load_file(folder / 'state' / 'state.safetensors') for folder in (one, two)]
+    for name, expected in states[0].items():
+        torch.testing.assert_close(states[1][name], expected, rtol=1e-3, atol=1e-5)
+    logs = [json.loads((f / 'log.jsonl').read_text().splitlines()[-1]) for f in (one, two)]
+    assert logs[0]['loss'] == pytest.approx(logs[1]['loss'], abs=2e-6)
+    assert len((two / 'log.jsonl').read_text().splitlines()) == 1  # one process writes
+
+
+def test_accumulated_parts_have_the_gradients_of_the_whole(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    source._numbers = range(3)
+    batch = source.batch(0)
+    whole = gradients(tiny, batch, tmp_path)
+    settings = replace(tiny.optimizer, batch_size=3, accumulation=2)
+    parts = gradients(replace(tiny, optimizer=settings), batch, tmp_path)
+    again = gradients(
+        replace(tiny, optimizer=replace(settings, gradient_checkpointing=True)), batch, tmp_path
+    )
+    for name, expected in whole.items():
+        torch.testing.assert_close(parts[name], expected, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(again[name], parts[name])
+
+
+def gradients(config: TrainingConfig, batch, folder: Path) -> dict[str, torch.Tensor]:
+    trainer = Trainer(config, folder, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    trainer.gradients(batch)
+    return {name: p.grad for name, p in trainer.weights.master.items()}
+
+
+def test_shares_are_even_and_leave_nothing_out() -> None:
+    processes = Processes('cpu')
+    shares = []
+    for number in range(3):
+        processes.number, processes.count = number, 3
+        shares.append(list(processes.share(8)))
+    assert sum(shares, []) == list(range(8))
+    assert sorted(map(len, shares)) == [2, 3, 3]
+
+
+def test_fewer_clips_than_processes_are_refused(tiny: TrainingConfig, tmp_path: Path) -> None:
+    processes = Processes('cpu')
+    processes.count = 2
+    with pytest.raises(TrainingError, match=r'batch_size is 1, less than 2 processes'):
+        Trainer(
+            tiny,
+            tmp_path,
+            seed=0,
+            device='cpu',
+            dtype=torch.float32,
+            trained_on={},
+            processes=processes,
+        )
