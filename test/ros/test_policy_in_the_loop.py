@@ -289,6 +289,7 @@ def test_in_observe_mode_a_camera_that_stops_ends_the_episode_and_says_so(observ
 
         def has_chunk():
             client.send_scene()
+            client.spin_for(0.1)
             return any(r['state'] == 'chunk' for r in reports())
 
         client.wait(has_chunk, 'a chunk')
