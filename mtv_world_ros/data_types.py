@@ -6,7 +6,10 @@ read-only. `T_a_b` maps b-coordinates into a: `p_a = T_a_b @ p_b`. Units are SI,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import nan
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -248,15 +251,24 @@ class SuccessEstimate:
         interval: (low, high); NaN where it abstains.
         jaccard: (V, O) Jaccard index, NaN where absent.
         reasons: what the estimate rests on, or why it abstains.
+        features: what a calibration weighs, by name; empty where it abstains.
+        is_calibrated: whether the probability is a fitted one.
+        num_seeds: rollouts that it is the mean of.
+        spread: standard deviation of their probabilities; NaN for one.
     """
 
     probability: float
     interval: tuple[float, float]
     jaccard: FloatArray
     reasons: tuple[str, ...]
+    features: Mapping[str, float] = field(default_factory=dict)
+    is_calibrated: bool = False
+    num_seeds: int = 1
+    spread: float = nan
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'reasons', tuple(self.reasons))
+        object.__setattr__(self, 'features', MappingProxyType(dict(self.features)))
         _freeze(self, 'jaccard', (None, None), np.float64)
 
 

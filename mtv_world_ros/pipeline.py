@@ -34,6 +34,8 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.estimator import SuccessEstimator
+from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.segmenter import Segmenter
 
 
@@ -126,6 +128,7 @@ class Pipeline:
         seed: int = 0,
         num_inference_steps: int = 0,
         should_stop: Callable[[], bool] = _never,
+        memory: RolloutMemory | None = None,
     ) -> Iterator[Prediction]:
         """Yields the predicted chunks, each as soon as it is ready.
 
@@ -136,6 +139,8 @@ class Pipeline:
             seed: of the noise; chunk k uses `seed + k`.
             num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
             should_stop: asked between denoising steps.
+            memory: of the prediction that the observation is the end of, where it is one: the
+                estimate is about the whole, from its first observation on.
 
         Raises:
             TrajectoryError: the trajectory does not fit the robot.
@@ -158,7 +163,7 @@ class Pipeline:
             window = slice(first, first + spec.num_frames + 1)
             num_kept = min(spec.num_frames, total - first)
             parts = self._imagine_chunk(
-                start, times[window], positions[window], num_kept, request, seed + chunk
+                start, times[window], positions[window], num_kept, request, seed + chunk, memory
             )
             prediction = Prediction(
                 **parts,
@@ -170,7 +175,7 @@ class Pipeline:
                 num_inference_steps=num_steps,
             )
             yield prediction
-            start = prediction.end_observation
+            start, memory = prediction.end_observation, prediction.memory
 
     def _imagine_chunk(
         self,
@@ -180,6 +185,7 @@ class Pipeline:
         num_kept: int,
         request: _Request,
         seed: int,
+        memory: RolloutMemory | None,
     ) -> dict[str, Any]:
         """What is made of one chunk: fields of `Prediction`."""
         clock = _Clock()
@@ -207,15 +213,8 @@ class Pipeline:
             start_frame=start.frames,
             positions=positions[1 : num_kept + 1],
         )
-        success = self.estimator.estimate(
-            masks,
-            start_masks,
-            start.cameras,
-            self._camera_poses(start.cameras, rollout.positions[-1:]),
-            request.instruction,
-            T_base_camera_start=self._camera_poses(start.cameras, positions[:1]),
-            gripper_openings=self.robot.gripper_openings(rollout.positions[-1:])[:, 0],
-        )
+        footage = self._footage(start.cameras, positions[: num_kept + 1], start_masks, masks)
+        success, memory = self.estimator.estimate(footage, request.instruction, memory)
         clock.lap('success')
         return {
             'rollout': rollout,
@@ -223,14 +222,26 @@ class Pipeline:
             'start_masks': start_masks,
             'masks': masks,
             'success': success,
+            'memory': memory,
             'seconds': MappingProxyType(clock.seconds),
         }
 
-    def _camera_poses(
-        self, cameras: tuple[CameraModel, ...], positions: FloatArray
-    ) -> tuple[FloatArray, ...]:
-        """V poses (4, 4) at positions (1, J)."""
-        return tuple(camera_poses(camera, self.robot, positions)[0] for camera in cameras)
+    def _footage(
+        self,
+        cameras: tuple[CameraModel, ...],
+        positions: FloatArray,
+        start_masks: ObjectMasks,
+        masks: ObjectMasks,
+    ) -> Footage:
+        """What the estimator is shown; positions (1 + T, J), row 0 at the start masks."""
+        return Footage(
+            masks=masks,
+            start_masks=start_masks,
+            cameras=cameras,
+            poses=np.stack([camera_poses(camera, self.robot, positions) for camera in cameras]),
+            tools=self.robot.tool_poses(positions)[..., :3, 3],
+            openings=self.robot.gripper_openings(positions),
+        )
 
     def draw(
         self,

@@ -14,6 +14,7 @@ from mtv_world_ros.data_types import (
     Rollout,
     SuccessEstimate,
 )
+from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +31,7 @@ class Prediction:
         stamp_ns: stamp of the rollout's observation [ns].
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
+        memory: what the estimate remembers of the rollout, for what is chained onto this chunk.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
         seconds: time spent by stage [s].
@@ -44,6 +46,7 @@ class Prediction:
     stamp_ns: int
     chunk: int
     num_chunks: int
+    memory: RolloutMemory
     segmenter: str = ''
     num_inference_steps: int = 0
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))

@@ -16,6 +16,7 @@ from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.observation_buffer import Scene
 from mtv_world_ros.ros.rejection import Reason, Rejection
 from mtv_world_ros.ros.timing import from_observation, TimeLimits
+from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,6 +98,7 @@ class RolloutWorker:
         self._closing = False
         self._last: Scene | None = None
         self._num_imagined = 0
+        self._memory: RolloutMemory | None = None
         self._results: deque[Result] = deque()
         self._thread = Thread(target=self._run, name='rollouts')
 
@@ -140,7 +142,7 @@ class RolloutWorker:
                     self._put(Ended(request=request, state='reset', num_chunks=0))
             self._abandoned = self._running is not None
             self._pending = None
-            self._last, self._num_imagined = None, 0
+            self._last, self._memory, self._num_imagined = None, None, 0
 
     def take(self) -> list[Result]:
         """Returns the results since the last call, in order."""
@@ -208,7 +210,7 @@ class RolloutWorker:
         return ended('done')
 
     def _chunks(self, request: Request) -> Iterator[None]:
-        scene, num_before = self._start(request)
+        scene, memory, num_before = self._start(request)
         trajectory = from_observation(
             request.trajectory, request.stamp_ns, scene.observation.stamp_ns, request.limits
         )
@@ -224,6 +226,7 @@ class RolloutWorker:
             seed=request.seed + num_before,
             num_inference_steps=request.num_inference_steps,
             should_stop=self._should_stop,
+            memory=memory,
         )
         for prediction in predictions:
             self._finish_chunk(request, scene, prediction)
@@ -231,12 +234,12 @@ class RolloutWorker:
             if self._should_stop() and prediction.chunk + 1 < prediction.num_chunks:
                 raise RolloutPreempted('a newer trajectory arrived')
 
-    def _start(self, request: Request) -> tuple[Scene, int]:
-        """The scene to start from, and the chunks that were imagined before it."""
+    def _start(self, request: Request) -> tuple[Scene, RolloutMemory | None, int]:
+        """The scene to start from, how it came about, and the chunks imagined before it."""
         with self._changed:
             if request.imagine and self._last is not None:
-                return self._last, self._num_imagined
-            return request.scene, 0
+                return self._last, self._memory, self._num_imagined
+            return request.scene, None, 0
 
     def _finish_chunk(self, request: Request, scene: Scene, prediction: Prediction) -> None:
         chunk = Chunk(
@@ -247,6 +250,7 @@ class RolloutWorker:
                 raise RolloutPreempted('the rollout was given up')
             if request.imagine:
                 self._last = replace(scene, observation=prediction.end_observation)
+                self._memory = prediction.memory
                 self._num_imagined += 1
             self._put(chunk)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.sim.shape_geoms import FLOOR_M
+from mtv_world_ros.success.swings import count_reversals
 
 #: a gripper counts as open above this share of its range
 OPEN_SHARE = 0.8
@@ -110,17 +111,7 @@ def num_reversals(up: FloatArray, swing: float = SWING_RAD) -> FloatArray:
     # the line along which it swings most
     direction = np.linalg.svd(lean - lean.mean(0))[2][0]
     angles = np.arctan2(lean @ direction, np.asarray(up)[:, 2])
-    counts, count, extreme, heading = np.zeros(len(angles)), 0, angles[0], 0
-    for k, angle in enumerate(angles):
-        if heading == 0:
-            if abs(angle - extreme) > swing:
-                heading, extreme = int(np.sign(angle - extreme)), angle
-        elif heading * (angle - extreme) > 0:
-            extreme = angle
-        elif heading * (extreme - angle) > swing:
-            count, heading, extreme = count + 1, -heading, angle
-        counts[k] = count
-    return counts
+    return count_reversals(angles, swing)
 
 
 def all_of(*predicates: Predicate) -> Predicate:

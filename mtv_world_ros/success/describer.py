@@ -14,7 +14,8 @@ OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', '
 #: words that end a noun phrase
 _STOP = re.compile(
     'a|an|the|to|of|on|in|into|onto|at|by|with|from|and|or|then|left|right|over|under|above|below|'
-    'behind|before|between|beside|near|next|front|back|is|are|it|its|so'
+    'behind|before|between|beside|near|next|front|back|is|are|it|its|so|towards|toward|away|up|down|'
+    'off|out|around|against|along|across|through|until|while'
 )
 _MAX_WORDS = 4
 
@@ -70,10 +71,15 @@ def _phrase(tokens: list[str]) -> list[str]:
         return []
     phrase = tokens[:1]
     for word in tokens[1:_MAX_WORDS]:
-        if _STOP.fullmatch(word) or word in PALETTE or not word[0].isalpha():
+        if ends_phrase(word) or word in PALETTE or not word[0].isalpha():
             break
         phrase.append(word)
     return phrase if len(phrase) > 1 else []
+
+
+def ends_phrase(word: str) -> bool:
+    """Returns whether a word belongs to no object's name: a preposition, an article."""
+    return _STOP.fullmatch(word) is not None
 
 
 def colour_of(name: str) -> str | None:

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp, isfinite, nan
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.data_types import CameraModel, FloatArray, ObjectMasks, SuccessEstimate
+from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.success.evidence import (
-    CannotTell,
-    Evidence,
-    EvidenceConfig,
-    gather,
-    relation_jaccard,
-    view_mean,
-    Views,
-)
+from mtv_world_ros.success.evidence import clipped, Evidence, gather, view_mean
+from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.relations import CannotTell, Margin
+from mtv_world_ros.success.rollout_memory import remember, RolloutMemory
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
+from mtv_world_ros.success.views import EvidenceConfig, Views
 
-__all__ = ['EstimatorConfig', 'SuccessEstimator', 'load_tasks']
+__all__ = ['EstimatorConfig', 'Judged', 'SuccessEstimator', 'load_tasks']
 
 #: a gripper at least this open has let go
 OPEN_GRIPPER = 0.8
+#: probability of a task that asks for open grippers while one is closed, at most
+CLOSED_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,16 +32,31 @@ class EstimatorConfig:
     """The logistic's weights, which are stated, not calibrated, and when to abstain.
 
     Attributes:
-        margin_weight: logit per softness length of the smallest margin.
-        max_margin: the smallest margin is clipped to this many softness lengths.
-        jaccard_weight: logit of (2 J with the goal mask - 1).
+        weights: logit per unit of a feature; see `evidence.FEATURES`.
+        doubts: the same for features of which only negative values count.
         evidence: when masks are not enough.
     """
 
-    margin_weight: float = 1.5
-    max_margin: float = 3.0
-    jaccard_weight: float = 1.0
+    weights: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({'margin': 1.5, 'goal': 1.0})
+    )
+    doubts: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({'grasp': 8.0, 'carry': 0.5})
+    )
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+
+    def probability(self, features: Mapping[str, float]) -> float:
+        """Returns the logistic of the features; those that are NaN do not count."""
+        terms = [weight * features.get(name, nan) for name, weight in self.weights.items()]
+        terms += [w * min(features.get(name, nan), 0.0) for name, w in self.doubts.items()]
+        return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
+
+
+class Judged(NamedTuple):
+    """The estimate after a chunk, and what to remember for the next one."""
+
+    estimate: SuccessEstimate
+    memory: RolloutMemory
 
 
 class SuccessEstimator:
@@ -58,7 +73,7 @@ class SuccessEstimator:
         Args:
             tasks: known tasks.
             task: name of the one to judge; default: the one the instruction matches. Where the
-                instruction names no objects for it, the first of two objects is its subject.
+                instruction names no objects for it, they take the task's placeholders in order.
             config: weights and limits.
 
         Raises:
@@ -75,105 +90,112 @@ class SuccessEstimator:
         self.config = config or EstimatorConfig()
 
     def estimate(
-        self,
-        masks: ObjectMasks,
-        start_masks: ObjectMasks,
-        cameras: Sequence[CameraModel],
-        T_base_camera: Sequence[FloatArray],
-        instruction: str = '',
-        *,
-        T_base_camera_start: Sequence[FloatArray] | None = None,
-        gripper_openings: FloatArray | None = None,
-    ) -> SuccessEstimate:
-        """Returns the probability that the task is done at the end of the rollout.
+        self, footage: Footage, instruction: str = '', memory: RolloutMemory | None = None
+    ) -> Judged:
+        """Returns the probability that the task is done at the end of a rollout's chunk.
 
-        `jaccard` holds J of the task's subject with its goal mask (its start mask, moved to
-        where the relation wants it), and J of every other object with its own start mask.
+        `jaccard` holds J of every subject with its goal mask (its first mask of the rollout,
+        moved to where the relation wants it), and J of every other object with its first mask.
 
         Args:
-            masks: of the T predicted frames.
-            start_masks: of the frame before them (T = 1).
-            cameras: V cameras at the masks' size.
-            T_base_camera: V poses (4, 4) at the end of the rollout.
+            footage: the chunk.
             instruction: what the robot was told; says which task it is and with which objects.
-            T_base_camera_start: V poses at the start; default: those of the end.
-            gripper_openings: (A,) commanded at the end, 0 closed to 1 open, if known.
+            memory: of the chunks before; None = the chunk is the rollout's first.
         """
-        views = Views(
-            masks=masks,
-            start_masks=start_masks,
-            cameras=cameras,
-            start_poses=T_base_camera_start or T_base_camera,
-            end_poses=T_base_camera,
-        )
-        last = self.config.evidence.last_frames
-        subject = None
+        memory = remember(memory, footage)
         try:
-            task, bound = self._task(instruction, masks.names)
-            subject = views.index(bound[task.relation.subject])
-            target = views.index(bound[task.relation.target])
-            evidence = gather(views, task.relation, subject, target, self.config.evidence)
+            task, bound = self._task(instruction, footage.masks.names)
+            _check_views(task, footage)
         except CannotTell as reason:
-            return SuccessEstimate(
-                probability=nan,
-                interval=(nan, nan),
-                jaccard=relation_jaccard(views, subject, None, last),
-                reasons=(f'abstains: {reason}',),
-            )
-        scores = relation_jaccard(views, subject, evidence, last)
-        return self._judge(task, evidence, scores, gripper_openings)
+            views = Views(footage=footage, memory=memory, used=(), config=self.config.evidence)
+            return Judged(_abstains(reason, views, []), memory)
+        views = Views(footage=footage, memory=memory, used=task.views, config=self.config.evidence)
+        subjects = [
+            views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
+        ]
+        try:
+            evidence = gather(views, task, bound)
+        except CannotTell as reason:
+            return Judged(_abstains(reason, views, subjects), memory)
+        return Judged(self._judge(task, evidence, views), memory)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """The task and its objects; a given task takes the objects in their order."""
         matched = match_task(self.tasks, instruction)
         if matched is not None:
             return matched
-        if self.is_given and len(names) == 2:
-            relation = self.tasks[0].relation
-            return self.tasks[0], {relation.subject: names[0], relation.target: names[1]}
+        if self.is_given and len(names) == len(self.tasks[0].roles):
+            return self.tasks[0], dict(zip(self.tasks[0].roles, names, strict=True))
         known = '; '.join(task.instruction for task in self.tasks) or 'none'
         raise CannotTell(f"'{instruction}' is no known task (known: {known})")
 
-    def _judge(
-        self,
-        task: TaskSpec,
-        evidence: Evidence,
-        scores: FloatArray,
-        gripper_openings: FloatArray | None,
-    ) -> SuccessEstimate:
-        worst = min(evidence.margins, key=lambda name: evidence.margins[name])
-        margin = evidence.margins[worst]
-        goal, start = view_mean(evidence.goal_jaccard), view_mean(evidence.start_jaccard)
-        reached = 2 * goal - 1 if isfinite(goal) else 0.0
-        spread = 1.96 * evidence.sigma_m
+    def _judge(self, task: TaskSpec, evidence: Evidence, views: Views) -> SuccessEstimate:
+        features, spread = evidence.features, 1.96 * evidence.sigma
         low, middle, high = (
-            self._probability(value / task.softness_m, reached)
-            for value in (margin - spread, margin, margin + spread)
+            self.config.probability({**features, 'margin': clipped(features['margin'] + shift)})
+            for shift in (-spread, 0.0, spread)
         )
-        reasons = [
-            f'{task.name}: {_worst_text(worst, margin)}, known to {1000 * spread:.0f} mm',
-            f'J with the goal mask {goal:.2f}, with the start mask {start:.2f}',
-            *evidence.notes,
-        ]
-        if gripper_openings is None:
+        first = [view_mean(views.start_jaccard(item)) for item in evidence.goal_jaccard]
+        reached = [view_mean(values) for values in evidence.goal_jaccard.values()]
+        reasons = [f'{task.name}: {_margin_text(evidence.worst, spread, task)}']
+        if reached:
+            pairs = zip(reached, first, strict=True)
+            reasons += [
+                f'J with the goal mask {g:.2f}, with the start mask {s:.2f}' for g, s in pairs
+            ]
+        reasons += evidence.notes
+        openings = views.footage.openings
+        if task.gripper == 'open' and openings is None:
             reasons.append('gripper not checked')
-        elif float(np.min(gripper_openings)) < OPEN_GRIPPER:
-            low, middle = 0.0, min(middle, 0.1)
+        elif task.gripper == 'open' and openings is not None and _is_closed(openings):
+            low, middle = 0.0, min(middle, CLOSED_PROBABILITY)
+            high = max(middle, min(high, CLOSED_PROBABILITY))
             reasons.append('a gripper is still closed')
         reasons.append('uncalibrated: a logistic with stated weights, given the world model')
         return SuccessEstimate(
-            probability=middle, interval=(low, high), jaccard=scores, reasons=tuple(reasons)
+            probability=middle,
+            interval=(low, high),
+            jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
+            reasons=tuple(reasons),
+            features=features,
         )
 
-    def _probability(self, margin: float, reached: float) -> float:
-        """The logistic of the smallest margin, in softness lengths, and of J with the goal."""
-        limit = self.config.max_margin
-        clipped = min(max(margin, -limit), limit)
-        logit = self.config.margin_weight * clipped + self.config.jaccard_weight * reached
-        return 1.0 / (1.0 + exp(-logit))
+
+def _is_closed(openings: FloatArray) -> bool:
+    return float(np.min(openings[:, -1])) < OPEN_GRIPPER
 
 
-def _worst_text(name: str, margin: float) -> str:
-    """The condition nearest to failing, in words."""
-    held = 'held' if margin >= 0 else 'missed'
-    return f"'{name}' {held} by {abs(1000 * margin):.0f} mm"
+def _check_views(task: TaskSpec, footage: Footage) -> None:
+    """Refuses a task that looks at views that there are not."""
+    known = [camera.view for camera in footage.cameras]
+    missing = [view for view in task.views if view not in known]
+    if missing:
+        raise CannotTell(f'task {task.name} looks at the views {missing}; there are {known}')
+
+
+def _abstains(reason: CannotTell, views: Views, subjects: Sequence[int]) -> SuccessEstimate:
+    return SuccessEstimate(
+        probability=nan,
+        interval=(nan, nan),
+        jaccard=_jaccard(views, {}, subjects),
+        reasons=(f'abstains: {reason}',),
+    )
+
+
+def _jaccard(views: Views, goals: Mapping[int, FloatArray], subjects: Sequence[int]) -> FloatArray:
+    """(V, O): the subjects' J with their goal masks, every other's with its first mask."""
+    num_views = len(views.footage.cameras)
+    scores = [views.start_jaccard(item) for item in range(len(views.names))]
+    for item in subjects:
+        scores[item] = goals.get(item, np.full(num_views, np.nan))
+    return np.stack(scores, axis=1) if scores else np.zeros((num_views, 0))
+
+
+def _margin_text(margin: Margin, spread: float, task: TaskSpec) -> str:
+    """The condition nearest to failing, in words; `spread` in units of its softness."""
+    held = 'held' if margin.value >= 0 else 'missed'
+    if margin.unit != 'm':
+        return f"'{margin.condition}' {held} by {abs(margin.value):g} {margin.unit}"
+    known = 1000 * spread * (margin.soft or task.softness_m)
+    away = 1000 * abs(margin.value)
+    return f"'{margin.condition}' {held} by {away:.0f} mm, known to {known:.0f} mm"

@@ -1,251 +1,242 @@
-"""What the masks of a rollout say about a task: places in space and Jaccard indices."""
+"""What a rollout says about a task: margins of its relations, J with goals, and grasps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import isfinite, nan
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
-from mtv_world_ros.success.jaccard import jaccard, mean_of_known
-from mtv_world_ros.success.localise import block_size, centroids, locate, Location, moved_mask
-from mtv_world_ros.success.task import Relation
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.success.jaccard import mean_of_known
+from mtv_world_ros.success.localise import block_size, Location
+from mtv_world_ros.success.relations import CannotTell, Inside, Margin, Within
+from mtv_world_ros.success.rollout_memory import Grasp
+from mtv_world_ros.success.swings import count_reversals
+from mtv_world_ros.success.task import TaskSpec
+from mtv_world_ros.success.views import Views
 
-
-class CannotTell(Exception):
-    """Why there is no evidence; caught by the estimator, never a user's error."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvidenceConfig:
-    """When masks are not enough.
-
-    Attributes:
-        last_frames: frames at the end whose median counts.
-        max_residual: largest miss of the views' rays, as a share of the image's diagonal.
-        max_disagreement: largest difference between views of the subject's J with its goal.
-        min_visible: smallest area of the subject at the end, as a share of its largest.
-        hidden_below: a target that shows less than this share of its start area, and lies
-            within its start mask, is taken to stand where it stood.
-    """
-
-    last_frames: int = 3
-    max_residual: float = 0.02
-    max_disagreement: float = 0.7
-    min_visible: float = 0.3
-    hidden_below: float = 0.8
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Views:
-    """Masks of a rollout in calibrated views.
-
-    Attributes:
-        masks: of the T predicted frames.
-        start_masks: of the frame before them (T = 1).
-        cameras: V cameras at the masks' size.
-        start_poses: V poses T_base_camera (4, 4) at the start.
-        end_poses: V poses T_base_camera (4, 4) at the end.
-    """
-
-    masks: ObjectMasks
-    start_masks: ObjectMasks
-    cameras: Sequence[CameraModel]
-    start_poses: Sequence[FloatArray]
-    end_poses: Sequence[FloatArray]
-
-    def index(self, name: str) -> int:
-        """Returns the object's index.
-
-        Raises:
-            CannotTell: it has no mask.
-        """
-        if name not in self.masks.names:
-            raise CannotTell(f"'{name}' is not among the objects {list(self.masks.names)}")
-        return self.masks.names.index(name)
-
-    def start_mask(self, item: int) -> BoolArray:
-        """Returns the (V, H, W) masks of one object at the start."""
-        return self.start_masks.masks[:, item, 0]
-
-    def start_ok(self, item: int) -> BoolArray:
-        """Returns (V,) whether the start mask is to be trusted."""
-        return np.array([row[item] == 'ok' for row in self.start_masks.status])
-
-    def end_ok(self, item: int) -> BoolArray:
-        """Returns (V,) whether the object is known, and seen in the last frame."""
-        ok = np.array([row[item] == 'ok' for row in self.masks.status])
-        return ok & self.masks.masks[:, item, -1].any((1, 2))
-
-    def start_jaccard(self, item: int, last: int) -> FloatArray:
-        """Returns (V,) J of the last masks with the start mask, NaN where either is not known."""
-        return self._jaccard(item, self.start_mask(item), last)
-
-    def goal_jaccard(
-        self, item: int, start: FloatArray, goal: FloatArray, last: int
-    ) -> FloatArray:
-        """Returns (V,) J of the last masks with the start mask moved from `start` to `goal`."""
-        moved = [
-            moved_mask(mask, camera, pose, start, goal)
-            for mask, camera, pose in zip(
-                self.start_mask(item), self.cameras, self.end_poses, strict=True
-            )
-        ]
-        return self._jaccard(item, np.stack(moved), last)
-
-    def _jaccard(self, item: int, reference: BoolArray, last: int) -> FloatArray:
-        scores = np.median(jaccard(self.masks.masks[:, item, -last:], reference[:, None]), axis=1)
-        return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
+#: margins are clipped to this many softness lengths
+MAX_MARGIN = 3.0
+#: an object this far from its start has moved [m]
+MOVED_M = 0.03
+#: a tool this far from an object's centre, in the table plane, can still have grasped it [m]
+GRASP_M = 0.02
+#: the same for the distance outside the mask of an object that is held by its rim [m]
+RIM_GAP_M = 0.01
+#: a carried object may come to rest this far from where its tool carried it [m]
+CARRY_ERROR_M = 0.025
+#: what the features are called, in order
+FEATURES = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """Features of a rollout for one relation.
+    """Of one rollout for one task.
 
     Attributes:
-        margins: by how much each condition holds [m].
-        sigma_m: standard error of the margins [m].
-        goal_jaccard: (V,) J of the subject with its goal mask.
-        start_jaccard: (V,) J of the subject with its start mask; 1 = it did not move.
+        worst: the condition nearest to failing, or furthest from holding.
+        features: by `FEATURES`, larger = likelier; NaN = says nothing about this task.
+        sigma: standard error of the worst margin, in units of its softness.
+        goal_jaccard: object -> (V,) J with its goal mask.
         notes: assumptions made on the way.
     """
 
-    margins: dict[str, float]
-    sigma_m: float
-    goal_jaccard: FloatArray
-    start_jaccard: FloatArray
+    worst: Margin
+    features: Mapping[str, float]
+    sigma: float
+    goal_jaccard: Mapping[int, FloatArray]
     notes: tuple[str, ...]
 
 
-def gather(
-    views: Views, relation: Relation, subject: int, target: int, config: EvidenceConfig
-) -> Evidence:
-    """Measures where subject and target end and how that compares with the relation.
+@dataclass(slots=True)
+class Placed:
+    """Where the bound objects are; a `Situation`. Each is located once, when it is asked for."""
+
+    views: Views
+    bound: Mapping[str, str]
+    notes: dict[str, None] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    _ends: dict[str, Location] = field(default_factory=dict)
+
+    def item(self, role: str) -> int:
+        """Returns the index of a placeholder's object."""
+        return self.views.index(self.bound[role])
+
+    def end(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        if role not in self._ends:
+            found, hidden = self.views.end(self.item(role))
+            if hidden:
+                name = self.bound[role]
+                self.notes[f"'{name}' is partly hidden: taken to stand where it stood"] = None
+            self._ends[role], self.sigmas[role] = found, found.sigma_m
+        return self._ends[role].point
+
+    def start(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        point = self.views.memory.start_point(self.item(role))
+        if not np.isfinite(point).all():
+            raise CannotTell(f"where '{self.bound[role]}' was at the start is not known")
+        return point
+
+    def stack_height(self, upper: str, lower: str) -> float:
+        """See `Situation`; both are taken as cubes, of the size that was last seen whole."""
+        memory, footage = self.views.memory, self.views.footage
+        edges = []
+        for role in (upper, lower):
+            item = self.item(role)
+            areas = memory.seen_masks[:, item].sum((-2, -1)).astype(np.float64)
+            point = memory.seen_points[item]
+            if not np.isfinite(point).all():
+                point = self.end(role)
+            edges.append(block_size(footage.cameras, tuple(footage.poses[:, -1]), areas, point))
+        return float(np.mean(edges))
+
+    def lift(self, role: str) -> float:
+        """See `Situation`."""
+        heights = self.views.memory.points[self.item(role), :, 2]
+        return float(np.nanmax(heights) - self.start(role)[2])
+
+    def swings(self, role: str, swing: float) -> int:
+        """See `Situation`; what the view tells that shows most of them."""
+        counts = []
+        for leans in self.views.memory.leans[:, self.item(role)]:
+            known = leans[np.isfinite(leans)]
+            if len(known):
+                reversals = count_reversals(np.unwrap(known, period=np.pi), swing)
+                counts.append(int(reversals[-1]))
+        return max(counts, default=0)
+
+
+def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
+    """Measures how far a task's relations hold at the end of a rollout.
 
     Raises:
         CannotTell: objects lost, rays that miss each other, views that disagree.
     """
-    _check_visible(views, subject, config)
-    end = _locate_end(views, subject, config)
-    start = _locate_start(views, subject)
-    below, notes = _locate_target(views, target, config)
-    height = _centre_height(views, subject, target, end, below)
-    goal = relation.goal(below.point, height)
-    goal_jaccard = np.full(len(views.cameras), np.nan)
-    if start is None:
-        notes = (*notes, f"no goal mask: '{views.masks.names[subject]}' has no known start")
-    else:
-        goal_jaccard = views.goal_jaccard(subject, start.point, goal, config.last_frames)
-    known = goal_jaccard[np.isfinite(goal_jaccard)]
-    if len(known) > 1 and np.ptp(known) > config.max_disagreement:
-        raise CannotTell(
-            'the views disagree: J with the goal mask is '
-            + ', '.join(f'{value:.2f}' for value in known)
-        )
+    placed = Placed(views, bound)
+    for role in task.movers:
+        views.check_visible(placed.item(role))
+    margins = [margin for relation in task.relations for margin in relation.margins(placed)]
+    scores = [_score(margin, task) for margin in margins]
+    worst = margins[int(np.argmin(scores))]
+    goals, gains = _goals(placed, task)
+    grasp, carry = _grasps(placed, task)
+    features = {
+        'margin': min(scores),
+        'mean_margin': float(np.mean(scores)),
+        'goal': gains,
+        'contained': _contained(placed, task),
+        'grasp': grasp,
+        'carry': carry,
+    }
+    sigma = float(np.hypot.reduce(sorted(placed.sigmas.values())[-2:])) if placed.sigmas else 0.0
     return Evidence(
-        margins=relation.margins(end.point, below.point, height),
-        sigma_m=float(np.hypot(end.sigma_m, below.sigma_m)),
-        goal_jaccard=goal_jaccard,
-        start_jaccard=views.start_jaccard(subject, config.last_frames),
-        notes=notes,
+        worst=worst,
+        features=features,
+        sigma=sigma / (worst.soft or task.softness_m) if worst.unit == 'm' else 0.0,
+        goal_jaccard=goals,
+        notes=tuple(placed.notes),
     )
 
 
-def _check_visible(views: Views, item: int, config: EvidenceConfig) -> None:
-    """Refuses a subject that has all but vanished in every view that knows it."""
-    areas = views.masks.masks[:, item].sum((-2, -1))
-    largest = np.maximum(areas.max(1), views.start_mask(item).sum((-2, -1)))
-    last = np.median(areas[:, -config.last_frames :], axis=1)
-    known = views.end_ok(item)
-    if known.any() and (last[known] < config.min_visible * largest[known]).all():
-        share = float(np.max(last[known] / largest[known]))
-        raise CannotTell(
-            f"'{views.masks.names[item]}' has vanished: {share:.0%} of its area is left"
+def clipped(score: float) -> float:
+    """Returns the score within plus and minus `MAX_MARGIN`."""
+    return min(max(score, -MAX_MARGIN), MAX_MARGIN)
+
+
+def _score(margin: Margin, task: TaskSpec) -> float:
+    return clipped(margin.value / (margin.soft or task.softness_m))
+
+
+def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float]:
+    """J of every subject with its goal mask, and their mean gain over the start, in -1..1."""
+    found: dict[int, FloatArray] = {}
+    gains = []
+    for relation in task.relations:
+        goal = relation.goal(placed)
+        if goal is None:
+            continue
+        item = placed.item(goal[0])
+        masks = placed.views.goal_masks(item, goal[1])
+        if masks is None:
+            placed.notes[f"no goal mask: '{placed.bound[goal[0]]}' has no known start"] = None
+            continue
+        found[item], before = placed.views.goal_jaccard(item, masks)
+        gain = (found[item] - before) / np.maximum(1 - before, 0.05)
+        gains.append(view_mean(np.clip(2 * gain - 1, -1, 1)))
+    return found, float(mean_of_known(np.array(gains))) if gains else nan
+
+
+def _contained(placed: Placed, task: TaskSpec) -> float:
+    """How much of the subjects lies on what they are to be in or on, in -1..1; the least."""
+    shares = [
+        placed.views.containment(placed.item(relation.subject), placed.item(relation.target))
+        for relation in task.relations
+        if isinstance(relation, Within | Inside)
+    ]
+    known = [share for share in shares if isfinite(share)]
+    return 2 * min(known) - 1 if known else nan
+
+
+def _grasps(placed: Placed, task: TaskSpec) -> tuple[float, float]:
+    """How well grasps explain that the movers moved: by their place, and by the way they went.
+
+    Positive = explained, at most 1; an object that did not move needs no grasp. NaN = the robot's
+    motion is not known.
+    """
+    if placed.views.memory.levels is None:
+        return nan, nan
+    near, along = [1.0], [1.0]
+    for role in task.movers:
+        if not _has_moved(placed, role):
+            continue
+        off, error = _nearest_grasp(
+            placed, role, is_rim=placed.bound[role].split()[-1] in task.rims
         )
+        near.append(1 - off)
+        along.append(1 - error / CARRY_ERROR_M)
+        if off > 1:
+            text = 'is imagined to move, but no gripper closed where it could hold it'
+            placed.notes[f"'{placed.bound[role]}' {text}"] = None
+    return max(min(near), -MAX_MARGIN), max(min(along), -MAX_MARGIN)
 
 
-def _locate_end(views: Views, item: int, config: EvidenceConfig) -> Location:
-    """Where the object is at the end."""
-    with_gaps = centroids(views.masks.masks[:, item, -config.last_frames :])
-    pixels = np.array([_median_known(view) for view in with_gaps])
-    known = views.end_ok(item)
-    pixels[~known] = np.nan
-    found = locate(views.cameras, views.end_poses, pixels)
-    name = views.masks.names[item]
-    if found is None:
-        words = ', '.join(
-            f'{camera.view}: {row[item] if row[item] != "ok" else "lost at the end"}'
-            for camera, row, ok in zip(views.cameras, views.masks.status, known, strict=True)
-            if not ok
-        )
-        raise CannotTell(f"'{name}' is known in fewer than two views ({words or 'one view'})")
-    limit = config.max_residual * float(np.hypot(views.cameras[0].width, views.cameras[0].height))
-    if found.residual_px > limit:
-        raise CannotTell(
-            f"the views disagree on where '{name}' is: their rays miss each other by "
-            f'{found.residual_px:.1f} px, more than {limit:.1f}'
-        )
-    return found
+def _nearest_grasp(placed: Placed, role: str, *, is_rim: bool) -> tuple[float, float]:
+    """How far off the nearest grasp was (1 = the limit), and by how much its way differs [m]."""
+    item = placed.item(role)
+    best, error = np.inf, np.inf
+    for grasp in placed.views.memory.grasps:
+        away = float(np.hypot(*(grasp.closed_at - grasp.points[item])[:2])) / GRASP_M
+        off = max(float(grasp.gaps_m[item]), 0.0) / RIM_GAP_M if is_rim else away
+        if off < best:  # NaN is not
+            best, error = off, _carry_error(placed, role, grasp)
+    return best, error
 
 
-def _locate_start(views: Views, item: int) -> Location | None:
-    """Where the object was, None where the start frame does not tell."""
-    pixels = centroids(views.start_mask(item))
-    pixels[~views.start_ok(item)] = np.nan
-    return locate(views.cameras, views.start_poses, pixels)
+def _carry_error(placed: Placed, role: str, grasp: Grasp) -> float:
+    """Distance in the table plane from where the grasp would have carried the object [m]."""
+    until = grasp.released_at
+    if until is None:
+        tools = placed.views.footage.tools
+        assert tools is not None
+        until = tools[grasp.arm, -1]
+    way = placed.end(role) - grasp.points[placed.item(role)]
+    return float(np.hypot(*(way - (until - grasp.closed_at))[:2]))
 
 
-def _locate_target(
-    views: Views, item: int, config: EvidenceConfig
-) -> tuple[Location, tuple[str, ...]]:
-    """Where the target ends; where it stood if the subject hides part of it."""
-    start = _locate_start(views, item)
-    if start is not None and _is_hidden_in_place(views, item, config):
-        name = views.masks.names[item]
-        return start, (f"'{name}' is partly hidden: taken to stand where it stood",)
-    return _locate_end(views, item, config), ()
+def _has_moved(placed: Placed, role: str) -> bool:
+    """Whether the object was away from its start in three frames; unknown ones do not tell."""
+    trail = placed.views.memory.points[placed.item(role)]
+    return _is_away(np.linalg.norm(trail - trail[0], axis=1))
 
 
-def _is_hidden_in_place(views: Views, item: int, config: EvidenceConfig) -> bool:
-    """Whether some view shows less of it than before, and none shows it elsewhere."""
-    first, last = views.start_mask(item), views.masks.masks[:, item, -1]
-    area, first_area = last.sum((-2, -1)), first.sum((-2, -1))
-    inside = (first & last).sum((-2, -1))
-    hidden = views.start_ok(item) & (area < config.hidden_below * first_area)
-    elsewhere = inside < 0.6 * area
-    return bool(hidden.any() and not elsewhere.any())
-
-
-def _centre_height(
-    views: Views, subject: int, target: int, end: Location, below: Location
-) -> float:
-    """Height of the subject's centre over the target's when stacked [m]; both taken as cubes."""
-    edges = []
-    for item, place in ((subject, end), (target, below)):
-        areas = views.masks.masks[:, item].sum((-2, -1))
-        known = np.concatenate([areas, views.start_mask(item).sum((-2, -1))[:, None]], axis=1)
-        largest = np.quantile(known, 0.8, axis=1)
-        edges.append(block_size(views.cameras, views.end_poses, largest, place.point))
-    return float(np.mean(edges))
-
-
-def _median_known(pixels: FloatArray) -> FloatArray:
-    """(2,) median of the rows that are known, NaN if none is."""
-    known = pixels[np.isfinite(pixels[:, 0])]
-    return np.median(known, axis=0) if len(known) else np.full(2, np.nan)
-
-
-def relation_jaccard(
-    views: Views, subject: int | None, evidence: Evidence | None, last: int
-) -> FloatArray:
-    """Returns (V, O): the subject's J with its goal mask, every other's with its start mask."""
-    num_objects = len(views.masks.names)
-    scores = [views.start_jaccard(item, last) for item in range(num_objects)]
-    if subject is not None:
-        unknown = np.full(len(views.cameras), np.nan)
-        scores[subject] = unknown if evidence is None else evidence.goal_jaccard
-    return np.stack(scores, axis=1) if scores else np.zeros((len(views.cameras), 0))
+def _is_away(away: FloatArray) -> bool:
+    """Whether the third largest of the known distances is a move."""
+    known = away[np.isfinite(away)]
+    return len(known) > 2 and float(np.partition(known, -3)[-3]) > MOVED_M
 
 
 def view_mean(values: FloatArray) -> float:

@@ -1,94 +1,20 @@
-"""Tasks: which relation between two objects an instruction asks for."""
+"""Tasks: which relations between objects an instruction asks for."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, MISSING
+from dataclasses import dataclass, field, fields, MISSING
 from pathlib import Path
 import re
 from typing import Any
 
-import numpy as np
 import yaml
 
-from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.success.describer import ends_phrase
+from mtv_world_ros.success.relations import KINDS, Relation, roles_of
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BesideRelation:
-    """The subject stands on the table to the left (-x) or right (+x) of the target.
-
-    Attributes:
-        kind: `left_of` or `right_of`.
-        subject: placeholder of the object that moves.
-        target: placeholder of the object it is placed by.
-        distance_m: smallest and largest distance of the centres in the table plane.
-        max_across_m: largest |dy|.
-        max_rise_m: largest |dz|.
-        goal_distance_m: dx at which the goal mask is drawn.
-    """
-
-    kind: str
-    subject: str
-    target: str
-    distance_m: tuple[float, float] = (0.08, 0.20)
-    max_across_m: float = 0.05
-    max_rise_m: float = 0.03
-    goal_distance_m: float = 0.13
-
-    def goal(self, target: FloatArray, height: float) -> FloatArray:
-        """Returns where the subject's centre should be (3,) [m]."""
-        del height
-        return target + np.array([self._side() * self.goal_distance_m, 0.0, 0.0])
-
-    def margins(self, subject: FloatArray, target: FloatArray, height: float) -> dict[str, float]:
-        """Returns by how much each condition holds [m]; negative = violated."""
-        del height
-        dx, dy, dz = (subject - target).tolist()
-        distance = float(np.hypot(dx, dy))
-        return {
-            'far enough': distance - self.distance_m[0],
-            'near enough': self.distance_m[1] - distance,
-            'on the right side': self._side() * dx,
-            'in line': self.max_across_m - abs(dy),
-            'on the table': self.max_rise_m - abs(dz),
-        }
-
-    def _side(self) -> float:
-        return -1.0 if self.kind == 'left_of' else 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnRelation:
-    """The subject stands on the target.
-
-    Attributes:
-        kind: `on_top_of` (plain `on` is a truth value in YAML).
-        subject: placeholder of the object that moves.
-        target: placeholder of the object below.
-        max_offset_m: largest |dx|, |dy|, |dz| from the place right above the target.
-    """
-
-    kind: str
-    subject: str
-    target: str
-    max_offset_m: tuple[float, float, float] = (0.025, 0.025, 0.012)
-
-    def goal(self, target: FloatArray, height: float) -> FloatArray:
-        """Returns where the subject's centre should be (3,) [m]."""
-        return target + np.array([0.0, 0.0, height])
-
-    def margins(self, subject: FloatArray, target: FloatArray, height: float) -> dict[str, float]:
-        """Returns by how much each condition holds [m]; negative = violated."""
-        room = np.asarray(self.max_offset_m) - np.abs(subject - self.goal(target, height))
-        return dict(
-            zip(('over it in x', 'over it in y', 'at its top'), room.tolist(), strict=True)
-        )
-
-
-Relation = BesideRelation | OnRelation
-_KINDS = {'left_of': BesideRelation, 'right_of': BesideRelation, 'on_top_of': OnRelation}
+GRIPPERS = ('open', 'any')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,14 +24,34 @@ class TaskSpec:
     Attributes:
         name: e.g. `stack_blocks_two`.
         instruction: template with placeholders for the objects, `stack the {a} on the {b}`.
-        relation: what must hold between the objects at the end.
+        relations: what must hold between the objects at the end, all of it.
+        nouns: what a placeholder's object may be called, by its last word; not given = anything.
+            Tells tasks of one template apart.
+        rims: last words of the names of objects that are held by their rim, not across the middle.
+        gripper: `open`: every gripper has let go at the end; `any`: that does not matter.
+        views: names of the views to look at; empty = all.
         softness_m: length that counts as one in the margins [m].
     """
 
     name: str
     instruction: str
-    relation: Relation
+    relations: tuple[Relation, ...]
+    nouns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rims: tuple[str, ...] = ()
+    gripper: str = 'open'
+    views: tuple[str, ...] = ()
     softness_m: float = 0.01
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Placeholders that the relations are about."""
+        found = [role for relation in self.relations for role in roles_of(relation)]
+        return tuple(dict.fromkeys(found))
+
+    @property
+    def movers(self) -> tuple[str, ...]:
+        """Placeholders of the objects that the robot is to move."""
+        return tuple(dict.fromkeys(relation.subject for relation in self.relations))
 
     def bind(self, instruction: str) -> dict[str, str] | None:
         """Returns the placeholders' objects if the instruction fits the template, else None."""
@@ -113,18 +59,25 @@ class TaskSpec:
             r'\\\{(\w+)\\\}', r'(?P<\1>[\\w -]+?)', re.escape(self.instruction.lower())
         )
         found = re.fullmatch(pattern, ' '.join(instruction.lower().split()).rstrip('.! '))
-        return found.groupdict() if found else None
+        if found is None:
+            return None
+        bound = found.groupdict()
+        if any(ends_phrase(word) for name in bound.values() for word in name.split()):
+            return None  # one placeholder took two objects
+        fits = all(bound[role].split()[-1] in nouns for role, nouns in self.nouns.items())
+        return bound if fits else None
 
 
 def match_task(
     tasks: Iterable[TaskSpec], instruction: str
 ) -> tuple[TaskSpec, dict[str, str]] | None:
-    """Returns the first task whose template the instruction fits, and its objects."""
-    for task in tasks:
-        bound = task.bind(instruction)
-        if bound is not None:
-            return task, bound
-    return None
+    """Returns the task whose template the instruction fits, and its objects.
+
+    Where several fit, the one that says most about its objects' nouns, then the first.
+    """
+    bound = [(task, task.bind(instruction)) for task in tasks]
+    found = [(task, objects) for task, objects in bound if objects is not None]
+    return max(found, key=lambda pair: len(pair[0].nouns), default=None)
 
 
 def load_task(path: Path) -> TaskSpec:
@@ -138,22 +91,18 @@ def load_task(path: Path) -> TaskSpec:
     except (OSError, yaml.YAMLError) as error:
         raise ConfigError(f"task file '{path}' cannot be read: {error}") from error
     values = _checked(TaskSpec, data, str(path))
-    relation = values['relation']
-    kind = relation.get('kind') if isinstance(relation, Mapping) else None
-    if kind not in _KINDS:
-        raise ConfigError(
-            f"{path}: relation.kind is '{kind}'{nearest(str(kind), _KINDS)}; known are "
-            f'{sorted(_KINDS)}'
-        )
-    where = f'{path}: relation'
-    values['relation'] = _KINDS[kind](**_numeric(_checked(_KINDS[kind], relation, where), where))
-    task = TaskSpec(**_numeric(values, str(path)))
-    for role in (task.relation.subject, task.relation.target):
-        if f'{{{role}}}' not in task.instruction:
-            raise ConfigError(
-                f"{path}: the relation is about '{role}', which the instruction "
-                f"'{task.instruction}' does not hold as {{{role}}}"
-            )
+    given = values['relations']
+    if not isinstance(given, list) or not given:
+        raise ConfigError(f"{path}: 'relations' is {given!r}; expected a list of relations")
+    values['relations'] = tuple(
+        _relation(item, f'{path}: relations[{index}]') for index, item in enumerate(given)
+    )
+    values = _numeric(values, str(path))
+    values['nouns'] = _nouns(values.get('nouns', {}), str(path))
+    for key in ('views', 'rims'):
+        values[key] = _names(values.get(key, []), f"{path}: '{key}'")
+    task = TaskSpec(**values)
+    _check(task, path)
     return task
 
 
@@ -171,6 +120,29 @@ def load_tasks(folder: Path) -> tuple[TaskSpec, ...]:
     return tasks
 
 
+def _check(task: TaskSpec, path: Path) -> None:
+    """Refuses placeholders that the instruction does not hold, and an unknown gripper word."""
+    for role in (*task.roles, *task.nouns):
+        if f'{{{role}}}' not in task.instruction:
+            raise ConfigError(
+                f"{path}: the relations or nouns are about '{role}', which the instruction "
+                f"'{task.instruction}' does not hold as {{{role}}}"
+            )
+    if task.gripper not in GRIPPERS:
+        raise ConfigError(
+            f"{path}: gripper is '{task.gripper}'; it must be one of {', '.join(GRIPPERS)}"
+        )
+
+
+def _relation(data: Any, where: str) -> Relation:
+    kind = data.get('kind') if isinstance(data, Mapping) else None
+    if kind not in KINDS:
+        raise ConfigError(
+            f"{where}: kind is '{kind}'{nearest(str(kind), KINDS)}; known are {sorted(KINDS)}"
+        )
+    return KINDS[kind](**_numeric(_checked(KINDS[kind], data, where), where))
+
+
 def _checked(kind: type, data: Any, where: str) -> dict[str, Any]:
     """The mapping's items, if its keys are the dataclass's."""
     known = {item.name: item for item in fields(kind)}
@@ -179,30 +151,55 @@ def _checked(kind: type, data: Any, where: str) -> dict[str, Any]:
     for key in data:
         if key not in known:
             raise ConfigError(f"{where}: unknown key '{key}'{nearest(str(key), known)}")
-    missing = [key for key, item in known.items() if item.default is MISSING and key not in data]
+    missing = [
+        key
+        for key, item in known.items()
+        if item.default is MISSING and item.default_factory is MISSING and key not in data
+    ]
     if missing:
         raise ConfigError(f'{where}: missing {missing}')
     return dict(data)
 
 
 #: numbers a key holds; a single number where it is not named
-_LENGTHS = {'distance_m': 2, 'max_offset_m': 3}
+_LENGTHS = {'distance_m': 2, 'max_offset_m': 3, 'half_size_m': 2, 'rise_m': 2, 'offset_m': 3}
+#: keys whose lengths may be negative
+_SIGNED = ('rise_m', 'offset_m')
 
 
 def _numeric(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """The mapping with every `*_m` checked to be the finite, positive length(s) it should be."""
+    """The mapping with every number checked to be the finite one, or list, it should be."""
     checked = dict(values)
     for key, value in values.items():
-        if not key.endswith('_m'):
-            continue
-        numbers = value if isinstance(value, list) else [value]
-        fits = len(numbers) == _LENGTHS.get(key, 1) and isinstance(value, list) == (
-            key in _LENGTHS
-        )
-        if not fits or not all(isinstance(n, int | float) and 0 < n < 1e3 for n in numbers):
-            raise ConfigError(
-                f"{where}: '{key}' is {value!r}; expected {_LENGTHS.get(key, 1)} positive "
-                'length(s) in metres'
-            )
-        checked[key] = tuple(map(float, numbers)) if key in _LENGTHS else float(numbers[0])
+        if key == 'num_reversals':
+            if type(value) is not int or value < 1:
+                raise ConfigError(f"{where}: '{key}' is {value!r}; expected a count of at least 1")
+        elif key.endswith(('_m', '_rad')):
+            checked[key] = _lengths(key, value, where)
     return checked
+
+
+def _lengths(key: str, value: Any, where: str) -> float | tuple[float, ...]:
+    count = _LENGTHS.get(key, 1)
+    numbers = value if isinstance(value, list) else [value]
+    low = -1e3 if key in _SIGNED else 0.0
+    fits = len(numbers) == count and isinstance(value, list) == (key in _LENGTHS)
+    if not fits or not all(isinstance(n, int | float) and low < n < 1e3 for n in numbers):
+        sort = '' if key in _SIGNED else 'positive '
+        unit = 'radians' if key.endswith('_rad') else 'metres'
+        raise ConfigError(
+            f"{where}: '{key}' is {value!r}; expected {count} {sort}length(s) in {unit}"
+        )
+    return tuple(map(float, numbers)) if key in _LENGTHS else float(numbers[0])
+
+
+def _nouns(data: Any, where: str) -> dict[str, tuple[str, ...]]:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: 'nouns' is {data!r}; expected words by placeholder")
+    return {role: _names(words, f"{where}: 'nouns.{role}'") for role, words in data.items()}
+
+
+def _names(data: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(data, list) or not all(isinstance(name, str) for name in data):
+        raise ConfigError(f'{where} is {data!r}; expected a list of words')
+    return tuple(data)

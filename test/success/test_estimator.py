@@ -1,96 +1,23 @@
-import cv2
+from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, NAMES, path, POSES, RED, STACK
 import numpy as np
 import pytest
 
-from mtv_world_ros.data_types import CameraModel, ObjectMasks
+from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 
-HEIGHT, WIDTH, SCALE = 72, 96, 4
-LEFT = 'place the red block to the left of the blue block'
-STACK = 'stack the red block on the blue block'
-NAMES = ('red block', 'blue block')
-RED, BLUE = (0.15, 0.25, 0.025), (0.05, 0.3, 0.02)
-EDGES = (0.05, 0.04)
 
-
-def camera(view, azimuth, elevation, distance):
-    """A camera opposite the robot that looks at the middle of the table."""
-    azimuth, elevation = np.deg2rad([azimuth, elevation])
-    outward = np.array(
-        [
-            np.cos(elevation) * np.sin(azimuth),
-            np.cos(elevation) * np.cos(azimuth),
-            np.sin(elevation),
-        ]
-    )
-    right = np.cross(-outward, (0, 0, 1))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], axis=1)
-    pose[:3, 3] = np.array([0, 0.31, 0.04]) + distance * outward
-    focal = WIDTH * distance / 0.65
-    K = np.array([[focal, 0, (WIDTH - 1) / 2], [0, focal, (HEIGHT - 1) / 2], [0, 0, 1]])
-    return CameraModel(
-        view=view, width=WIDTH, height=HEIGHT, K=K, mount_link='base', T_mount_camera=pose
-    )
-
-
-CAMERAS = (camera('low', 28, 28, 1.05), camera('high', -4, 62, 1.3))
-POSES = tuple(np.asarray(c.T_mount_camera) for c in CAMERAS)
-
-
-def silhouette(model, centre, edge, yaw):
-    """(H, W) coverage of an upright cube, drawn with OpenCV's own projection."""
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * edge / 2
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    pose = np.linalg.inv(model.T_mount_camera)
-    rotation, _ = cv2.Rodrigues(pose[:3, :3])
-    corners = signs @ turn.T + centre
-    pixels, _ = cv2.projectPoints(corners, rotation, pose[:3, 3], np.asarray(model.K), None)
-    hull = cv2.convexHull(((pixels[:, 0] + 0.5) * SCALE - 0.5).astype(np.float32))
-    canvas = np.zeros((HEIGHT * SCALE, WIDTH * SCALE), np.uint8)
-    cv2.fillConvexPoly(canvas, np.round(hull).astype(np.int32), 1)
-    return canvas
-
-
-def masks(red_path, blue_path, status=None):
-    """Masks of both blocks along (T, 3) paths; the nearer one hides the other."""
-    found = np.zeros((2, 2, len(red_path), HEIGHT, WIDTH), bool)
-    for view, model in enumerate(CAMERAS):
-        for frame, centres in enumerate(zip(red_path, blue_path, strict=True)):
-            drawn = [
-                silhouette(model, np.array(c), edge, 0.4 * k)
-                for k, (c, edge) in enumerate(zip(centres, EDGES, strict=True))
-            ]
-            near = np.argmin([np.linalg.norm(model.T_mount_camera[:3, 3] - c) for c in centres])
-            drawn[1 - near] = drawn[1 - near] & (1 - drawn[near])
-            for item, canvas in enumerate(drawn):
-                area = cv2.resize(
-                    canvas.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA
-                )
-                found[view, item, frame] = area >= 0.5
-    return ObjectMasks(names=NAMES, masks=found, status=status or (('ok', 'ok'),) * 2)
-
-
-def path(start, end, steps=6):
-    """A lift, a carry and a rest at the end."""
-    start, end = np.array(start), np.array(end)
-    share = np.linspace(0, 1, steps)[:, None]
-    arc = start + share * (end - start)
-    arc[:, 2] += 0.1 * np.sin(np.pi * share[:, 0])
-    return np.concatenate([arc, np.repeat(end[None], 3, axis=0)])
-
-
-def estimate(end, instruction, *, status=None, blue_end=BLUE, task=None, **options):
+def judge(shown, instruction=LEFT, task=None):
     estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task)
+    return estimator.estimate(shown, instruction).estimate
+
+
+def estimate(end, instruction, *, status=None, blue_end=BLUE, task=None, openings=None):
     rollout = masks(path(RED, end), path(BLUE, blue_end) if blue_end != BLUE else [BLUE] * 9)
     if status:
         rollout = ObjectMasks(names=NAMES, masks=rollout.masks, status=status)
-    return estimator.estimate(
-        rollout, masks([RED], [BLUE]), CAMERAS, POSES, instruction, **options
-    )
+    return judge(footage(rollout, masks([RED], [BLUE]), openings), instruction, task)
 
 
 @pytest.mark.parametrize('dx', [-0.1, -0.13, -0.17])
@@ -157,10 +84,10 @@ def test_every_estimate_says_it_is_uncalibrated():
 
 def test_closed_gripper_is_no_success():
     end = (BLUE[0] - 0.13, BLUE[1], 0.025)
-    closed = estimate(end, LEFT, gripper_openings=np.array([1.0, 0.1]))
+    closed = estimate(end, LEFT, openings=np.array([1.0, 0.1]))
     assert closed.probability <= 0.1
     assert any('gripper is still closed' in reason for reason in closed.reasons)
-    assert estimate(end, LEFT, gripper_openings=np.array([1.0, 1.0])).probability > 0.8
+    assert estimate(end, LEFT, openings=np.array([1.0, 1.0])).probability > 0.8
 
 
 def assert_abstains(found, *words):
@@ -169,8 +96,8 @@ def assert_abstains(found, *words):
 
 
 def test_unknown_instruction_abstains_and_names_the_known_tasks():
-    found = estimate(RED, 'shake the bottle')
-    assert_abstains(found, 'shake the bottle', 'stack the {a} on the {b}')
+    found = estimate(RED, 'polish the bottle')
+    assert_abstains(found, 'polish the bottle', 'stack the {a} on the {b}')
     assert np.isfinite(found.jaccard).all()
 
 
@@ -191,8 +118,7 @@ def test_views_that_show_different_places_abstain():
     mixed = ObjectMasks(
         names=NAMES, masks=np.stack([one.masks[0], other.masks[1]]), status=one.status
     )
-    estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
-    found = estimator.estimate(mixed, masks([RED], [BLUE]), CAMERAS, POSES, LEFT)
+    found = judge(footage(mixed, masks([RED], [BLUE])))
     assert_abstains(found, 'views disagree')
 
 
@@ -202,8 +128,7 @@ def test_object_that_vanished_abstains():
     gone[:, 0, -4:] = False
     gone[:, 0, -4:, 30, 40] = True
     rollout = ObjectMasks(names=NAMES, masks=gone, status=rollout.status)
-    estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
-    found = estimator.estimate(rollout, masks([RED], [BLUE]), CAMERAS, POSES, LEFT)
+    found = judge(footage(rollout, masks([RED], [BLUE])))
     assert_abstains(found, 'vanished')
 
 
@@ -212,14 +137,14 @@ def test_single_view_abstains():
     rollout, start = (
         ObjectMasks(names=NAMES, masks=m.masks[:1], status=m.status[:1]) for m in (rollout, start)
     )
-    estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
-    found = estimator.estimate(rollout, start, CAMERAS[:1], POSES[:1], LEFT)
+    found = judge(footage(rollout, start, cameras=CAMERAS[:1], poses=POSES[:1]))
     assert_abstains(found, 'fewer than two views')
 
 
 def test_no_objects_abstain():
     empty = ObjectMasks(names=(), masks=np.zeros((2, 0, 3, 72, 96), bool), status=((), ()))
-    found = SuccessEstimator().estimate(empty, empty, CAMERAS, POSES, LEFT)
+    start = ObjectMasks(names=(), masks=empty.masks[:, :, :1], status=((), ()))
+    found = SuccessEstimator().estimate(footage(empty, start), LEFT).estimate
     assert_abstains(found, 'known: none')
     assert found.jaccard.shape == (2, 0)
 

@@ -1,0 +1,233 @@
+"""What is kept of a rollout from chunk to chunk: how it began, where the objects went, grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
+from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.localise import centroids, locate
+
+#: frames whose places are kept; the start is kept whatever follows
+MAX_FRAMES = 2000
+#: grasps that are kept
+MAX_GRASPS = 64
+#: a gripper that closes by this share has grasped, one that opens by the other has let go
+CLOSES_BY, OPENS_BY = 0.15, 0.1
+#: a gripper less open than this at the start may hold something already
+HOLDING_BELOW = 0.8
+#: an object that shows this share of its largest area is not hidden
+UNHIDDEN_SHARE = 0.9
+
+
+class Grasp(NamedTuple):
+    """A gripper that closed.
+
+    Attributes:
+        arm: its index.
+        closed_at: (3,) where the tool was [m].
+        gaps_m: (O,) how far outside an object's last unhidden mask it was [m]; negative =
+            inside, NaN = not known. The largest over the views.
+        points: (O, 3) where the objects were last seen unhidden [m].
+        released_at: (3,) where it let go [m]; None = it has not.
+    """
+
+    arm: int
+    closed_at: FloatArray
+    gaps_m: FloatArray
+    points: FloatArray
+    released_at: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutMemory:
+    """Of V views, O objects, A arms and N frames so far.
+
+    Attributes:
+        start_masks: of the first frame of all (T = 1).
+        start_poses: (V, 4, 4) T_base_camera then.
+        points: (O, N, 3) centres, NaN where fewer than two views know one [m].
+        leans: (V, O, N) angles of the masks' long axes in the image [rad].
+        seen_masks: (V, O, H, W) last masks in which an object was not hidden.
+        seen_points: (O, 3) where it was then [m].
+        largest: (V, O) largest area of each mask so far [px].
+        grasps: in order.
+        levels: (A,) opening since which a gripper's closing or opening counts.
+        closed: (A,) whether a gripper has closed since it last opened.
+    """
+
+    start_masks: ObjectMasks
+    start_poses: FloatArray
+    points: FloatArray
+    leans: FloatArray
+    seen_masks: BoolArray
+    seen_points: FloatArray
+    largest: FloatArray
+    grasps: tuple[Grasp, ...] = ()
+    levels: FloatArray | None = None
+    closed: BoolArray | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """O names."""
+        return self.start_masks.names
+
+    def start_point(self, item: int) -> FloatArray:
+        """Returns where an object was in the first frame of all (3,) [m], NaN = not known."""
+        return self.points[item, 0]
+
+
+def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
+    """Returns the memory after a chunk.
+
+    Args:
+        memory: before it; None = the chunk is the first, as it is where the objects have changed.
+        footage: the chunk.
+    """
+    if memory is None or memory.names != footage.masks.names:
+        memory = _begin(footage)
+    for frame in range(1, footage.num_frames + 1):
+        memory = _followed(memory, footage, frame)
+    return memory
+
+
+def _begin(footage: Footage) -> RolloutMemory:
+    masks = footage.frame_masks(0)
+    points, leans = _points(footage, 0), _leans(masks, footage.known(0))
+    memory = RolloutMemory(
+        start_masks=footage.start_masks,
+        start_poses=footage.poses[:, 0],
+        points=points[:, None],
+        leans=leans[:, :, None],
+        seen_masks=masks,
+        seen_points=points,
+        largest=masks.sum((-2, -1)).astype(np.float64),
+    )
+    if footage.openings is None or footage.tools is None:
+        return memory
+    openings = footage.openings[:, 0]
+    closed = openings < HOLDING_BELOW
+    memory = replace(memory, levels=openings.copy(), closed=closed)
+    for arm in np.flatnonzero(closed):
+        memory = _grasped(memory, footage, 0, int(arm))
+    return memory
+
+
+def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMemory:
+    """The memory after one more frame."""
+    if footage.openings is not None and footage.tools is not None and memory.levels is not None:
+        for arm, opening in enumerate(footage.openings[:, frame]):
+            memory = _with_gripper(memory, footage, frame, arm, float(opening))
+    masks, known = footage.frame_masks(frame), footage.known(frame)
+    points, area = _points(footage, frame), masks.sum((-2, -1)).astype(np.float64)
+    largest = np.maximum(memory.largest, np.where(known, area, 0.0))
+    unhidden = known.all(0) & (area >= UNHIDDEN_SHARE * largest).all(0)
+    unhidden &= np.isfinite(points[:, 0])
+    trail = np.concatenate([memory.points, points[:, None]], axis=1)
+    leans = np.concatenate([memory.leans, _leans(masks, known)[:, :, None]], axis=2)
+    if trail.shape[1] > MAX_FRAMES:  # drops the oldest but the start
+        trail, leans = np.delete(trail, 1, axis=1), np.delete(leans, 1, axis=2)
+    return replace(
+        memory,
+        points=trail,
+        leans=leans,
+        largest=largest,
+        seen_masks=np.where(unhidden[None, :, None, None], masks, memory.seen_masks),
+        seen_points=np.where(unhidden[:, None], points, memory.seen_points),
+    )
+
+
+def _with_gripper(
+    memory: RolloutMemory, footage: Footage, frame: int, arm: int, opening: float
+) -> RolloutMemory:
+    """The memory after a gripper's opening in one more frame."""
+    assert memory.levels is not None and memory.closed is not None and footage.tools is not None
+    levels, closed = memory.levels.copy(), memory.closed.copy()
+    level = levels[arm]
+    memory = replace(memory, levels=levels, closed=closed)
+    if opening < level - CLOSES_BY:
+        levels[arm], closed[arm] = opening, True
+        return _grasped(memory, footage, frame, arm)
+    if closed[arm] and opening > level + OPENS_BY:
+        levels[arm], closed[arm] = opening, False
+        return _released(memory, arm, footage.tools[arm, frame])
+    levels[arm] = min(level, opening) if closed[arm] else max(level, opening)
+    return memory
+
+
+def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> RolloutMemory:
+    assert footage.tools is not None
+    tool = footage.tools[arm, frame]
+    gaps = np.array(
+        [
+            _gap(footage.cameras, footage.poses[:, frame], masks, tool)
+            for masks in memory.seen_masks.swapaxes(0, 1)
+        ]
+    )
+    grasp = Grasp(arm, tool, gaps, memory.seen_points.copy())
+    return replace(memory, grasps=(*memory.grasps, grasp)[-MAX_GRASPS:])
+
+
+def _released(memory: RolloutMemory, arm: int, tool: FloatArray) -> RolloutMemory:
+    """All grasps of the arm that still hold end here: it closes in steps."""
+    ended = tuple(
+        grasp._replace(released_at=tool)
+        if grasp.arm == arm and grasp.released_at is None
+        else grasp
+        for grasp in memory.grasps
+    )
+    return replace(memory, grasps=ended)
+
+
+def _gap(
+    cameras: Sequence[CameraModel], poses: FloatArray, masks: BoolArray, tool: FloatArray
+) -> float:
+    """How far the tool is outside an object's (V, H, W) masks [m]; the largest over the views."""
+    gaps = []
+    for camera, pose, mask in zip(cameras, poses, masks, strict=True):
+        pixel, depth = project(camera, pose, tool)
+        if not mask.any() or not np.isfinite(pixel).all():
+            continue
+        gaps.append(_outside_px(mask, pixel) * float(depth) / camera.K[0, 0])
+    return max(gaps, default=float('nan'))
+
+
+def _outside_px(mask: BoolArray, pixel: FloatArray) -> float:
+    """Distance of a pixel from the mask's edge [px], negative inside."""
+    x, y = pixel
+    height, width = mask.shape
+    inside = 0 <= round(x) < width and 0 <= round(y) < height and mask[round(y), round(x)]
+    rows, columns = np.nonzero(~np.pad(mask, 1) if inside else mask)
+    shift = 1 if inside else 0
+    nearest = float(np.hypot(columns - shift - x, rows - shift - y).min())
+    return 0.5 - nearest if inside else nearest - 0.5
+
+
+def _points(footage: Footage, frame: int) -> FloatArray:
+    """(O, 3) centres, NaN where fewer than two views know one."""
+    pixels = np.where(
+        footage.known(frame)[..., None], centroids(footage.frame_masks(frame)), np.nan
+    )
+    points = np.full((pixels.shape[1], 3), np.nan)
+    for item in range(pixels.shape[1]):
+        found = locate(footage.cameras, tuple(footage.poses[:, frame]), pixels[:, item])
+        if found is not None:
+            points[item] = found.point
+    return points
+
+
+def _leans(masks: BoolArray, known: BoolArray) -> FloatArray:
+    """(V, O) angles of the long axes from the image's vertical, in (-pi/2, pi/2] [rad]."""
+    leans = np.full(masks.shape[:2], np.nan)
+    for view, item in zip(*np.nonzero(known), strict=True):
+        moments = cv2.moments(masks[view, item].astype(np.uint8), binaryImage=True)
+        leans[view, item] = 0.5 * np.arctan2(
+            -2 * moments['mu11'], moments['mu02'] - moments['mu20']
+        )
+    return leans

@@ -1,0 +1,216 @@
+"""Masks of a rollout in calibrated views: which are known, where objects are, J with a goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.jaccard import jaccard
+from mtv_world_ros.success.localise import centroids, locate, Location, moved_mask
+from mtv_world_ros.success.relations import CannotTell
+from mtv_world_ros.success.rollout_memory import RolloutMemory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvidenceConfig:
+    """When masks are not enough.
+
+    Attributes:
+        last_frames: frames at the end whose median counts.
+        max_residual: largest miss of the views' rays, as a share of the image's diagonal.
+        max_disagreement: largest difference between views of the subject's J with its goal.
+        min_visible: smallest area of the subject at the end, as a share of its largest.
+        hidden_below: an object that shows less than this share of its last unhidden area, and
+            lies within that mask, is taken to stand where it stood then.
+    """
+
+    last_frames: int = 3
+    max_residual: float = 0.02
+    max_disagreement: float = 0.7
+    min_visible: float = 0.3
+    hidden_below: float = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Views:
+    """The last chunk of a rollout, and what is remembered of the rollout.
+
+    Attributes:
+        footage: the last chunk.
+        memory: of the rollout, with this chunk.
+        used: names of the views to look at; empty = all.
+        config: limits.
+    """
+
+    footage: Footage
+    memory: RolloutMemory
+    used: tuple[str, ...]
+    config: EvidenceConfig
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return self.footage.masks.names
+
+    def index(self, name: str) -> int:
+        """Returns the object's index.
+
+        Raises:
+            CannotTell: it has no mask.
+        """
+        if name not in self.names:
+            raise CannotTell(f"'{name}' is not among the objects {list(self.names)}")
+        return self.names.index(name)
+
+    def _is_used(self) -> BoolArray:
+        """(V,) whether a view is looked at."""
+        views = [camera.view for camera in self.footage.cameras]
+        return np.array([not self.used or view in self.used for view in views])
+
+    def start_mask(self, item: int) -> BoolArray:
+        """Returns the (V, H, W) masks of one object in the rollout's first frame."""
+        return self.memory.start_masks.masks[:, item, 0]
+
+    def start_ok(self, item: int) -> BoolArray:
+        """Returns (V,) whether that mask is to be trusted."""
+        ok = np.array([row[item] == 'ok' for row in self.memory.start_masks.status])
+        return ok & self._is_used()
+
+    def end_ok(self, item: int) -> BoolArray:
+        """Returns (V,) whether the object is known, and seen in the last frame."""
+        return self.footage.known(self.footage.num_frames)[:, item] & self._is_used()
+
+    def start_jaccard(self, item: int) -> FloatArray:
+        """Returns (V,) J of the last masks with the start mask, NaN where either is not known."""
+        return self._jaccard(item, self.start_mask(item))
+
+    def goal_masks(self, item: int, goal: FloatArray) -> BoolArray | None:
+        """Returns (V, H, W) start masks moved to `goal` (3,); None = its start is not known."""
+        start = self.memory.start_point(item)
+        if not np.isfinite(start).all():
+            return None
+        moved = [
+            moved_mask(mask, camera, poses[-1], start, goal)
+            for mask, camera, poses in zip(
+                self.start_mask(item), self.footage.cameras, self.footage.poses, strict=True
+            )
+        ]
+        return np.stack(moved)
+
+    def goal_jaccard(self, item: int, goals: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Returns (V,) J of the last masks, and of the start masks, with (V, H, W) goal masks.
+
+        Raises:
+            CannotTell: the views disagree.
+        """
+        scores = self._jaccard(item, goals)
+        known = scores[np.isfinite(scores)]
+        if len(known) > 1 and np.ptp(known) > self.config.max_disagreement:
+            raise CannotTell(
+                'the views disagree: J with the goal mask is '
+                + ', '.join(f'{value:.2f}' for value in known)
+            )
+        first = jaccard(self.start_mask(item), goals)
+        return scores, np.where(np.isfinite(scores), first, np.nan)
+
+    def _jaccard(self, item: int, reference: BoolArray) -> FloatArray:
+        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        scores = np.median(jaccard(masks, reference[:, None]), axis=1)
+        return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
+
+    def containment(self, item: int, within: int) -> float:
+        """Returns the share of an object's mask in another's last unhidden one; the least."""
+        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        both = masks & self.memory.seen_masks[:, within, None]
+        area = np.maximum(masks.sum((-2, -1)), 1)
+        shares = np.median(both.sum((-2, -1)) / area, axis=1)
+        known = self.end_ok(item) & self.start_ok(within)
+        return float(shares[known].min()) if known.any() else float('nan')
+
+    def check_visible(self, item: int) -> None:
+        """Refuses an object that has all but vanished in every view that knows it.
+
+        Raises:
+            CannotTell: it has.
+        """
+        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        last = np.median(masks.sum((-2, -1)), axis=1)
+        known, largest = self.end_ok(item), self.memory.largest[:, item]
+        if known.any() and (last[known] < self.config.min_visible * largest[known]).all():
+            share = float(np.max(last[known] / largest[known]))
+            raise CannotTell(f"'{self.names[item]}' has vanished: {share:.0%} of its area is left")
+
+    def end(self, item: int) -> tuple[Location, bool]:
+        """Returns where the object is at the end, and whether it is hidden where it stood.
+
+        Raises:
+            CannotTell: it is lost, or the views' rays miss each other.
+        """
+        point = self.memory.seen_points[item]
+        if np.isfinite(point).all() and self._is_hidden_in_place(item):
+            return Location(point=point, residual_px=0.0, sigma_m=self._sigma(item)), True
+        return self._located(item), False
+
+    def _located(self, item: int) -> Location:
+        footage, last = self.footage, self.config.last_frames
+        pixels = np.array(
+            [_median_known(view) for view in centroids(footage.masks.masks[:, item, -last:])]
+        )
+        known = self.end_ok(item)
+        pixels[~known] = np.nan
+        found = locate(footage.cameras, tuple(footage.poses[:, -1]), pixels)
+        name = self.names[item]
+        if found is None:
+            raise CannotTell(
+                f"'{name}' is known in fewer than two views ({self._unknown(item) or 'one view'})"
+            )
+        camera = footage.cameras[0]
+        limit = self.config.max_residual * float(np.hypot(camera.width, camera.height))
+        if found.residual_px > limit:
+            raise CannotTell(
+                f"the views disagree on where '{name}' is: their rays miss each other by "
+                f'{found.residual_px:.1f} px, more than {limit:.1f}'
+            )
+        return found
+
+    def _unknown(self, item: int) -> str:
+        """Why views do not know where the object is."""
+        words = []
+        for camera, row, ok, used in zip(
+            self.footage.cameras,
+            self.footage.masks.status,
+            self.end_ok(item),
+            self._is_used(),
+            strict=True,
+        ):
+            if not ok:
+                word = row[item] if row[item] != 'ok' else 'lost at the end'
+                words.append(f'{camera.view}: {word if used else "not used by the task"}')
+        return ', '.join(words)
+
+    def _is_hidden_in_place(self, item: int) -> bool:
+        """Whether some view shows less of it than before, and none shows it elsewhere."""
+        seen, last = self.memory.seen_masks[:, item], self.footage.masks.masks[:, item, -1]
+        area, seen_area = last.sum((-2, -1)), seen.sum((-2, -1))
+        inside = (seen & last).sum((-2, -1))
+        hidden = self.start_ok(item) & (area < self.config.hidden_below * seen_area)
+        elsewhere = inside < 0.6 * area
+        return bool(hidden.any() and not elsewhere.any())
+
+    def _sigma(self, item: int) -> float:
+        """Standard error of where it was last seen [m]."""
+        found = locate(
+            self.footage.cameras,
+            tuple(self.footage.poses[:, -1]),
+            centroids(self.memory.seen_masks[:, item]),
+        )
+        return found.sigma_m if found is not None else float('nan')
+
+
+def _median_known(pixels: FloatArray) -> FloatArray:
+    """(2,) median of the rows that are known, NaN if none is."""
+    known = pixels[np.isfinite(pixels[:, 0])]
+    return np.median(known, axis=0) if len(known) else np.full(2, np.nan)
