@@ -23,7 +23,7 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ObservationError
-from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.prediction import Prediction
@@ -34,7 +34,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.estimator import SuccessEstimator
-from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.footage import footage_of
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.segmenter import Segmenter
 
@@ -213,7 +213,9 @@ class Pipeline:
             start_frame=start.frames,
             positions=positions[1 : num_kept + 1],
         )
-        footage = self._footage(start.cameras, positions[: num_kept + 1], start_masks, masks)
+        footage = footage_of(
+            self.robot, start.cameras, positions[: num_kept + 1], start_masks, masks
+        )
         success, memory = self.estimator.estimate(footage, request.instruction, memory)
         clock.lap('success')
         return {
@@ -225,23 +227,6 @@ class Pipeline:
             'memory': memory,
             'seconds': MappingProxyType(clock.seconds),
         }
-
-    def _footage(
-        self,
-        cameras: tuple[CameraModel, ...],
-        positions: FloatArray,
-        start_masks: ObjectMasks,
-        masks: ObjectMasks,
-    ) -> Footage:
-        """What the estimator is shown; positions (1 + T, J), row 0 at the start masks."""
-        return Footage(
-            masks=masks,
-            start_masks=start_masks,
-            cameras=cameras,
-            poses=np.stack([camera_poses(camera, self.robot, positions) for camera in cameras]),
-            tools=self.robot.tool_poses(positions)[..., :3, 3],
-            openings=self.robot.gripper_openings(positions),
-        )
 
     def draw(
         self,

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
+from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.robot import RobotModel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,3 +47,21 @@ class Footage:
         ok = np.array([[word == 'ok' for word in row] for row in status], np.bool_)
         masks = self.frame_masks(frame)
         return ok.reshape(masks.shape[:2]) & masks.any((-2, -1))
+
+
+def footage_of(
+    robot: RobotModel,
+    cameras: Sequence[CameraModel],
+    positions: FloatArray,
+    start_masks: ObjectMasks,
+    masks: ObjectMasks,
+) -> Footage:
+    """Returns the footage of a chunk at joint positions (1 + T, J), row 0 at the start masks."""
+    return Footage(
+        masks=masks,
+        start_masks=start_masks,
+        cameras=cameras,
+        poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
+        tools=robot.tool_poses(positions)[..., :3, 3],
+        openings=robot.gripper_openings(positions),
+    )
