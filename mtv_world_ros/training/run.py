@@ -160,6 +160,8 @@ def train(
         resumed = trainer.load_state()
     if initial is not None and not resumed:
         trainer.start_from(initial)
+    if resumed and processes.is_main and _steps_of(out / 'checkpoint') != trainer.step:
+        trainer.export(out / 'checkpoint')  # killed after the state was saved
     if processes.is_main:
         (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
         tqdm.write(
@@ -172,6 +174,12 @@ def train(
     finally:
         source.close()
     return out / 'checkpoint'
+
+
+def _steps_of(checkpoint: Path) -> int | None:
+    """Steps that a checkpoint was trained for; None where there is none."""
+    card = checkpoint / 'world_model.json'
+    return json.loads(card.read_text())['trained_on']['steps'] if card.is_file() else None
 
 
 def _loop(trainer: Trainer, source: BatchSource, save_every: int) -> None:

@@ -1,0 +1,84 @@
+"""Trains once undisturbed and once with kills; processes are forked, so that torch loads once.
+
+    python train_killed.py OUT EPISODES PRESET
+
+OUT gets `whole/`, `killed/` and `kills.json`: when each kill came.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import random
+import signal
+import sys
+import time
+
+import torch
+
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.resources import share_path
+from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.run import train
+
+_KILLS = 6
+
+
+def start(out: Path, episodes: Path, preset: Path) -> int:
+    """Trains in a process of its own and returns its id."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        torch.set_num_threads(1)
+        robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+        config = load_training_config(preset)
+        segmenter = ColourSegmenter()
+        train(config, episodes, out, robot=robot, segmenter=segmenter, save_every=3)
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def finished(child: int) -> bool:
+    """Whether a process ended, which it must have done well."""
+    done, status = os.waitpid(child, os.WNOHANG)
+    assert not done or status == 0, status
+    return bool(done)
+
+
+def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
+    """Kills a process some seconds after it began to step, or then while it writes its state."""
+    first = out / 'state' / 'state.json'
+    before = first.stat().st_mtime_ns if first.exists() else 0
+    while not first.exists() or first.stat().st_mtime_ns == before:
+        if finished(child):
+            return None
+        time.sleep(0.001)
+    time.sleep(after)
+    while saving and not (out / 'state.partial').exists():
+        if finished(child):
+            return None
+    if finished(child):
+        return None
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return f'{"saving" if saving else "anywhere"}: {sorted(p.name for p in out.iterdir())}'
+
+
+if __name__ == '__main__':
+    folder, bags, file = (Path(argument) for argument in sys.argv[1:])
+    random.seed(0)
+    kills = []
+    for number in range(_KILLS):
+        process = start(folder / 'killed', bags, file)
+        moment = random.random() * 0.15
+        told = kill(process, folder / 'killed', saving=number % 2 == 1, after=moment)
+        kills += [told] if told else []
+    for name in ('killed', 'whole'):
+        process = start(folder / name, bags, file)
+        assert os.waitpid(process, 0)[1] == 0
+    (folder / 'kills.json').write_text(json.dumps(kills))
