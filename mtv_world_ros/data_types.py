@@ -284,6 +284,7 @@ class WorldModelSpec:
         height: frame height [px].
         robot: name of the robot it was trained with.
         num_inference_steps: denoising steps it is made for.
+        num_history: most frames before the start frame that it makes use of.
     """
 
     views: tuple[str, ...]
@@ -293,6 +294,7 @@ class WorldModelSpec:
     height: int
     robot: str
     num_inference_steps: int = 4
+    num_history: int = 0
 
     @property
     def chunk_seconds(self) -> float:

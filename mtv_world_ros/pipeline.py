@@ -26,6 +26,7 @@ from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.history import fit_history, History
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
@@ -56,6 +57,7 @@ class WorldModel(Protocol):
         seed: int,
         num_inference_steps: int,
         should_stop: Callable[[], bool],
+        history: History | None = None,
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB predicted frames.
 
@@ -68,6 +70,7 @@ class WorldModel(Protocol):
             seed: seed of the noise.
             num_inference_steps: denoising steps.
             should_stop: asked between steps.
+            history: what of the rollout comes before the start frame; None = it begins there.
 
         Raises:
             RolloutPreempted: `should_stop` said so.
@@ -129,6 +132,7 @@ class Pipeline:
         num_inference_steps: int = 0,
         should_stop: Callable[[], bool] = _never,
         memory: RolloutMemory | None = None,
+        history: History | None = None,
     ) -> Iterator[Prediction]:
         """Yields the predicted chunks, each as soon as it is ready.
 
@@ -141,10 +145,12 @@ class Pipeline:
             should_stop: asked between denoising steps.
             memory: of the prediction that the observation is the end of, where it is one: the
                 estimate is about the whole, from its first observation on.
+            history: `end_history` of the prediction that the observation is the end of; None = a
+                rollout begins.
 
         Raises:
             TrajectoryError: the trajectory does not fit the robot.
-            ObservationError: the views are not the model's.
+            ObservationError: the views are not the model's, or the history is of another size.
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
@@ -153,6 +159,7 @@ class Pipeline:
         total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
         num_chunks = ceil(total / spec.num_frames)
         start = fit_observation(observation, spec)
+        past = (memory, fit_history(history, start))
         names = self.objects or objects_from_instruction(instruction)
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
         positions = resample(trajectory, observation.positions, times)
@@ -163,7 +170,7 @@ class Pipeline:
             window = slice(first, first + spec.num_frames + 1)
             num_kept = min(spec.num_frames, total - first)
             parts = self._imagine_chunk(
-                start, times[window], positions[window], num_kept, request, seed + chunk, memory
+                start, times[window], positions[window], num_kept, request, seed + chunk, past
             )
             prediction = Prediction(
                 **parts,
@@ -175,7 +182,8 @@ class Pipeline:
                 num_inference_steps=num_steps,
             )
             yield prediction
-            start, memory = prediction.end_observation, prediction.memory
+            start = prediction.end_observation
+            past = (prediction.memory, prediction.end_history)
 
     def _imagine_chunk(
         self,
@@ -185,10 +193,10 @@ class Pipeline:
         num_kept: int,
         request: _Request,
         seed: int,
-        memory: RolloutMemory | None,
+        past: tuple[RolloutMemory | None, History],
     ) -> dict[str, Any]:
         """What is made of one chunk: fields of `Prediction`."""
-        clock = _Clock()
+        clock, (memory, history) = _Clock(), past
         start_masks = self.segmenter.segment(start.frames[:, None], request.names)
         clock.lap('start masks')
         control = self.draw(start.cameras, positions, times, start_masks)
@@ -200,6 +208,7 @@ class Pipeline:
             seed=seed,
             num_inference_steps=request.num_inference_steps,
             should_stop=request.should_stop,
+            history=history,
         )[:, :num_kept]
         clock.lap('model')
         first = start_masks.masks[:, :, 0]
@@ -225,6 +234,7 @@ class Pipeline:
             'masks': masks,
             'success': success,
             'memory': memory,
+            'end_history': history.after(start.frames, frames, self.spec.num_history),
             'seconds': MappingProxyType(clock.seconds),
         }
 

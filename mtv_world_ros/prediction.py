@@ -14,6 +14,7 @@ from mtv_world_ros.data_types import (
     Rollout,
     SuccessEstimate,
 )
+from mtv_world_ros.history import History
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 
@@ -32,6 +33,7 @@ class Prediction:
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
         memory: what the estimate remembers of the rollout, for what is chained onto this chunk.
+        end_history: what comes before `end_observation`, for chaining the next chunk onto it.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
         seconds: time spent by stage [s].
@@ -47,6 +49,7 @@ class Prediction:
     chunk: int
     num_chunks: int
     memory: RolloutMemory
+    end_history: History
     segmenter: str = ''
     num_inference_steps: int = 0
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))

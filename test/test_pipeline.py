@@ -13,6 +13,7 @@ from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpe
 from mtv_world_ros.errors import CheckpointError, ObservationError, TrajectoryError
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.resources import share_path
 
@@ -30,8 +31,10 @@ class CountingWorldModel(PersistenceWorldModel):
         self.trajectories: list[np.ndarray] = []
         self.seeds: list[int] = []
         self.num_steps: list[int] = []
+        self.histories: list[History] = []
 
-    def predict(self, start_frame, trajectory_frames, *, seed, **options):
+    def predict(self, start_frame, trajectory_frames, *, seed, history, **options):
+        self.histories.append(history)
         self.trajectories.append(trajectory_frames)
         self.seeds.append(seed)
         self.num_steps.append(options['num_inference_steps'])
@@ -122,6 +125,55 @@ def test_chunks_of_one_rollout_have_seeds_of_their_own(
 ) -> None:
     imagine(pipeline, recording, 3.2, seed=7)
     assert world_model.seeds == [7, 8]
+
+
+@pytest.mark.parametrize('num_history', [0, 5, 12])
+def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anchor(
+    recording: Recording, num_history: int
+) -> None:
+    model = CountingWorldModel(replace(SPEC, num_history=num_history))
+    chunks = imagine(assemble(CARD, model), recording, 4.8)
+    first = recording.frames[:, 0]
+    shown = np.concatenate([first[:, None], *(c.rollout.video.frames for c in chunks)], axis=1)
+    assert len(model.histories) == 3
+    for chunk, history in enumerate(model.histories):
+        start = 8 * chunk  # the frame that the chunk starts from is no part of its history
+        assert np.array_equal(history.frames, shown[:, max(start - num_history, 0) : start])
+        assert np.array_equal(history.anchor, first)
+
+
+def test_a_rollout_that_goes_on_is_the_one_that_never_stopped(recording: Recording) -> None:
+    """Chunks asked for one by one: the clock, the history and the anchor are those of one."""
+    model = CountingWorldModel(replace(SPEC, num_history=5))
+    pipeline = assemble(CARD, model)
+    whole = imagine(pipeline, recording, 4.8)
+    seen, history, parts = observe(recording), None, []
+    asked = commands(recording, 4.8)
+    for chunk in range(3):
+        mine = (asked.times > 1.6 * chunk + 1e-6) & (asked.times <= 1.6 * (chunk + 1) + 1e-6)
+        trajectory = JointTrajectory(
+            joint_names=asked.joint_names,
+            times=asked.times[mine] - 1.6 * chunk,
+            positions=asked.positions[mine],
+        )
+        (part,) = pipeline.imagine(
+            seen, trajectory, instruction=recording.instruction, history=history
+        )
+        seen, history = part.end_observation, part.end_history
+        parts.append(part)
+    for one, other in zip(parts, whole, strict=True):
+        assert np.array_equal(one.rollout.video.frames, other.rollout.video.frames)
+        assert one.end_observation.stamp_ns == other.end_observation.stamp_ns
+        np.testing.assert_allclose(one.rollout.positions, other.rollout.positions, atol=1e-9)
+    for one, other in zip(model.histories[3:], model.histories[:3], strict=True):
+        assert np.array_equal(one.frames, other.frames)
+        assert np.array_equal(one.anchor, other.anchor)
+
+
+def test_a_history_of_another_size_is_refused(pipeline: Pipeline, recording: Recording) -> None:
+    other = History.begin(np.zeros((2, 24, 32, 3), np.uint8))
+    with pytest.raises(ObservationError, match=r'\(2, 24, 32, 3\).*\(2, 48, 64, 3\)'):
+        list(pipeline.imagine(observe(recording), commands(recording, 1.6), history=other))
 
 
 def test_control_frame_zero_shows_the_observed_state(

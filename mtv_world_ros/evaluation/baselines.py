@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, FloatArray, WorldModelSpec
+from mtv_world_ros.history import History
 
 
 class PersistenceWorldModel:
@@ -24,8 +25,9 @@ class PersistenceWorldModel:
         seed: int,
         num_inference_steps: int,
         should_stop: Callable[[], bool],
+        history: History | None = None,
     ) -> ByteArray:
         """Returns the start frame T times; see `pipeline.WorldModel.predict`."""
-        del positions, seed, num_inference_steps, should_stop
+        del positions, seed, num_inference_steps, should_stop, history
         num_frames = trajectory_frames.shape[1] - 1
         return np.repeat(start_frame[:, None], num_frames, axis=1)

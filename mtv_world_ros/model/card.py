@@ -24,13 +24,14 @@ _CARD_KEYS = {
     'rendering': dict,
     'trained_on': dict,
 }
-#: what only models with text need: the instruction, what to keep away from and how strongly; and
-#: the denoising steps that a distilled model is made for
+#: what only models with text need: the instruction, what to keep away from and how strongly; the
+#: denoising steps that a distilled model is made for; and `history.HistorySettings`
 _OPTIONAL_KEYS = {
     'prompt': str,
     'negative_prompt': str,
     'guidance_scale': (int, float),
     'num_inference_steps': int,
+    'history': dict,
 }
 
 
@@ -64,6 +65,7 @@ def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
         height=card['height'],
         robot=card['robot'],
         num_inference_steps=card.get('num_inference_steps', 4),
+        num_history=card.get('history', {}).get('num_frames', 0),
     )
 
 

@@ -27,6 +27,9 @@ class Conditioning:
         text: (B, 512, text_dim) umT5 tokens of the prompt, in models with text.
         negative_text: the same of what guidance leads away from; None = no guidance.
         image: (B, V * 257, image_dim) CLIP tokens of the start image.
+        anchor: (B, V, C, h, w) of the rollout's first frame, where reference tokens show that.
+        history: (B, V, C, P, h, w) of what was seen before, in models that take it.
+        history_sigmas: (B,) noise levels of the history, 1 = there is none.
     """
 
     control: Tensor
@@ -37,6 +40,21 @@ class Conditioning:
     text: Tensor | None = None
     negative_text: Tensor | None = None
     image: Tensor | None = None
+    anchor: Tensor | None = None
+    history: Tensor | None = None
+    history_sigmas: Tensor | None = None
+
+    def with_noisy_history(self, noise: Tensor) -> Conditioning:
+        """Returns the same with noise (B, V, C, P, h, w) mixed into the clean history."""
+        assert self.history is not None and self.history_sigmas is not None
+        sigma = self.history_sigmas.reshape(-1, 1, 1, 1, 1, 1)
+        noisy = (1 - sigma) * self.history.float() + sigma * noise
+        return replace(self, history=noisy.to(self.history.dtype))
+
+    @property
+    def history_timestep(self) -> Tensor | None:
+        """(B,) in [0, 1000], as the transformer takes it."""
+        return None if self.history_sigmas is None else 1000 * self.history_sigmas
 
     def repeated(self, count: int) -> Conditioning:
         """Returns the same for `count` samples, where it is for one."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from diffusers.models.transformers.transformer_wan import WanRotaryPosEmbed
 import torch
 from torch import Tensor
@@ -38,42 +40,71 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
             )
         self.view_offset = view_offset
 
-    def forward(self, hidden_states: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, hidden_states: Tensor, times: Sequence[int] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Returns cosines and sines, each (1, V*F*h*w, 1, head_dim).
 
         Args:
             hidden_states: a (B, V, F, h, w, D) token grid; only its shape is read.
+            times: F increasing times of the grid's frames; those before the rollout's video are
+                negative. Default: 0 .. F-1.
         """
         _, num_views, num_frames, height, width, _ = hidden_states.shape
-        self._check_size(num_views, num_frames, height, width)
+        places = self._times(num_views, tuple(times or range(num_frames)))
+        self._check_size(num_views, places, height, width)
+        cos, sin = self.get_buffer('freqs_cos'), self.get_buffer('freqs_sin')
+        # cosines are even, sines odd: a turn by -t undoes one by t
         return (
-            self._table(self.get_buffer('freqs_cos'), num_views, num_frames, height, width),
-            self._table(self.get_buffer('freqs_sin'), num_views, num_frames, height, width),
+            self._table(cos, _rows(cos[:, : self.t_dim], places, 1), height, width),
+            self._table(sin, _rows(sin[:, : self.t_dim], places, -1), height, width),
         )
 
-    def _check_size(self, v: int, f: int, h: int, w: int) -> None:
-        along = {'width': (f, v * w), 'time': (v * f, w), 'none': (f, w)}[self.view_offset]
-        largest = max(*along, h)
+    def _times(self, num_views: int, times: tuple[int, ...]) -> list[list[int]]:
+        """V rows of F times: the views' own; those of the video are the same whatever is before.
+
+        With an offset in time the views' videos follow one another, and what is before the video
+        stands before all of them.
+        """
+        if self.view_offset != 'time':
+            return [list(times) for _ in range(num_views)]
+        after, before = max(times) + 1, max(0, -min(times))
+        return [
+            [t + v * after if t >= 0 else t - (num_views - 1 - v) * before for t in times]
+            for v in range(num_views)
+        ]
+
+    def _check_size(self, v: int, times: list[list[int]], h: int, w: int) -> None:
+        f = 1 + max(abs(t) for row in times for t in row)
+        largest = max(f, v * w if self.view_offset == 'width' else w, h)
         if largest > self.max_seq_len:
             raise CheckpointError(
-                f'{v} views of {f} x {h} x {w} tokens reach position {largest}, the model has '
-                f'{self.max_seq_len}; use fewer or smaller frames, or raise '
+                f'{v} views of {len(times[0])} x {h} x {w} tokens reach position {largest}, the '
+                f'model has {self.max_seq_len}; use fewer or smaller frames, or raise '
                 'transformer.rope_max_seq_len'
             )
 
-    def _table(self, freqs: Tensor, v: int, f: int, h: int, w: int) -> Tensor:
-        time, row, column = freqs.split([self.t_dim, self.h_dim, self.w_dim], dim=1)
+    def _table(self, freqs: Tensor, frames: Tensor, h: int, w: int) -> Tensor:
+        """The angles of a (V, F, h, w) grid; frames (V, F, t_dim) are those of time."""
+        v, f, _ = frames.shape
+        _, row, column = freqs.split([self.t_dim, self.h_dim, self.w_dim], dim=1)
         if self.view_offset == 'width':
             columns = column[: v * w].view(v, 1, 1, w, -1)
         else:
             columns = column[:w].view(1, 1, 1, w, -1)
-        if self.view_offset == 'time':
-            frames = time[: v * f].view(v, f, 1, 1, -1)
-        else:
-            frames = time[:f].view(1, f, 1, 1, -1)
         table = [
-            frames.expand(v, f, h, w, -1),
+            frames.view(v, f, 1, 1, -1).expand(v, f, h, w, -1),
             row[:h].view(1, 1, h, 1, -1).expand(v, f, h, w, -1),
             columns.expand(v, f, h, w, -1),
         ]
         return torch.cat(table, dim=-1).reshape(1, v * f * h * w, 1, -1)
+
+
+def _rows(table: Tensor, places: list[list[int]], sign: int) -> Tensor:
+    """(V, F, D) rows of a table (N, D); those of negative places times the sign.
+
+    Cut out, not indexed with a tensor: that would have to be copied to the device first.
+    """
+    return torch.stack(
+        [torch.stack([table[t] if t >= 0 else sign * table[-t] for t in row]) for row in places]
+    )

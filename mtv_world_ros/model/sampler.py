@@ -60,9 +60,12 @@ def sample_latents(
     """
     shape = conditioning.control.shape[1:]
     device = conditioning.control.device
-    noise = [torch.randn(1, *shape, generator=torch.Generator().manual_seed(s)) for s in seeds]
-    latents = torch.cat(noise).to(device)
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    latents = _noise(generators, shape).to(device)
     conditioning = conditioning.repeated(len(seeds))
+    if conditioning.history is not None:
+        noise = _noise(generators, conditioning.history.shape[1:])
+        conditioning = conditioning.with_noisy_history(noise.to(device))
     set_timesteps(scheduler, num_inference_steps, device)
     timesteps: Any = scheduler.timesteps  # the stubs are looser than the schedulers
     sigmas: Any = scheduler.sigmas
@@ -80,6 +83,11 @@ def sample_latents(
         flow = flow_of(transformer, out, latents, sigmas[step].to(device))
         latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]  # type: ignore[arg-type]
     return latents
+
+
+def _noise(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
+    """(K, *shape) noise, a sample from each generator."""
+    return torch.cat([torch.randn(1, *shape, generator=generator) for generator in generators])
 
 
 def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.device) -> None:
@@ -108,4 +116,7 @@ def _predict(
         encoder_hidden_states=text,
         encoder_hidden_states_image=conditioning.image,
         actions=conditioning.actions,
+        anchor=conditioning.anchor,
+        history=conditioning.history,
+        history_timestep=conditioning.history_timestep,
     ).float()

@@ -1,7 +1,7 @@
 """The one diffusion transformer: Wan's, over all views in one token sequence.
 
 Shape letters: B batch, V views, C latent channels, F latent frames, H W latent size,
-f h w = token grid, S = V * (1 + f) * h * w tokens, D width.
+P latent frames of the history, f h w = token grid, D width; `token_grid.py` has the rest.
 """
 
 from __future__ import annotations
@@ -19,6 +19,19 @@ from mtv_world_ros.model.context import check_tokens, fit_cross_attention
 from mtv_world_ros.model.control import build_control
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.stem import ConvStem, ReferenceDecoder, ReferenceStem
+from mtv_world_ros.model.token_embedding import (
+    embed_history,
+    embed_reference,
+    embed_video,
+    unembed,
+)
+from mtv_world_ros.model.token_grid import (
+    arrange,
+    by_token,
+    check_start_image,
+    fit_context,
+    TokenGrid,
+)
 
 
 class MultiViewWanTransformer(WanTransformer3DModel):
@@ -27,6 +40,10 @@ class MultiViewWanTransformer(WanTransformer3DModel):
     Input channels per view are `cat[noisy | control | start image]`; reference latents pass
     through phi (`ref_conv`), are prepended in time and dropped again. The layout follows
     Wan2.1-Fun-Control with all views in one sequence (paper, Method).
+
+    A history, what was seen before the chunk, goes through the video's own stem with a noise level
+    of its own. In time it stands before the reference image, at negative times, so that the
+    video's are those of a chunk without history; its tokens are dropped like the reference's.
 
     Args (beyond the base class):
         latent_channels: C of the autoencoder.
@@ -42,6 +59,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             cross-attention also where `context` is `none`.
         action_dim: numbers an action, for controls other than `trajectory_video`.
         num_context_tokens: learned tokens in place of the text where `context` is `none`.
+        start_image: where the start image enters: `both`, as `reference` tokens alone, or in its
+            `channel` slot alone.
     """
 
     # number formats are chosen by whoever loads the model, in one place for all modules
@@ -77,6 +96,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         control: str = 'trajectory_video',
         action_dim: int = 0,
         num_context_tokens: int = 8,
+        start_image: str = 'both',
     ) -> None:
         super().__init__(
             patch_size=patch_size,
@@ -97,6 +117,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             pos_embed_seq_len=pos_embed_seq_len,
         )
         self.stem, self.prediction = stem, prediction
+        self.start_image = check_start_image(start_image)
         if stem == 'patch':  # as Wan was trained; bfloat16 is too coarse for angles and times
             self._keep_in_fp32_modules = ['rope', 'time_embedder', 'scale_shift_table']
         self.patch_size = tuple(patch_size)
@@ -151,6 +172,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         encoder_hidden_states_image: Tensor | None = None,
         actions: Tensor | None = None,
         actions_kept: Tensor | None = None,
+        anchor: Tensor | None = None,
+        history: Tensor | None = None,
+        history_timestep: Tensor | None = None,
     ) -> Tensor:
         """Returns (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
 
@@ -165,6 +189,11 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             encoder_hidden_states_image: (B, V * 257, image_dim) CLIP tokens.
             actions: what `ActionEncoding` gives, for controls other than `trajectory_video`.
             actions_kept: (B,) bool, False = a sample without its actions; see `ActionControl`.
+            anchor: (B, V, C, H, W) latents of the image that the reference tokens are made of, in
+                place of the start image: the first one of the rollout.
+            history: (B, V, C, P, H, W) latents of what was seen before the chunk, as noisy as
+                `history_timestep` says; None = no such tokens.
+            history_timestep: (B,) in [0, 1000]; 1000 = nothing is known of it.
 
         Raises:
             CheckpointError: more views than the model has embeddings for, or text or image tokens
@@ -183,18 +212,56 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             )
         if encoder_hidden_states is None:
             encoder_hidden_states = hidden_states.new_zeros(hidden_states.shape[0], 1, 1)
-        temb, time_proj, text, image = self.condition_embedder(
-            timestep, encoder_hidden_states, encoder_hidden_states_image
+        temb, time_proj, text, image = self._embed_times(
+            timestep, history_timestep, encoder_hidden_states, encoder_hidden_states_image
         )
+        if self.start_image == 'reference':
+            start = torch.zeros_like(start)
         x = torch.cat([hidden_states, control, start], dim=2)
-        tokens, skips = self._embed(x, temb)
-        ref_tokens, keys = self._embed_reference(reference, start_control, temb)
-        grid = torch.cat([ref_tokens, tokens], dim=2)
-        grid = grid + self.view_embedding[:num_views, None, None, None]
+        tokens, skips = embed_video(self, x, temb[:, 0])
+        ref_tokens, keys = embed_reference(self, reference, start_control, anchor, temb[:, 0])
+        grid = arrange(
+            tokens,
+            None if self.start_image == 'channel' else ref_tokens,
+            None if history is None else embed_history(self, history, start, temb[:, -1]),
+        )
+        sequence = grid.tokens + self.view_embedding[:num_views, None, None, None]
         context = self._context(text, image, actions, actions_kept, grid)
-        rotary = self.rope(grid)
-        sequence = grid.flatten(1, 4)
-        time_proj = time_proj.unflatten(1, (6, -1))
+        sequence = self._run_blocks(
+            sequence.flatten(1, 4),
+            context,
+            by_token(time_proj, grid),
+            self.rope(grid.tokens, grid.times),
+        )
+        shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)
+        sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
+        kept = sequence.reshape(grid.tokens.shape)[:, :, grid.num_before :]
+        return unembed(self, kept, skips, temb[:, 0], keys, reference, hidden_states)
+
+    def _embed_times(
+        self,
+        timestep: Tensor,
+        history_timestep: Tensor | None,
+        text: Tensor,
+        image: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """(B, K, D) embeddings and (B, K, 6, D) modulations of K noise levels; text; images.
+
+        K is 2 with a history, whose level comes last, else 1.
+        """
+        if history_timestep is None:
+            temb, proj, text, image = self.condition_embedder(timestep, text, image)
+            temb, proj = temb.unsqueeze(1), proj.unsqueeze(1)
+        else:
+            both = torch.stack([timestep, history_timestep], dim=1).flatten()
+            temb, proj, text, image = self.condition_embedder(
+                both, text, image, timestep_seq_len=2
+            )
+        return temb, proj.unflatten(2, (6, -1)), text, image
+
+    def _run_blocks(
+        self, sequence: Tensor, context: Any, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
+    ) -> Tensor:
         for block in self.blocks:
             if torch.is_grad_enabled() and self.gradient_checkpointing:
                 sequence = checkpoint(
@@ -202,10 +269,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
                 )
             else:
                 sequence = block(sequence, context, time_proj, rotary)
-        shift, scale = (self.scale_shift_table + temb.unsqueeze(1)).chunk(2, dim=1)
-        sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
-        kept = sequence.reshape(grid.shape)[:, :, 1:]
-        return self._unembed(kept, skips, temb, keys, reference, hidden_states)
+        return sequence
 
     def _context(
         self,
@@ -213,58 +277,18 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         image: Tensor | None,
         actions: Tensor | None,
         kept: Tensor | None,
-        grid: Tensor,
+        grid: TokenGrid,
     ) -> Any:
-        """What the blocks' cross-attention looks at; grid (B, V, 1 + f, h, w, D)."""
+        """What the blocks' cross-attention looks at."""
         if self.action_control is None:
             return text if image is None else torch.cat([image, text], dim=1)
         if actions is None:
             raise CheckpointError(f"control '{self.config['control']}' needs actions, got none")
-        slots_views = (grid.shape[2], grid.shape[1])
+        num_views, num_frames = grid.tokens.shape[1:3]
+        slots_views = (1 + num_frames - grid.num_before, num_views)
         text_or_none = text if self.with_text else None
-        return self.action_control(actions, kept, text_or_none, image, slots_views)
-
-    def _embed(self, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W)."""
-        batch, views = x.shape[:2]
-        if self.stem == 'conv':
-            frames = x.transpose(2, 3).flatten(0, 2).contiguous(memory_format=torch.channels_last)
-            return self.patch_embedding(frames, temb, views)
-        tokens = self.patch_embedding(x.flatten(0, 1)).unflatten(0, (batch, views))
-        return tokens.movedim(2, -1), []
-
-    def _embed_reference(
-        self, reference: Tensor, start_control: Tensor | None, temb: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Tokens (B, V, 1, h, w, D) of the reference latents, and keys for copying."""
-        batch, views = reference.shape[:2]
-        flat = reference.flatten(0, 1)
-        if self.stem == 'conv':
-            assert start_control is not None
-            flat = torch.cat([flat, start_control.flatten(0, 1)], dim=1)
-            tokens, keys = self.ref_conv(flat.contiguous(memory_format=torch.channels_last), temb)
-        else:
-            tokens = keys = self.ref_conv(flat)
-        return tokens.unflatten(0, (batch, views)).movedim(2, -1).unsqueeze(2), keys
-
-    def _unembed(
-        self,
-        kept: Tensor,
-        skips: list[Tensor],
-        temb: Tensor,
-        keys: Tensor,
-        reference: Tensor,
-        like: Tensor,
-    ) -> Tensor:
-        """(B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D)."""
-        batch, views, _, num_frames, height, width = like.shape
-        if self.stem == 'conv':
-            frames = self.proj_out(kept, skips, temb, keys, reference.flatten(0, 1))
-            return frames.unflatten(0, (batch, views, num_frames)).transpose(2, 3)
-        p_t, p_h, p_w = self.patch_size
-        out = self.proj_out(kept)
-        out = out.unflatten(-1, (p_t, p_h, p_w, -1)).permute(0, 1, 8, 2, 5, 3, 6, 4, 7)
-        return out.reshape(batch, views, -1, num_frames, height, width)
+        context = self.action_control(actions, kept, text_or_none, image, slots_views)
+        return fit_context(context, grid)
 
 
 def copy_of(transformer: MultiViewWanTransformer) -> MultiViewWanTransformer:

@@ -12,6 +12,7 @@ import torch
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError
+from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint
@@ -22,6 +23,14 @@ from mtv_world_ros.model.conditioning import (
     decode_frames,
 )
 from mtv_world_ros.model.followers import Followers
+from mtv_world_ros.model.history import (
+    check_history,
+    filled,
+    history_settings,
+    with_anchor,
+    with_history,
+    without_history,
+)
 from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
@@ -78,6 +87,8 @@ class DiffusionWorldModel:
         self.card = checkpoint.card
         self.spec = spec_of(checkpoint.card)
         check_video(self.autoencoder, self.transformer.config, self.spec)
+        self.history = history_settings(checkpoint.card)
+        check_history(self.history, self.autoencoder, self.transformer.config)
         self.text_encoder = checkpoint.text_encoder
         self.image_encoder = checkpoint.image_encoder
         if self.image_encoder is not None:
@@ -120,6 +131,7 @@ class DiffusionWorldModel:
         seed: int,
         num_inference_steps: int,
         should_stop: Callable[[], bool],
+        history: History | None = None,
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
         return self.predict_batch(
@@ -129,6 +141,7 @@ class DiffusionWorldModel:
             seeds=[seed],
             num_inference_steps=num_inference_steps,
             should_stop=should_stop,
+            history=history,
         )[0]
 
     def predict_batch(
@@ -140,6 +153,7 @@ class DiffusionWorldModel:
         seeds: Sequence[int],
         num_inference_steps: int,
         should_stop: Callable[[], bool],
+        history: History | None = None,
     ) -> ByteArray:
         """Returns (K, V, T, H, W, 3) uint8 RGB frames: one prediction a seed, in one batch.
 
@@ -148,6 +162,9 @@ class DiffusionWorldModel:
         try:
             with torch.inference_mode():
                 conditioning = self._condition(start_frame, trajectory_frames, positions)
+                conditioning = self._with_history(
+                    conditioning, history or History.begin(start_frame)
+                )
                 latents = sample_latents(
                     self.transformer,
                     self.scheduler,
@@ -177,6 +194,19 @@ class DiffusionWorldModel:
         else:
             latents = self._condition_on_actions(self.actions, start, positions)
         return self._with_context(latents, start)
+
+    def _with_history(self, latents: Conditioning, history: History) -> Conditioning:
+        """Adds what of the rollout comes before the chunk, in models that take it."""
+        count, level = self.history.num_frames, self.history.noise_level
+        if self.history.anchored:
+            latents = with_anchor(self.autoencoder, latents, self._tensor(history.anchor))
+        if not count:
+            return latents
+        if not history.frames.shape[1]:
+            return without_history(self.autoencoder, latents, count)
+        frames = filled(self._tensor(history.frames), count)
+        sigmas = torch.full((1,), level, device=self.device)
+        return with_history(self.autoencoder, latents, frames, sigmas)
 
     def _condition_on_actions(
         self, actions: ActionEncoding, start: torch.Tensor, positions: FloatArray

@@ -12,9 +12,11 @@ from mtv_world_ros.data_types import (
     SuccessEstimate,
 )
 from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import fit_observation, Pipeline
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 
 class ImaginedWorld:
@@ -36,6 +38,8 @@ class ImaginedWorld:
     ) -> None:
         self._pipeline, self._instruction = pipeline, instruction
         self._seed, self._num_inference_steps = seed, num_inference_steps
+        self._history: History | None = None
+        self._memory: RolloutMemory | None = None
         self.success: SuccessEstimate | None = None
         self.seconds: dict[str, float] = {}
 
@@ -47,12 +51,15 @@ class ImaginedWorld:
             instruction=self._instruction,
             seed=self._seed,
             num_inference_steps=self._num_inference_steps,
+            memory=self._memory,
+            history=self._history,
         ):
             self._seed += 1
             self.success = chunk.success
             for stage, seconds in chunk.seconds.items():
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
             observation = chunk.end_observation
+            self._memory, self._history = chunk.memory, chunk.end_history
         return observation
 
 

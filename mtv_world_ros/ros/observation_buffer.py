@@ -11,6 +11,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 
 from mtv_world_ros.data_types import CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.history import History
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.ros import image_conversions
 from mtv_world_ros.ros.conversions import to_positions
@@ -45,11 +46,13 @@ class Scene:
         observation: frames and cameras at the model's size, positions in the robot's order.
         camera_infos: CameraInfo of each view as received, with the image's frame_id.
         source_stamp_ns: stamp of the real frames that it goes back to [ns].
+        history: what was imagined before it; None = the frames are real.
     """
 
     observation: Observation
     camera_infos: tuple[CameraInfo, ...]
     source_stamp_ns: int
+    history: History | None = None
 
 
 class ObservationBuffer:

@@ -227,6 +227,7 @@ class RolloutWorker:
             num_inference_steps=request.num_inference_steps,
             should_stop=self._should_stop,
             memory=memory,
+            history=scene.history,
         )
         for prediction in predictions:
             self._finish_chunk(request, scene, prediction)
@@ -249,7 +250,11 @@ class RolloutWorker:
             if self._abandoned or self._closing:
                 raise RolloutPreempted('the rollout was given up')
             if request.imagine:
-                self._last = replace(scene, observation=prediction.end_observation)
+                self._last = replace(
+                    scene,
+                    observation=prediction.end_observation,
+                    history=prediction.end_history,
+                )
                 self._memory = prediction.memory
                 self._num_imagined += 1
             self._put(chunk)

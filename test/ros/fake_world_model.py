@@ -44,6 +44,7 @@ class FakeWorldModel:
         seed,
         num_inference_steps,
         should_stop,
+        history=None,
     ):
         assert trajectory_frames.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
         assert positions.shape == (1 + NUM_FRAMES, 14)

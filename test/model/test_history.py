@@ -1,0 +1,255 @@
+"""History and anchor: tokens before the video, which reach it and never come out with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from diffusers import FlowMatchEulerDiscreteScheduler
+import numpy as np
+import pytest
+from small_transformer import build, inputs, PATCH, SMALL
+import torch
+from torch import Tensor
+
+from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.history import History
+from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.history import history_settings
+from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
+from mtv_world_ros.model.world_model import DiffusionWorldModel
+
+CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
+
+
+def past(views: int = 2, frames: int = 2, level: float = 100.0, seed: int = 7) -> dict:
+    """Arguments of a forward pass for a history of so many latent frames."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        'history': torch.randn(1, views, 12, frames, 16, 16, generator=generator),
+        'history_timestep': torch.tensor([level]),
+    }
+
+
+def given(kind: str, views: int = 2, **changes: object) -> tuple[Any, dict]:
+    config, text_dim = CONFIGS[kind]
+    return build(config, **changes), inputs(views=views, text_dim=text_dim)
+
+
+@pytest.mark.parametrize('views', [1, 2, 3])
+def test_returns_exactly_the_videos_frames_whatever_is_before(kind: str, views: int) -> None:
+    model, values = given(kind, views)
+    for frames in (2, 4):
+        out = model(**values, **past(views, frames), anchor=values['reference'])
+        assert out.shape == values['hidden_states'].shape
+        assert torch.isfinite(out).all()
+
+
+@pytest.mark.parametrize('views', [1, 2, 3])
+def test_every_weight_learns_with_a_history_too(kind: str, views: int) -> None:
+    model, values = given(kind, views, num_views=views)
+    past_values = {n: v.requires_grad_() for n, v in past(views).items()}
+    model(**values, **past_values).square().mean().backward()
+    without = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    assert [n for n in without if not n.endswith(('to_k.bias', 'copy.to_k.bias'))] == []
+    assert past_values['history'].grad.abs().amax(dim=(0, 2, 4, 5)).min() > 0
+
+
+def test_history_reaches_the_video_only_through_self_attention(kind: str) -> None:
+    """It neither leaks into the output nor changes what the video's tokens are."""
+    model, values = given(kind)
+    seen = model(**values, **past())
+    assert not torch.allclose(seen, model(**values, **past(seed=8)), atol=1e-5)
+    with torch.no_grad():
+        for block in model.blocks:
+            block.attn1.to_out[0].weight.zero_()
+            block.attn1.to_out[0].bias.zero_()
+    deaf = model(**values)
+    for other in (past(), past(seed=8), past(level=900.0), past(frames=4)):
+        torch.testing.assert_close(model(**values, **other), deaf, rtol=0, atol=2e-6)
+
+
+def test_the_historys_noise_level_is_its_own(kind: str) -> None:
+    """Block 0 modulates tokens of the history by its level, all others by the video's."""
+    model, values = given(kind)
+    caught: list[Tensor] = []
+    model.blocks[0].register_forward_pre_hook(lambda _, arguments: caught.append(arguments[2]))
+    model(**values, **past(level=100.0))
+    model(**values, **past(level=900.0))
+    model(**values)
+    low, high, plain = caught
+    frames = {'conv': 1, 'patch': 2}[kind]  # the convolutional stem merges two frames
+    num = {'conv': 16, 'patch': 64}[kind]  # tokens of a frame
+    rows = low.unflatten(1, (2, -1, num))
+    assert rows.shape[2] == frames + 1 + {'conv': 2, 'patch': 4}[kind]
+    differs = (low != high).any(-1).any(-1).unflatten(1, (2, -1, num))[0]
+    assert differs[:, :frames].all() and not differs[:, frames:].any()
+    torch.testing.assert_close(rows[0, 1, -1, 0], plain[0])
+
+
+@pytest.mark.parametrize('view_offset', ['width', 'time', 'none'])
+def test_the_videos_places_are_the_same_with_and_without_history(view_offset: str) -> None:
+    rope = MultiViewRotaryPosEmbed(12, (1, 2, 2), 64, view_offset)
+    video = torch.zeros(1, 3, 5, 2, 2, 4)
+    plain = [t.reshape(3, 5, 4, -1) for t in rope(video)]
+    longer = torch.zeros(1, 3, 7, 2, 2, 4)
+    both = [t.reshape(3, 7, 4, -1) for t in rope(longer, (-2, -1, 0, 1, 2, 3, 4))]
+    for short, long in zip(plain, both, strict=True):
+        assert torch.equal(long[:, 2:], short)
+    # no history shares its place with a video or another view's history
+    turns = torch.stack([t[..., 0, :].flatten(0, 1) for t in both], dim=1).flatten(1)
+    same = torch.cdist(turns, turns) < 1e-5
+    assert view_offset == 'none' or same.sum() == 21
+    assert view_offset != 'none' or same.sum() == 3 * 21
+
+
+def test_places_before_zero_turn_the_other_way() -> None:
+    """Attention sees differences of places alone: shifting all of them changes nothing."""
+    rope = MultiViewRotaryPosEmbed(12, (1, 2, 2), 64)
+    grid = torch.zeros(1, 1, 3, 1, 1, 4)
+    generator = torch.Generator().manual_seed(0)
+    query, key = torch.randn(2, 3, 12, generator=generator)
+
+    def scores(times: tuple[int, ...]) -> Tensor:
+        cos, sin = (t.reshape(3, 12) for t in rope(grid, times))
+
+        def turned(x: Tensor) -> Tensor:  # pairs (even, odd) are turned, as Wan does
+            even, odd = x[:, ::2], x[:, 1::2]
+            c, s = cos[:, ::2], sin[:, 1::2]
+            return torch.stack([even * c - odd * s, even * s + odd * c], dim=-1).flatten(1)
+
+        return turned(query) @ turned(key).T
+
+    torch.testing.assert_close(scores((-2, -1, 0)), scores((3, 4, 5)), rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(scores((-2, -1, 0)), scores((2, 1, 0)), atol=1e-2)
+
+
+def test_swapping_the_views_swaps_the_output_with_history(kind: str) -> None:
+    model, values = given(kind, view_offset='none')
+    with torch.no_grad():
+        model.view_embedding.zero_()
+    values = {**values, **past(), 'anchor': past(seed=3)['history'][:, :, :, 0]}
+    swapped = {k: v.flip(1) if v.ndim >= 5 else v for k, v in values.items()}
+    torch.testing.assert_close(model(**swapped), model(**values).flip(1), rtol=1e-4, atol=1e-5)
+
+
+def test_the_anchor_takes_the_place_of_the_start_image_in_the_reference_tokens(kind: str) -> None:
+    model, values = given(kind)
+    other = past(seed=3)['history'][:, :, :, 0]
+    assert not torch.allclose(model(**values, anchor=other), model(**values), atol=1e-5)
+    if kind == 'patch':  # phi alone sees the reference there
+        swapped = {**values, 'reference': other}
+        assert torch.equal(model(**values, anchor=other), model(**swapped))
+
+
+@pytest.mark.parametrize('start_image', ['both', 'reference', 'channel'])
+def test_the_start_image_enters_where_it_is_told_to(start_image: str) -> None:
+    model, values = given('patch', start_image=start_image)
+    before = model(**values)
+    for name, slot in (('start', 'channel'), ('reference', 'reference')):
+        changed = {**values, name: values[name] + 1.0}
+        heard = not torch.equal(model(**changed), before)
+        assert heard == (start_image in ('both', slot)), name
+
+
+def test_an_unknown_start_image_is_refused() -> None:
+    with pytest.raises(CheckpointError, match="start_image 'none' is not one of both, ref"):
+        build(PATCH, start_image='none')
+
+
+CARD = {
+    'views': ['low', 'high'],
+    'fps': 5.0,
+    'num_frames': 4,
+    'width': 32,
+    'height': 32,
+    'robot': 'yam_bimanual',
+    'control': 'trajectory_video',
+    'object_mask': True,
+    'rendering': {},
+    'trained_on': {},
+}
+SETTINGS = {'num_frames': 4, 'noise_level': 0.1, 'reference': 'first_frame'}
+
+
+def world_model(**card: object) -> DiffusionWorldModel:
+    return DiffusionWorldModel(
+        Checkpoint(
+            transformer=build(SMALL),
+            autoencoder=SpaceToDepthAutoencoder(),
+            scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
+            card={**CARD, **card},
+        )
+    )
+
+
+def frames(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (*shape, 32, 32, 3), np.uint8)
+
+
+def predict(model: DiffusionWorldModel, history: History | None, seeds: list[int] | None = None):
+    return model.predict_batch(
+        frames(2),
+        frames(2, 5, seed=1),
+        positions=np.zeros((5, 14)),
+        seeds=seeds or [0],
+        num_inference_steps=1,
+        should_stop=lambda: False,
+        history=history,
+    )
+
+
+def test_a_model_without_history_takes_no_notice_of_one() -> None:
+    model = world_model()
+    history = History(anchor=frames(2, seed=5), frames=frames(2, 4, seed=6))
+    assert np.array_equal(predict(model, history), predict(model, None))
+
+
+def test_the_first_chunk_is_one_of_a_rollout_that_just_began() -> None:
+    model = world_model(history=SETTINGS)
+    assert model.spec.num_history == 4
+    began = History.begin(frames(2))
+    assert np.array_equal(predict(model, None), predict(model, began))
+    moved = replace(began, anchor=frames(2, seed=5))
+    assert not np.array_equal(predict(model, None), predict(model, moved))
+
+
+def test_history_frames_are_seen_and_few_are_filled_up_with_the_oldest() -> None:
+    model = world_model(history=SETTINGS)
+    seen = frames(2, 4, seed=6)
+
+    def after(kept: np.ndarray) -> np.ndarray:
+        return predict(model, History(anchor=frames(2), frames=kept))
+
+    assert not np.array_equal(after(seen), after(frames(2, 4, seed=9)))
+    assert np.array_equal(after(seen[:, 2:]), after(seen[:, [2, 2, 2, 3]]))
+
+
+def test_a_seed_gives_the_same_chunk_in_every_company_with_history() -> None:
+    model = world_model(history=SETTINGS)
+    history = History(anchor=frames(2), frames=frames(2, 4, seed=6))
+    together = predict(model, history, [3, 4])
+    alone = np.concatenate([predict(model, history, [seed]) for seed in (3, 4)])
+    # a batch may round differently in the last bit, a byte shows it at most as 1
+    assert np.abs(together.astype(int) - alone).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ('changes', 'match'),
+    [
+        ({'num_frames': 3}, 'num_frames to a multiple of 2'),
+        ({'num_frames': -1}, 'num_frames is -1'),
+        ({'noise_level': 1.0}, 'at least 0 and below 1'),
+        ({'reference': 'last'}, "'last' is not one of chunk_start, first_frame"),
+        ({'frames': 4}, "'history' cannot be used.*frames"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(changes: dict, match: str) -> None:
+    with pytest.raises((CheckpointError, ConfigError), match=match):
+        world_model(history={**SETTINGS, **changes})
+
+
+def test_settings_are_off_where_the_card_has_none() -> None:
+    assert not history_settings(CARD).on
+    assert history_settings(CARD).as_card() == {}
