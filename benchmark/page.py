@@ -13,8 +13,12 @@ import time
 import numpy as np
 
 
-def parse_arguments(text: str | None, repeats: int) -> argparse.Namespace:
-    """The options that all benchmarks share: --repeats, --seed, --machine, --out."""
+def parse_arguments(
+    text: str | None,
+    repeats: int,
+    more: Callable[[argparse.ArgumentParser], None] = lambda parser: None,
+) -> argparse.Namespace:
+    """The options that all benchmarks share, --repeats, --seed, --machine, --out, and `more`."""
     parser = argparse.ArgumentParser(
         description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -24,6 +28,7 @@ def parse_arguments(text: str | None, repeats: int) -> argparse.Namespace:
         '--machine', default=f'cpu{os.cpu_count()}', help='name of the machine on the page'
     )
     parser.add_argument('--out', type=Path, help='folder to write the page into')
+    more(parser)
     return parser.parse_args()
 
 

@@ -10,7 +10,7 @@ from mtv_world_ros.errors import CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
-from mtv_world_ros.policies.config import load_policy_config
+from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import content_digest, share_path
@@ -156,22 +156,24 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     """
     path = Path(name)
     if str(name).startswith('expert'):
-        return _scripted(str(name), robot)
+        return _scripted(ScriptedPolicySettings(variant=str(name)), robot)
     if path.suffix not in ('.yaml', '.yml'):
         path = share_path('config', 'policies', f'{name}.yaml')
     config = load_policy_config(path)
-    if isinstance(config, str):
+    if isinstance(config, ScriptedPolicySettings):
         return _scripted(config, robot)
     made = config.make(robot)
     return lambda task, scene_seed: made
 
 
-def _scripted(variant: str, robot: RobotModel) -> PolicyMaker:
+def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
     from mtv_world_ros.sim.expert import Expert
     from mtv_world_ros.sim.policy_variant import parse_variant
-    from mtv_world_ros.sim.scripted_policy import scripted_policy
+    from mtv_world_ros.sim.scripted_policy import scripted_policy, ScriptedPolicyConfig
 
+    variant = settings.variant
     parse_variant(variant)
+    config = ScriptedPolicyConfig(hold_s=settings.hold_s)
     expert = Expert(robot)
 
     def make(task: str, scene_seed: int) -> Policy:
@@ -180,7 +182,7 @@ def _scripted(variant: str, robot: RobotModel) -> PolicyMaker:
                 f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
                 "'scene_seed' to those of the recorded episode"
             )
-        return scripted_policy(variant, task, scene_seed, expert)
+        return scripted_policy(variant, task, scene_seed, expert, config=config)
 
     return make
 

@@ -15,8 +15,8 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.joint_columns import UNITS
 from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
-from mtv_world_ros.importing.joint_columns import UNITS
 
 _VIEW_KEYS = ('feature', 'calibration', 'camera')
 _CAMERA_KEYS = ('file', 'intrinsics', 'extrinsics', 'rotation', 'translation', 'pose', 'axes',

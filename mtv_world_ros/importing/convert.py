@@ -12,9 +12,9 @@ from mtv_world_ros.data.mcap_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.joint_columns import to_positions
 from mtv_world_ros.geometry.robot import check_positions
 from mtv_world_ros.importing.camera_parameters import camera_model
-from mtv_world_ros.importing.joint_columns import to_positions
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, Stream
 

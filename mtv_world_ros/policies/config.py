@@ -8,12 +8,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from mtv_world_ros.config_values import check_keys, read_yaml, text
+from mtv_world_ros.config_values import check_keys, number, read_yaml, text
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.openpi_client import openpi_config
 from mtv_world_ros.policies.policy import Policy
 
-KINDS = ('scripted', 'python')
+KINDS = ('scripted', 'python', 'openpi')
 
 
 class PolicyConfig(Protocol):
@@ -22,6 +23,19 @@ class PolicyConfig(Protocol):
     def make(self, robot: RobotModel) -> Policy:
         """Returns the policy for a robot."""
         ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScriptedPolicySettings:
+    """A policy of the simulator, which this layer does not know.
+
+    Attributes:
+        variant: e.g. `expert` or `expert-noise-0.02`.
+        hold_s: from the end of its plan to the end of the episode [s].
+    """
+
+    variant: str = 'expert'
+    hold_s: float = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,11 +67,8 @@ class PythonPolicyConfig:
             ) from error
 
 
-def load_policy_config(path: Path) -> PolicyConfig | str:
+def load_policy_config(path: Path) -> PolicyConfig | ScriptedPolicySettings:
     """Reads a file like those in `config/policies`.
-
-    Returns:
-        The configuration; of a scripted policy its name.
 
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
@@ -66,7 +77,7 @@ def load_policy_config(path: Path) -> PolicyConfig | str:
     return policy_config(values, str(path))
 
 
-def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | str:
+def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | ScriptedPolicySettings:
     """Returns the configuration that plain values describe; see `load_policy_config`."""
     if not isinstance(values, Mapping) or 'kind' not in values:
         raise ConfigError(f"{where}: expected a key 'kind': {', '.join(KINDS)}")
@@ -77,8 +88,14 @@ def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | str:
             f'{", ".join(KINDS)}'
         )
     if kind == 'scripted':
-        check_keys(rest, ('variant',), (), where)
-        return text(rest, 'variant', 'expert', where)
+        check_keys(rest, ('variant', 'hold_s'), (), where)
+        default = ScriptedPolicySettings()
+        return ScriptedPolicySettings(
+            variant=text(rest, 'variant', default.variant, where),
+            hold_s=number(rest, 'hold_s', default.hold_s, where),
+        )
+    if kind == 'openpi':
+        return openpi_config(rest, where)
     check_keys(rest, ('factory', 'arguments'), ('factory',), where)
     arguments = check_keys(rest.get('arguments') or {}, rest.get('arguments') or (), (), where)
     return PythonPolicyConfig(factory=text(rest, 'factory', '', where), arguments=arguments)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.resample import resample
 
 #: points nearer to the end than this are the end [s]
@@ -22,18 +21,22 @@ def first_part(
         trajectory: times count from the observation it answers; joints in any order.
         start_positions: (J,) positions at time 0, in the trajectory's joint order.
         seconds: where it is cut [s].
+
+    Raises:
+        ConfigError: the time is not positive.
     """
+    if seconds <= 0:
+        raise ConfigError(f'answers are executed for {seconds} s; it must be positive')
     if trajectory.times[-1] <= seconds + _SAME_S:
         return trajectory
     times, kept = trajectory.times, trajectory.times <= seconds + _SAME_S
     is_cut_between = not kept.any() or times[kept][-1] < seconds - _SAME_S
     if not is_cut_between:
         return _taken(trajectory, kept)
-    end = resample(replace(trajectory, velocities=None), start_positions, np.array([seconds]))
+    end = resample(trajectory, start_positions, np.array([seconds]))
     velocities = trajectory.velocities
     if velocities is not None:
         last = [np.interp(seconds, times, column) for column in velocities.T]
-        end = resample(trajectory, start_positions, np.array([seconds]))
         velocities = np.vstack([velocities[kept], last])
     return JointTrajectory(
         joint_names=trajectory.joint_names,

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 import time
 from typing import Protocol
 
-import numpy as np
-
 from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.resample import resample
+from mtv_world_ros.policies.execution import first_part
 from mtv_world_ros.policies.policy import Policy
 
 
@@ -72,36 +69,7 @@ def live(
         policy_s += time.perf_counter() - begun
         if answer is None:
             return Life(num_chunks=number, is_over=True, policy_s=policy_s)
-        observation = world.execute(observation, first_part(answer, observation, chunk_s))
-    return Life(num_chunks=max_chunks, is_over=False, policy_s=policy_s)
-
-
-def first_part(
-    answer: JointTrajectory, observation: Observation, seconds: float
-) -> JointTrajectory:
-    """Returns the part of a trajectory up to a time, with a point at that time.
-
-    Raises:
-        ConfigError: the time is not positive.
-    """
-    if seconds <= 0:
-        raise ConfigError(f'answers are executed for {seconds} s; it must be positive')
-    if answer.times[-1] <= seconds + 1e-9:
-        return answer
-    kept = answer.times <= seconds + 1e-9
-    times = answer.times[kept]
-    if len(times) and times[-1] > seconds - 1e-9:
-        slopes = answer.velocities
-        return JointTrajectory(
-            joint_names=answer.joint_names,
-            times=times,
-            positions=answer.positions[kept],
-            velocities=None if slopes is None else slopes[kept],
+        observation = world.execute(
+            observation, first_part(answer, observation.positions, chunk_s)
         )
-    times = np.append(times, seconds)
-    # without velocities: the one at the cut is not known
-    return JointTrajectory(
-        joint_names=answer.joint_names,
-        times=times,
-        positions=resample(answer, observation.positions, times),
-    )
+    return Life(num_chunks=max_chunks, is_over=False, policy_s=policy_s)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import time
 from typing import Protocol
 
-from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.policies.execution import first_part
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ros.actor import Actor, Answer
@@ -67,14 +69,21 @@ class PolicyLoop:
 
     Args:
         spec: of the world model.
+        joint_names: J names, in the robot's order.
         actor: asks the policy.
         frames: gets what the world model publishes.
         outputs: see there.
     """
 
     def __init__(
-        self, spec: WorldModelSpec, actor: Actor, frames: PredictedFrames, outputs: Outputs
+        self,
+        spec: WorldModelSpec,
+        joint_names: Sequence[str],
+        actor: Actor,
+        frames: PredictedFrames,
+        outputs: Outputs,
     ) -> None:
+        self._joint_names = tuple(joint_names)
         self._spec, self._actor, self._frames, self._out = spec, actor, frames, outputs
         self.phase = 'idle'
         self.episode = 0
@@ -191,7 +200,7 @@ class PolicyLoop:
             self.end('done')
             return
         seconds = self._settings.execute_s or self._spec.num_frames / self._spec.fps
-        start = answer.trajectory.positions[0]
+        start = self._start_of(answer.trajectory, self._observation)
         stamp_ns = self._observation.stamp_ns
         self._chunk.policy_s = answer.seconds
         self._chunk.sent_s = time.monotonic()
@@ -199,6 +208,12 @@ class PolicyLoop:
         self._sent.add(str(stamp_ns))
         self._wait('imagining', self._settings.rollout_timeout_s)
         self._out.send(first_part(answer.trajectory, start, seconds), stamp_ns)
+
+    def _start_of(self, trajectory: JointTrajectory, observation: Observation) -> FloatArray:
+        """Where the trajectory's joints are when it starts; those of other robots at its begin."""
+        seen = dict(zip(self._joint_names, observation.positions, strict=True))
+        named = zip(trajectory.joint_names, trajectory.positions[0], strict=True)
+        return np.array([seen.get(name, first) for name, first in named])
 
     def _collect(self) -> None:
         said, before = self._chunk.said, self._observation

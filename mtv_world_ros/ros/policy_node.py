@@ -69,7 +69,7 @@ class PolicyNode(Node):
         )
         frames = PredictedFrames(self._spec.views, joint_names)
         self._actor = Actor(lambda: self._answers.trigger())
-        self._loop = PolicyLoop(self._spec, self._actor, frames, self)
+        self._loop = PolicyLoop(self._spec, joint_names, self._actor, frames, self)
         self._answers = self.create_guard_condition(self._guarded(self._loop.on_answers))
         self._cameras = subscribe_observations(
             self,

@@ -206,6 +206,7 @@ def scripted_policy(
     seed: int,
     expert: Expert,
     randomization: RandomizationConfig | None = None,
+    config: ScriptedPolicyConfig | None = None,
 ) -> ScriptedPolicy:
     """Returns the policy of a name, for the scene that the simulator draws for a task and a seed.
 
@@ -215,6 +216,7 @@ def scripted_policy(
         seed: of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: plans.
         randomization: as the simulator's.
+        config: how it answers.
 
     Raises:
         PolicyError: no such policy.
@@ -222,7 +224,7 @@ def scripted_policy(
     """
     variant, kind = parse_variant(name), task_named(task)
     scene = draw_scene(kind, scene_generator(seed), randomization)
-    return ScriptedPolicy(variant, expert, kind, scene)
+    return ScriptedPolicy(variant, expert, kind, scene, config)
 
 
 def _velocities(plan: JointTrajectory, times: FloatArray) -> FloatArray:

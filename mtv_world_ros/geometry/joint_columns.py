@@ -1,4 +1,4 @@
-"""How columns of a dataset become the robot's joints: names, units, zero, sign, gripper range."""
+"""How columns of a data set, or of a policy server's vectors, become the robot's joints."""
 
 from __future__ import annotations
 
@@ -36,8 +36,10 @@ class JointColumn:
     offset: float = 0.0
 
 
-def parse_joints(rows: Any, unit: str, robot: RobotModel, where: str) -> tuple[JointColumn, ...]:
-    """Reads `joints`, one entry for each joint of the robot.
+def parse_joints(
+    rows: Any, unit: str, robot: RobotModel, where: str, *, allow_missing: bool = False
+) -> tuple[JointColumn, ...]:
+    """Reads `joints`, one entry for each joint of the robot, unless some may be missing.
 
     An entry is a column (name or number), or keys: `column` with `unit`, `sign` and `offset`
     (added last, rad or m); or with `closed` and `open`, the gripper's values in the dataset; or
@@ -51,7 +53,7 @@ def parse_joints(rows: Any, unit: str, robot: RobotModel, where: str) -> tuple[J
         rows = {joint: joint for joint in robot.joint_names}
     check_keys(rows, robot.joint_names, (), f'{where}: joints')
     missing = [joint for joint in robot.joint_names if joint not in rows]
-    if missing:
+    if missing and not allow_missing:
         raise ConfigError(
             f"{where}: joints {missing} of robot '{robot.name}' are missing; name their columns, "
             'or give `{constant: 0.0}` for one that the dataset does not have'
@@ -59,6 +61,7 @@ def parse_joints(rows: Any, unit: str, robot: RobotModel, where: str) -> tuple[J
     return tuple(
         _joint(joint, rows[joint], unit, robot, f"{where}: joint '{joint}'")
         for joint in robot.joint_names
+        if joint in rows
     )
 
 
@@ -134,6 +137,33 @@ def to_positions(
             column = values[:, _column(joint, names, values.shape[1], feature)]
         positions[:, index] = joint.factor * column + joint.offset
     return positions
+
+
+def to_columns(
+    positions: Mapping[str, float], names: Sequence[str], joints: Sequence[JointColumn]
+) -> FloatArray:
+    """Returns (C,) values of positions by joint [rad or m]; the inverse of `to_positions`.
+
+    Args:
+        positions: by joint name.
+        names: of the columns; empty where they have none, they are then as many as are used.
+        joints: without constants.
+
+    Raises:
+        ConfigError: a column is not there, or nothing is put into one.
+    """
+    used = [joint for joint in joints if joint.column is not None]
+    count = len(names) or 1 + max(
+        (j.column for j in used if isinstance(j.column, int)), default=-1
+    )
+    values = np.full(count, np.nan)
+    for joint in used:
+        column = _column(joint, names, count, 'state')
+        values[column] = (positions[joint.joint] - joint.offset) / joint.factor
+    empty = np.flatnonzero(np.isnan(values))
+    if len(empty):
+        raise ConfigError(f'columns {empty.tolist()} of {count} get no joint; name one for each')
+    return values
 
 
 def _column(joint: JointColumn, names: Sequence[str], count: int, feature: str) -> int:

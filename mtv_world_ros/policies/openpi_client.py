@@ -1,0 +1,184 @@
+"""A client of openpi's policy server: websocket, msgpack, metadata first, errors as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+import os
+from typing import Any
+
+from mtv_world_ros.config_values import check_keys, number, text
+from mtv_world_ros.data_types import JointTrajectory, Observation
+from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.msgpack_arrays import pack, unpack
+from mtv_world_ros.policies.server_mapping import find, MAPPING_KEYS, read_mapping, ServerMapping
+
+_KEYS = ('server', 'api_key_variable', 'timeout_s', *MAPPING_KEYS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenPiConfig:
+    """Which server, and what it gets and gives.
+
+    Attributes:
+        server: e.g. `ws://localhost:8000`.
+        api_key_variable: environment variable with the API key; empty = none is needed.
+        timeout_s: longest wait for the connection, and for an answer [s].
+        values: the file's mapping keys, see `read_mapping`.
+        where: the file.
+    """
+
+    server: str
+    api_key_variable: str
+    timeout_s: float
+    values: Mapping[str, Any]
+    where: str
+
+    def make(self, robot: RobotModel) -> OpenPiPolicy:
+        """Returns the client; it connects at its first reset.
+
+        Raises:
+            ConfigError: a key is unknown or missing, a value is wrong, a package is missing.
+        """
+        try:
+            import msgpack  # noqa: F401
+            import websockets  # noqa: F401
+        except ImportError as error:
+            raise ConfigError(
+                f"{self.where}: the client of openpi's server needs the package '{error.name}'; "
+                "install it with: pip install 'mtv_world_ros[policies]'"
+            ) from error
+        return OpenPiPolicy(self, read_mapping(self.values, robot, self.where))
+
+
+def openpi_config(values: Mapping[str, Any], where: str) -> OpenPiConfig:
+    """Reads a policy file of kind `openpi`, without its `kind`.
+
+    Raises:
+        ConfigError: a key is unknown or missing, a value is wrong.
+    """
+    check_keys(values, _KEYS, ('server', 'actions'), where)
+    server = text(values, 'server', '', where)
+    if not server.startswith(('ws://', 'wss://')):
+        raise ConfigError(f"{where}: 'server' is '{server}'; expected ws://host:port or wss://...")
+    timeout_s = number(values, 'timeout_s', 60.0, where)
+    if timeout_s <= 0:
+        raise ConfigError(f"{where}: 'timeout_s' is {timeout_s:g}, must be positive")
+    return OpenPiConfig(
+        server=server,
+        api_key_variable=text(values, 'api_key_variable', '', where),
+        timeout_s=timeout_s,
+        values={key: values[key] for key in MAPPING_KEYS if key in values},
+        where=where,
+    )
+
+
+class OpenPiPolicy:
+    """Asks the server.
+
+    Attributes:
+        metadata: what the server said of itself.
+
+    Args:
+        config: which server.
+        mapping: what it gets and gives.
+    """
+
+    def __init__(self, config: OpenPiConfig, mapping: ServerMapping) -> None:
+        self._config, self._mapping = config, mapping
+        self._connection: Any = None
+        self._opened = ExitStack()
+        self.metadata: dict[str, Any] = {}
+
+    @property
+    def name(self) -> str:
+        """The server's address."""
+        return f'openpi {self._config.server}'
+
+    def reset(self, *, seed: int) -> None:
+        """Connects, if that is not done; the protocol knows neither episodes nor seeds."""
+        del seed
+        if self._connection is None:
+            self._connect()
+
+    def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
+        """Returns the server's chunk of actions as commands; it never ends an episode.
+
+        Raises:
+            PolicyError: no connection, no answer in time, the server failed, or its answer
+                cannot be used.
+        """
+        self.reset(seed=0)
+        request = self._mapping.request(observation, instruction)
+        answer = self._exchange(pack(request))
+        actions = self._mapping.actions
+        return actions.trajectory(find(answer, actions.key), observation)
+
+    def close(self) -> None:
+        """Closes the connection; the next question opens another."""
+        self._connection = None
+        self._opened.close()
+
+    def _connect(self) -> None:
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        config, key = self._config, ''
+        if config.api_key_variable:
+            key = os.environ.get(config.api_key_variable, '')
+        if config.api_key_variable and not key:
+            raise ConfigError(
+                f"{config.where}: the environment variable '{config.api_key_variable}' with the "
+                'API key is not set'
+            )
+        try:
+            connecting = connect(
+                config.server,
+                compression=None,
+                max_size=None,
+                open_timeout=config.timeout_s,
+                # a server that thinks does not answer pings
+                ping_interval=None,
+                additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
+            )
+            self._connection = self._opened.enter_context(connecting)
+        except (OSError, TimeoutError, WebSocketException, ValueError) as error:
+            raise PolicyError(
+                f"no connection to the policy server '{config.server}': {error}; is it running?"
+            ) from error
+        self.metadata = self._receive()
+
+    def _exchange(self, request: bytes) -> Any:
+        from websockets.exceptions import WebSocketException
+
+        try:
+            self._connection.send(request)
+        except (OSError, WebSocketException) as error:
+            self.close()
+            raise self._gone(error) from error
+        return self._receive()
+
+    def _receive(self) -> Any:
+        from websockets.exceptions import WebSocketException
+
+        try:
+            message = self._connection.recv(timeout=self._config.timeout_s)
+        except TimeoutError as error:
+            self.close()  # what comes later would be taken for the next answer
+            raise PolicyError(
+                f"the policy server '{self._config.server}' did not answer within "
+                f"{self._config.timeout_s:g} s ('timeout_s')"
+            ) from error
+        except (OSError, WebSocketException) as error:
+            self.close()
+            raise self._gone(error) from error
+        if isinstance(message, str):  # a traceback; the server closes the connection after it
+            self.close()
+            last = message.strip().splitlines()[-1] if message.strip() else 'no reason given'
+            raise PolicyError(f'the policy server failed: {last}')
+        return unpack(message)
+
+    def _gone(self, error: Exception) -> PolicyError:
+        return PolicyError(f"the policy server '{self._config.server}' is gone: {error}")

@@ -1,0 +1,88 @@
+"""A policy server that speaks openpi's protocol, written from its description, not our client.
+
+Wire format (openpi-client): websocket; the server sends a msgpack map of metadata first; then each
+binary request gets a binary answer, or a text with a traceback after which the server closes.
+Arrays are msgpack maps {b'__ndarray__': True, b'data', b'dtype', b'shape'}.
+"""
+
+import asyncio
+import http
+import sys
+import time
+import traceback
+
+import msgpack
+import numpy as np
+import websockets
+from websockets.asyncio.server import serve
+
+
+def to_wire(value):
+    assert isinstance(value, np.ndarray)
+    return {
+        b'__ndarray__': True,
+        b'data': value.tobytes(),
+        b'dtype': value.dtype.str,
+        b'shape': value.shape,
+    }
+
+
+def from_wire(value):
+    if b'__ndarray__' in value:
+        return np.ndarray(
+            buffer=value[b'data'], dtype=np.dtype(value[b'dtype']), shape=value[b'shape']
+        )
+    return value
+
+
+def infer(request):
+    """Moves every joint by 0.01 an action; the prompt says what goes wrong."""
+    prompt = request['prompt']
+    if prompt == 'fail':
+        raise KeyError('no such checkpoint')
+    if prompt == 'sleep':
+        time.sleep(1.5)
+    actions = request['state'][None] + 0.01 * np.arange(1, 11)[:, None]
+    if prompt == 'nan':
+        actions[3, 2] = np.nan
+    images = {name: [*image.shape, str(image.dtype)] for name, image in request['images'].items()}
+    mean = np.array([request['images'][name].mean() for name in sorted(request['images'])])
+    return {
+        'actions': actions.astype(np.float32),
+        'seen': images,
+        'mean': mean,
+        'state_dtype': str(request['state'].dtype),
+        'server_timing': {'infer_ms': 1.0},
+    }
+
+
+async def handle(connection):
+    await connection.send(msgpack.packb({'model': 'tiny', 'action_horizon': 10}))
+    while True:
+        try:
+            request = msgpack.unpackb(await connection.recv(), object_hook=from_wire)
+            answer = await asyncio.to_thread(infer, request)
+            await connection.send(msgpack.packb(answer, default=to_wire))
+        except websockets.ConnectionClosed:
+            return
+        except Exception:
+            await connection.send(traceback.format_exc())
+            await connection.close(code=1011, reason='Internal server error.')
+            raise
+
+
+def check_key(connection, request):
+    if request.headers.get('Authorization') != 'Api-Key secret':
+        return connection.respond(http.HTTPStatus.UNAUTHORIZED, 'no key\n')
+    return None
+
+
+async def main():
+    options = {'process_request': check_key} if '--key' in sys.argv else {}
+    async with serve(handle, '127.0.0.1', 0, compression=None, max_size=None, **options) as server:
+        print(server.sockets[0].getsockname()[1], flush=True)
+        await server.serve_forever()
+
+
+if __name__ == '__main__':
+    asyncio.run(main())

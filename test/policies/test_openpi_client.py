@@ -1,0 +1,176 @@
+"""The client against a server process that speaks openpi's protocol."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
+pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
+
+from mtv_world_ros.assembly import assemble_policy, robot_path
+from mtv_world_ros.data_types import CameraModel, Observation
+from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.policies.server_mapping import fitted
+from mtv_world_ros.resources import share_path
+
+SERVER = Path(__file__).with_name('openpi_server.py')
+ROBOT = load_robot(robot_path('yam_bimanual'))
+HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
+
+
+def start_server(*options):
+    process = subprocess.Popen(
+        [sys.executable, str(SERVER), *options], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    return process, int(process.stdout.readline())
+
+
+@pytest.fixture(scope='module')
+def server():
+    process, port = start_server()
+    yield port
+    process.kill()
+    process.wait()
+
+
+def make_policy(tmp_path, port, **changes):
+    values = yaml.safe_load(share_path('config', 'policies', 'openpi.yaml').read_text())
+    values |= {'server': f'ws://127.0.0.1:{port}', 'timeout_s': 1.0, **changes}
+    path = tmp_path / 'policy.yaml'
+    path.write_text(yaml.safe_dump(values))
+    return assemble_policy(path, ROBOT)('', -1)
+
+
+def observe(positions=HOME):
+    frames = np.zeros((2, 72, 96, 3), np.uint8)
+    frames[0], frames[1] = 60, 200
+    cameras = tuple(
+        CameraModel(view=view, width=96, height=72, K=np.diag([90.0, 90.0, 1.0]),
+                    mount_link='base', T_mount_camera=np.eye(4))
+        for view in ('low', 'high')
+    )  # fmt: skip
+    return Observation(cameras=cameras, frames=frames, positions=positions, stamp_ns=10**9)
+
+
+def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_path, server):
+    policy = make_policy(tmp_path, server)
+    policy.reset(seed=0)
+    assert policy.metadata == {'model': 'tiny', 'action_horizon': 10}
+    answer = policy.act(observe(), 'stack')
+    assert answer.joint_names == ROBOT.joint_names
+    np.testing.assert_allclose(answer.times, 0.02 * np.arange(1, 11))
+    moved = answer.positions - HOME
+    arm = [k for k, name in enumerate(ROBOT.joint_names) if 'gripper' not in name]
+    steps = 0.01 * np.arange(1, 11)[:, None]
+    np.testing.assert_allclose(moved[:, arm], np.repeat(steps, len(arm), axis=1), atol=1e-6)
+    # a gripper of 0 (closed) to 1 (open) on the wire
+    tool = ROBOT.tools[0]
+    span = tool.gripper_open - tool.gripper_closed
+    np.testing.assert_allclose(moved[:, 6], span * steps[:, 0], atol=1e-6)
+
+
+def test_images_arrive_in_the_size_and_layout_that_the_server_wants(tmp_path, server):
+    policy = make_policy(tmp_path, server)
+    policy.reset(seed=0)
+    from mtv_world_ros.policies.msgpack_arrays import pack
+
+    answer = policy._exchange(pack(policy._mapping.request(observe(), 'stack')))
+    assert answer['seen'] == {
+        'cam_high': [3, 224, 224, 'uint8'],
+        'cam_low': [3, 224, 224, 'uint8'],
+    }
+    assert answer['state_dtype'] == 'float32'
+    # 96 x 72 fills 224 x 168 of 224 x 224
+    np.testing.assert_allclose(answer['mean'], [200 * 168 / 224, 60 * 168 / 224], atol=0.5)
+
+
+def test_padding_keeps_the_aspect_ratio_and_centres():
+    frame = np.full((72, 96, 3), 255, np.uint8)
+    padded = fitted(frame, 224, 224)
+    assert (padded[28:196] == 255).all() and not padded[:28].any() and not padded[196:].any()
+    assert (fitted(frame, 224, 224, 'stretch') == 255).all()
+
+
+def test_a_servers_traceback_is_told_and_the_next_episode_connects_again(tmp_path, server):
+    policy = make_policy(tmp_path, server)
+    policy.reset(seed=0)
+    with pytest.raises(PolicyError, match="failed: KeyError: 'no such checkpoint'"):
+        policy.act(observe(), 'fail')
+    policy.reset(seed=1)
+    assert policy.act(observe(), 'stack') is not None
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one(tmp_path, server):
+    policy = make_policy(tmp_path, server)
+    policy.reset(seed=0)
+    with pytest.raises(PolicyError, match=r"did not answer within 1 s \('timeout_s'\)"):
+        policy.act(observe(), 'sleep')
+    shifted = HOME + 0.05
+    answer = policy.act(observe(shifted), 'stack')
+    assert answer.positions[0, 0] == pytest.approx(0.06, abs=1e-6)
+
+
+def test_not_a_number_is_refused_with_its_place(tmp_path, server):
+    policy = make_policy(tmp_path, server)
+    with pytest.raises(PolicyError, match='action 3 has nan in column 2'):
+        policy.act(observe(), 'nan')
+
+
+def test_a_server_that_dies_is_told(tmp_path):
+    process, port = start_server()
+    policy = make_policy(tmp_path, port)
+    policy.reset(seed=0)
+    process.kill()
+    process.wait()
+    with pytest.raises(PolicyError, match='is gone'):
+        policy.act(observe(), 'stack')
+    with pytest.raises(PolicyError, match='no connection .* is it running'):
+        policy.reset(seed=0)
+
+
+def test_the_api_key_comes_from_the_environment(tmp_path, monkeypatch):
+    process, port = start_server('--key')
+    try:
+        policy = make_policy(tmp_path, port, api_key_variable='OPENPI_KEY')
+        with pytest.raises(ConfigError, match="'OPENPI_KEY' with the API key is not set"):
+            policy.reset(seed=0)
+        monkeypatch.setenv('OPENPI_KEY', 'wrong')
+        with pytest.raises(PolicyError, match='401'):
+            policy.reset(seed=0)
+        monkeypatch.setenv('OPENPI_KEY', 'secret')
+        assert policy.act(observe(), 'stack') is not None
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_relative_actions_count_from_the_observed_positions(tmp_path, server):
+    actions = yaml.safe_load(share_path('config', 'policies', 'openpi.yaml').read_text())[
+        'actions'
+    ]
+    policy = make_policy(tmp_path, server, actions={**actions, 'relative': True})
+    answer = policy.act(observe(), 'stack')
+    assert answer.positions[0, 1] == pytest.approx(2 * 1.047 + 0.01, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        ({'sever': 'x'}, r"unknown key 'sever' \(did you mean 'server'\?\)"),
+        ({'server': 'localhost:8000'}, r"'server' is 'localhost:8000'; expected ws://"),
+        ({'images': [{'key': 'a', 'veiw': 'low'}]}, r"'veiw' \(did you mean 'view'\?\)"),
+        ({'images': [{'key': 'a', 'view': 'low', 'width': 3}]}, "give both 'width' and 'height'"),
+        ({'state': [{'key': 's', 'joints': {'left_joint1': 1}}]}, r'columns \[0\] of 2 get no'),
+        ({'actions': {'joints': {}, 'rate_hz': 50}}, 'joints .* are missing'),
+        ({'timeout_s': 0}, "'timeout_s' is 0, must be positive"),
+    ],
+)  # fmt: skip
+def test_wrong_configurations_say_what_would_be_right(tmp_path, changes, text):
+    with pytest.raises(ConfigError, match=text):
+        make_policy(tmp_path, 1, **changes)
