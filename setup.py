@@ -70,8 +70,8 @@ setup(
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # LeRobot datasets are read with it (mtv-world import-dataset).
         'import': ['pyarrow>=17'],
-        # Clients of policy servers: openpi's.
-        'policies': ['msgpack>=1', 'websockets>=13'],
+        # Clients of policy servers: LeRobot's (grpcio), openpi's.
+        'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.

@@ -11,10 +11,12 @@ from typing import Any, Protocol
 from mtv_world_ros.config_values import check_keys, number, read_yaml, text
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.lerobot_client import lerobot_config
 from mtv_world_ros.policies.openpi_client import openpi_config
 from mtv_world_ros.policies.policy import Policy
 
-KINDS = ('scripted', 'python', 'openpi')
+_SERVERS = {'openpi': openpi_config, 'lerobot': lerobot_config}
+KINDS = ('scripted', 'python', 'openpi', 'lerobot')
 
 
 class PolicyConfig(Protocol):
@@ -94,8 +96,8 @@ def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | Scripted
             variant=text(rest, 'variant', default.variant, where),
             hold_s=number(rest, 'hold_s', default.hold_s, where),
         )
-    if kind == 'openpi':
-        return openpi_config(rest, where)
+    if kind in _SERVERS:
+        return _SERVERS[kind](rest, where)
     check_keys(rest, ('factory', 'arguments'), ('factory',), where)
     arguments = check_keys(rest.get('arguments') or {}, rest.get('arguments') or (), (), where)
     return PythonPolicyConfig(factory=text(rest, 'factory', '', where), arguments=arguments)

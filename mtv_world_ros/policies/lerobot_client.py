@@ -1,0 +1,218 @@
+"""A client of LeRobot's policy server (`lerobot.async_inference.policy_server`), over gRPC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import time
+from typing import Any
+
+from mtv_world_ros.config_values import check_keys, number, text
+from mtv_world_ros.data_types import JointTrajectory, Observation
+from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.lerobot_messages import (
+    observation_parts,
+    policy_setup,
+    read_actions,
+)
+from mtv_world_ros.policies.server_mapping import read_mapping, ServerMapping
+
+_MAPPING_KEYS = ('images', 'state', 'actions')
+_KEYS = ('server', 'timeout_s', 'setup_timeout_s', 'policy', *_MAPPING_KEYS)
+_POLICY_KEYS = ('type', 'path', 'device', 'actions_per_chunk', 'rename')
+_SERVICE = '/transport.AsyncInference/'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeRobotConfig:
+    """Which server and policy, and what it gets and gives.
+
+    Attributes:
+        server: e.g. `localhost:8080`.
+        timeout_s: longest wait for an answer [s].
+        setup_timeout_s: longest wait until the server has loaded the policy [s].
+        policy_type: as LeRobot names it, e.g. `act`, `smolvla`, `pi0`.
+        path: folder or name of the pretrained policy, for the server.
+        device: of the policy, on the server.
+        actions_per_chunk: actions of an answer.
+        rename: from keys of the observation to those of the policy.
+        values: the file's mapping keys, see `read_mapping`.
+        where: the file.
+    """
+
+    server: str
+    timeout_s: float
+    setup_timeout_s: float
+    policy_type: str
+    path: str
+    device: str
+    actions_per_chunk: int
+    rename: Mapping[str, str]
+    values: Mapping[str, Any]
+    where: str
+
+    def make(self, robot: RobotModel) -> LeRobotPolicy:
+        """Returns the client; it connects at its first reset.
+
+        Raises:
+            ConfigError: a key is unknown or missing, a value is wrong, a package is missing.
+        """
+        try:
+            import grpc  # noqa: F401
+        except ImportError as error:
+            raise ConfigError(
+                f"{self.where}: the client of LeRobot's server needs the package 'grpcio'; "
+                "install it with: pip install 'mtv_world_ros[policies]'"
+            ) from error
+        mapping = read_mapping(self.values, robot, self.where)
+        if len(mapping.states) != 1 or not mapping.states[0].names:
+            raise ConfigError(
+                f"{self.where}: 'state' must have one entry with 'names', the motors in the order "
+                'of observation.state'
+            )
+        nested = [image.key for image in mapping.images if len(image.key) > 1]
+        if nested or any(not (image.width and image.height) for image in mapping.images):
+            raise ConfigError(
+                f"{self.where}: every image needs a plain 'key', the camera's name, and 'width' "
+                "and 'height' as the robot's camera has them"
+            )
+        return LeRobotPolicy(self, mapping)
+
+
+def lerobot_config(values: Mapping[str, Any], where: str) -> LeRobotConfig:
+    """Reads a policy file of kind `lerobot`, without its `kind`.
+
+    Raises:
+        ConfigError: a key is unknown or missing, a value is wrong.
+    """
+    check_keys(values, _KEYS, ('server', 'policy', 'state', 'actions'), where)
+    inner = f'{where}: policy'
+    policy = check_keys(values['policy'], _POLICY_KEYS, ('type', 'path'), inner)
+    seconds = {
+        key: number(values, key, default, where)
+        for key, default in (('timeout_s', 60.0), ('setup_timeout_s', 600.0))
+    }
+    count = number(policy, 'actions_per_chunk', 50, inner)
+    for key, value in {**seconds, 'actions_per_chunk': count}.items():
+        if value <= 0:
+            raise ConfigError(f"{where}: '{key}' is {value:g}, must be positive")
+    rename = policy.get('rename') or {}
+    return LeRobotConfig(
+        server=text(values, 'server', '', where),
+        policy_type=text(policy, 'type', '', inner),
+        path=text(policy, 'path', '', inner),
+        device=text(policy, 'device', 'cpu', inner),
+        actions_per_chunk=int(count),
+        rename=check_keys(rename, rename, (), f'{inner}: rename'),
+        values={key: values[key] for key in _MAPPING_KEYS if key in values},
+        where=where,
+        **seconds,
+    )
+
+
+class LeRobotPolicy:
+    """Asks the server, one observation at a time.
+
+    Args:
+        config: which server and policy.
+        mapping: what it gets and gives.
+    """
+
+    def __init__(self, config: LeRobotConfig, mapping: ServerMapping) -> None:
+        self._config, self._mapping = config, mapping
+        self._channel: Any = None
+        self._is_set_up = False
+        self._timestep = 0
+
+    @property
+    def name(self) -> str:
+        """Type and path of the policy."""
+        return f'lerobot {self._config.policy_type} {self._config.path}'
+
+    def reset(self, *, seed: int) -> None:
+        """Lets the server forget what it has, and load the policy if that is not done."""
+        del seed
+        self._timestep = 0
+        config = self._config
+        self._call('Ready', b'', config.timeout_s)
+        if not self._is_set_up:
+            setup = {
+                'policy_type': config.policy_type,
+                'pretrained_name_or_path': config.path,
+                'lerobot_features': self._features(),
+                'actions_per_chunk': config.actions_per_chunk,
+                'device': config.device,
+                'rename_map': dict(config.rename),
+            }
+            self._call('SendPolicyInstructions', policy_setup(setup), config.setup_timeout_s)
+            self._is_set_up = True
+
+    def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
+        """Returns the server's chunk of actions as commands; it never ends an episode.
+
+        Raises:
+            PolicyError: no connection, no answer in time, or one that cannot be used.
+        """
+        mapping, state = self._mapping, self._mapping.states[0]
+        raw: dict[str, Any] = {image.key[0]: image.image(observation) for image in mapping.images}
+        raw |= dict(zip(state.names, mapping.columns(state, observation).tolist(), strict=True))
+        values = {
+            'timestamp': time.time(),
+            'timestep': self._timestep,
+            'observation': {**raw, 'task': instruction},
+            # or the server would leave out what looks like the one before
+            'must_go': True,
+        }
+        self._timestep += self._config.actions_per_chunk
+        self._send_observation(values)
+        answer = self._call('GetActions', b'', self._config.timeout_s)
+        return mapping.actions.trajectory(read_actions(answer), observation)
+
+    def close(self) -> None:
+        """Closes the connection; the next reset sets the policy up again."""
+        channel, self._channel, self._is_set_up = self._channel, None, False
+        if channel is not None:
+            channel.close()
+
+    def _features(self) -> dict[str, dict[str, Any]]:
+        """The observation's features as LeRobot's data sets describe them."""
+        names = list(self._mapping.states[0].names)
+        features: dict[str, dict[str, Any]] = {
+            'observation.state': {'dtype': 'float32', 'shape': (len(names),), 'names': names}
+        }
+        for image in self._mapping.images:
+            features[f'observation.images.{image.key[0]}'] = {
+                'dtype': 'image',
+                'shape': (image.height, image.width, 3),
+                'names': ['height', 'width', 'channels'],
+            }
+        return features
+
+    def _send_observation(self, values: Mapping[str, Any]) -> None:
+        stub = self._connected().stream_unary(f'{_SERVICE}SendObservations')
+        self._guarded(lambda: stub(observation_parts(values), timeout=self._config.timeout_s))
+
+    def _call(self, method: str, request: bytes, timeout_s: float) -> bytes:
+        stub = self._connected().unary_unary(f'{_SERVICE}{method}')
+        return self._guarded(lambda: stub(request, timeout=timeout_s))
+
+    def _connected(self) -> Any:
+        import grpc
+
+        if self._channel is None:
+            unlimited = [('grpc.max_receive_message_length', -1)]
+            self._channel = grpc.insecure_channel(self._config.server, options=unlimited)
+        return self._channel
+
+    def _guarded(self, call: Any) -> Any:
+        import grpc
+
+        try:
+            return call()
+        except grpc.RpcError as error:
+            self.close()
+            code, details = error.code().name, error.details()  # type: ignore[attr-defined]
+            raise PolicyError(
+                f"the policy server '{self._config.server}' did not do it: {code}: {details}"
+            ) from error
