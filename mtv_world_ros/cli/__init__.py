@@ -8,6 +8,7 @@ import sys
 from mtv_world_ros.cli import (
     collect,
     demo,
+    distill,
     doctor,
     evaluate,
     imagine,
@@ -25,6 +26,7 @@ COMMANDS = (
     imagine,
     collect,
     train,
+    distill,
     evaluate,
     report,
     doctor,

@@ -105,8 +105,6 @@ def _train(arguments: argparse.Namespace) -> int:
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """What the options change of the preset; --set wins."""
-    import yaml
-
     from mtv_world_ros.errors import ConfigError
 
     overrides: dict[str, Any] = {}
@@ -119,7 +117,21 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
         overrides |= {'video.views': views, 'transformer.num_views': len(views)}
     if arguments.object_mask is not None:
         overrides['video.object_mask'] = arguments.object_mask == 'on'
-    for item in arguments.overrides:
+    return overrides | set_overrides(arguments.overrides)
+
+
+def set_overrides(items: list[str]) -> dict[str, Any]:
+    """Returns what `--set SECTION.KEY=VALUE` options say.
+
+    Raises:
+        ConfigError: one has no value.
+    """
+    import yaml
+
+    from mtv_world_ros.errors import ConfigError
+
+    overrides: dict[str, Any] = {}
+    for item in items:
         key, equals, value = item.partition('=')
         if not equals:
             raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")

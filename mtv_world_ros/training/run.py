@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import json
 from pathlib import Path
 
@@ -93,6 +93,7 @@ def train(
     num_episodes: int | None = None,
     initial: Path | None = None,
     cache: Path | None = None,
+    make_trainer: Callable[..., Trainer] = Trainer,
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
@@ -112,6 +113,7 @@ def train(
         num_episodes: use only so many, spread evenly over all.
         initial: checkpoint whose weights a new run starts from; a resumed one has its own.
         cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
+        make_trainer: what trains, with the arguments of `Trainer`.
 
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
@@ -131,7 +133,7 @@ def train(
         'skipped': len(skipped),
         'tasks': sorted({recording.task for recording in recordings}),
     }
-    trainer = Trainer(
+    trainer = make_trainer(
         config,
         out,
         seed=seed,

@@ -1,0 +1,85 @@
+"""`mtv-world distill`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from mtv_world_ros.cli.options import add_dtype
+
+#: laid over the preset: a student starts from a trained model and is near its end
+_DEFAULTS = {
+    'optimizer.learning_rate': 1e-4,
+    'optimizer.warmup_steps': 50,
+    'optimizer.steps': 1000,
+    'optimizer.ema_decay': 0.99,
+}
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'distill', help='make a model that needs fewer denoising steps from a trained one'
+    )
+    parser.add_argument('checkpoint', help="the teacher: a folder, or 'bundled'")
+    parser.add_argument('dataset', type=Path)
+    parser.add_argument('--out', type=Path, required=True, help='resumes what is there')
+    parser.add_argument('--steps', type=int, default=4, help='denoising steps of the student')
+    parser.add_argument(
+        '--teacher-steps', type=int, help='of the teacher; default: 8 times those of the student'
+    )
+    parser.add_argument('--preset', default='small', help='optimizer, loss and disturbances')
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides',
+        help='e.g. optimizer.steps=2000',
+    )  # fmt: skip
+    parser.add_argument('--episodes', type=int, help='use only so many, spread over all')
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
+    )
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='see train')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--device', default='cpu')
+    add_dtype(parser)
+    parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all cores')
+    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    parser.set_defaults(handler=_distill)
+
+
+def _distill(arguments: argparse.Namespace) -> int:
+    import os
+
+    import torch
+
+    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.cli.train import set_overrides
+    from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.distill import distill, DistillConfig
+
+    settings = DistillConfig(
+        num_steps=arguments.steps, teacher_steps=arguments.teacher_steps or 8 * arguments.steps
+    )
+    teacher = checkpoint_path(arguments.checkpoint)
+    overrides = {**_DEFAULTS, **set_overrides(arguments.overrides)}
+    torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
+    folder = distill(
+        teacher,
+        select(arguments.dataset, arguments.split, default='train').paths,
+        arguments.out,
+        load_training_config(arguments.preset, overrides),
+        settings,
+        robot=load_robot(robot_path(read_card(teacher)['robot'])),
+        segmenter=assemble_segmenter(device=arguments.device),
+        seed=arguments.seed,
+        device=arguments.device,
+        dtype=choose_dtype(arguments.dtype, arguments.device),
+        save_every=arguments.save_every,
+        num_episodes=arguments.episodes,
+        cache=arguments.cache,
+    )
+    print(f'checkpoint for {settings.num_steps} denoising steps: {folder}')
+    return 0

@@ -1,0 +1,280 @@
+"""`mtv-world distill`: a student that samples in a few steps what its teacher does in many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mtv_world_ros.errors import ConfigError, TrainingError
+from mtv_world_ros.model.card import spec_of
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.conditioning import Conditioning
+from mtv_world_ros.model.lora import Adapters
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.sampler import flow_of
+from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.config import TrainingConfig, VideoConfig
+from mtv_world_ros.training.distill_objective import (
+    as_predicted,
+    follow,
+    path_sigmas,
+    straight_flows,
+    straight_scheduler,
+)
+from mtv_world_ros.training.draws import Draws
+from mtv_world_ros.training.encoding import encode_batch, Encoders
+from mtv_world_ros.training.objective import Loss, sample_loss
+from mtv_world_ros.training.run import train
+from mtv_world_ros.training.trainer import Trainer
+
+_SETTINGS = 'distillation.json'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DistillConfig:
+    """How far the student's steps reach.
+
+    Attributes:
+        num_steps: denoising steps that the student is made for.
+        teacher_steps: of the teacher, a multiple of them.
+    """
+
+    num_steps: int = 4
+    teacher_steps: int = 32
+
+    def __post_init__(self) -> None:
+        if self.num_steps < 1:
+            raise ConfigError(f'--steps is {self.num_steps}; the student needs at least 1')
+        if self.teacher_steps < self.num_steps or self.teacher_steps % self.num_steps:
+            raise ConfigError(
+                f'--teacher-steps is {self.teacher_steps}; it must be a multiple of --steps, '
+                f'e.g. {8 * self.num_steps}'
+            )
+
+    @property
+    def substeps(self) -> int:
+        """Steps of the teacher for each of the student's."""
+        return self.teacher_steps // self.num_steps
+
+
+class DistillTrainer(Trainer):
+    """Trains a student, which begins as its teacher.
+
+    Args:
+        teacher: to distil; guided where its card has a guidance scale.
+        distill: how far the student's steps reach.
+        options: those of `Trainer`.
+    """
+
+    def __init__(self, *args: Any, teacher: Checkpoint, distill: DistillConfig, **options: Any):
+        super().__init__(*args, **options)
+        self.parts, self.distill = teacher, distill
+        if teacher.adapter is not None:
+            adapters = Adapters(teacher.transformer)
+            adapters.use(teacher.adapter)
+            adapters.merge()
+        # before it takes the number format of forward and backward
+        self._first = {n: t.clone() for n, t in teacher.transformer.state_dict().items()}
+        dtype = self.weights.worker.dtype
+        self.teacher = place(copy_of(teacher.transformer), self.device, dtype).eval()
+        self.teacher.requires_grad_(False)
+        self.autoencoder = place(teacher.autoencoder, self.device, torch.float32)
+        self.guidance = float(teacher.card.get('guidance_scale', 1.0))
+        self.encoders = self._encoders(teacher)
+        self._negative = self._text('negative_prompt') if self.guidance != 1.0 else None
+        self._sigmas = path_sigmas(teacher.scheduler, distill.num_steps, distill.substeps)
+
+    def _encoders(self, teacher: Checkpoint) -> Encoders:
+        if teacher.image_encoder is not None:
+            teacher.image_encoder.to(self.device)
+        return Encoders(
+            autoencoder=self.autoencoder, text=self._text('prompt'), image=teacher.image_encoder
+        )
+
+    def _text(self, key: str) -> Tensor | None:
+        """Tokens of a text of the card, in models with text."""
+        encoder = self.parts.text_encoder
+        return encoder and encoder.encode(self.parts.card.get(key, ''), self.device)
+
+    def start_from(self, folder: Path) -> None:
+        """Takes the teacher's weights, its adapter merged."""
+        del folder
+        self.weights.worker.load_state_dict(self._first)
+        self.weights.load(self._first)
+        self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
+
+    def loss(self, batch: Batch) -> Loss:
+        """The loss of all the student's steps along one path of the teacher a clip."""
+        encoded = encode_batch(self.encoders, batch, self.config.objective, self.device)
+        condition = encoded.conditioning.in_dtype(self.weights.worker.dtype)
+        draws = Draws(self.seed, batch.step, batch.numbers)
+        noise = draws.normal(*encoded.clean.shape[1:]).to(self.device)
+        sigmas = self._sigmas.to(self.device)
+        points = follow(
+            lambda latents, sigma: self._teacher_flow(latents, sigma, condition),
+            noise,
+            sigmas,
+            self.distill.substeps,
+        )
+        levels = sigmas[:: self.distill.substeps]
+        losses = [
+            self._line_loss(latents, sigma, flow, condition, encoded.weights)
+            for latents, sigma, flow in zip(
+                points[:-1], levels[:-1], straight_flows(points, levels), strict=True
+            )
+        ]
+        return Loss(
+            torch.stack([loss.total for loss in losses]).sum(),
+            torch.stack([loss.weight for loss in losses]).sum(),
+        )
+
+    def _line_loss(
+        self,
+        latents: Tensor,
+        sigma: Tensor,
+        flow: Tensor,
+        condition: Conditioning,
+        weights: Tensor,
+    ) -> Loss:
+        student = self.weights.worker
+        target = as_predicted(student.prediction, flow, latents, sigma)
+        predicted = _denoise(student, latents, sigma, condition, condition.text)
+        return sample_loss(predicted, target, weights, self.config.objective.huber_delta)
+
+    def _teacher_flow(self, latents: Tensor, sigma: Tensor, condition: Conditioning) -> Tensor:
+        out = _denoise(self.teacher, latents, sigma, condition, condition.text)
+        if self._negative is not None:
+            negative = self._negative.expand(len(latents), -1, -1)
+            away = _denoise(self.teacher, latents, sigma, condition, negative)
+            out = away + self.guidance * (out - away)
+        return flow_of(self.teacher, out, latents, sigma)
+
+    def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
+        """Writes the averaged student with the teacher's other parts as a checkpoint."""
+        trained_on = {
+            **self.trained_on,
+            'steps': self.step,
+            'seed': self.seed,
+            'distilled': asdict(self.distill),
+            'teacher': self.parts.card['trained_on'],
+        }
+        card = {
+            **self.parts.card,
+            'num_inference_steps': self.distill.num_steps,
+            'trained_on': trained_on,
+        }
+        card.pop('guidance_scale', None)  # the student has learned it
+        student = replace(
+            self.parts,
+            transformer=self.weights.averaged(),
+            scheduler=straight_scheduler(self.parts.scheduler),
+            card=card,
+            adapter=None,
+        )
+        save_checkpoint(student, folder, dtype=dtype)
+
+
+def _denoise(
+    transformer: MultiViewWanTransformer,
+    latents: Tensor,
+    sigma: Tensor,
+    condition: Conditioning,
+    text: Tensor | None,
+) -> Tensor:
+    dtype = transformer.dtype
+    return transformer(
+        latents.to(dtype),
+        (1000 * sigma).expand(len(latents)),
+        control=condition.control,
+        start=condition.start,
+        reference=condition.reference,
+        start_control=condition.start_control,
+        encoder_hidden_states=None if text is None else text.to(dtype),
+        encoder_hidden_states_image=None if condition.image is None else condition.image.to(dtype),
+        actions=condition.actions,
+    ).float()
+
+
+def distill(
+    checkpoint: Path, dataset: Any, out: Path, config: TrainingConfig, settings: DistillConfig,
+    **options: Any,
+) -> Path:  # fmt: skip
+    """Distils a checkpoint, resuming from `out` where it was left; returns the student's folder.
+
+    Args:
+        checkpoint: the teacher.
+        dataset: episodes; their start frames and actions count, their later frames only weigh
+            the pixels.
+        out: see `train`.
+        config: optimizer, objective and disturbances; all else is the teacher's.
+        settings: how far the student's steps reach.
+        options: of `train`.
+
+    Raises:
+        CheckpointError: the teacher cannot be loaded.
+        TrainingError: `out` holds another distillation; see also `train`.
+    """
+    teacher = load_checkpoint(checkpoint)
+    _check_same(out, {**asdict(settings), 'teacher': teacher.card['trained_on']})
+    return train(
+        student_config(config, teacher),
+        dataset,
+        out,
+        initial=checkpoint,
+        make_trainer=partial(DistillTrainer, teacher=teacher, distill=settings),
+        **options,
+    )
+
+
+def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfig:
+    """Returns a configuration with the teacher's architecture, video and rendering."""
+    card, spec = teacher.card, spec_of(teacher.card)
+    return replace(
+        config,
+        transformer=_arguments(teacher.transformer.config),
+        autoencoder=_with_class(getattr(teacher.autoencoder, 'vae', teacher.autoencoder)),
+        scheduler=_with_class(teacher.scheduler),
+        video=VideoConfig(
+            views=spec.views,
+            fps=spec.fps,
+            num_frames=spec.num_frames,
+            width=spec.width,
+            height=spec.height,
+            robot=spec.robot,
+            control=card['control'],
+            object_mask=card['object_mask'],
+        ),
+        rendering=TrajectoryVideoConfig(**card['rendering']),
+    )
+
+
+def _arguments(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in config.items() if not name.startswith('_')}
+
+
+def _with_class(part: Any) -> dict[str, Any]:
+    return {**_arguments(part.config), '_class_name': type(part).__name__}
+
+
+def _check_same(out: Path, settings: Mapping[str, Any]) -> None:
+    file = out / _SETTINGS
+    wanted = json.loads(json.dumps(settings))
+    if file.is_file():
+        found = json.loads(file.read_text())
+        different = [key for key in wanted if found.get(key) != wanted[key]]
+        if different:
+            raise TrainingError(
+                f"'{out}' holds another distillation: its {', '.join(different)} differ; give "
+                'the same teacher and steps, or another --out'
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(wanted, indent=2) + '\n')
