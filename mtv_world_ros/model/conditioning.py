@@ -63,9 +63,11 @@ class Conditioning:
         return replace(self, **{n: v.expand(count, *v.shape[1:]) for n, v in held.items()})
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
-        """Returns the same with the latents of videos and images in a number format."""
-        names = ('control', 'start_control', 'start', 'reference')
-        return replace(self, **{name: getattr(self, name).to(dtype) for name in names})
+        """Returns the same with latents and tokens in a number format; actions stay."""
+        latents = ('control', 'start_control', 'start', 'reference', 'anchor', 'history')
+        tokens = ('text', 'negative_text', 'image')
+        held = {name: getattr(self, name) for name in (*latents, *tokens)}
+        return replace(self, **{n: v.to(dtype) for n, v in held.items() if v is not None})
 
 
 def encode_frames(autoencoder: Autoencoder, frames: Tensor) -> Tensor:

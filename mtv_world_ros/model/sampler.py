@@ -74,9 +74,9 @@ def sample_latents(
             raise RolloutPreempted(
                 f'given up after {step} of {num_inference_steps} denoising steps'
             )
-        out = _predict(transformer, latents, timestep, conditioning, conditioning.text)
+        out = denoise(transformer, latents, timestep, conditioning, conditioning.text)
         if guidance_scale != 1.0 and conditioning.negative_text is not None:
-            away = _predict(
+            away = denoise(
                 transformer, latents, timestep, conditioning, conditioning.negative_text
             )
             out = away + guidance_scale * (out - away)
@@ -99,13 +99,22 @@ def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.
         scheduler.set_timesteps(num_inference_steps, device=device)
 
 
-def _predict(
+def denoise(
     transformer: MultiViewWanTransformer,
     latents: Tensor,
     timestep: Tensor,
     conditioning: Conditioning,
     text: Tensor | None,
 ) -> Tensor:
+    """Returns what the transformer predicts of latents, in float32.
+
+    Args:
+        transformer: the model.
+        latents: (B, V, C, F, h, w) noisy.
+        timestep: of all of them, in [0, 1000].
+        conditioning: in the transformer's number format.
+        text: tokens in place of the conditioning's.
+    """
     return transformer(
         latents.to(transformer.dtype),
         timestep.expand(len(latents)),

@@ -18,8 +18,8 @@ from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_che
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.sampler import flow_of
-from mtv_world_ros.model.transformer import copy_of, MultiViewWanTransformer
+from mtv_world_ros.model.sampler import denoise, flow_of
+from mtv_world_ros.model.transformer import copy_of
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.training.batches import Batch
 from mtv_world_ros.training.config import TrainingConfig, VideoConfig
@@ -118,6 +118,9 @@ class DistillTrainer(Trainer):
         condition = encoded.conditioning.in_dtype(self.weights.worker.dtype)
         draws = Draws(self.seed, batch.step, batch.numbers)
         noise = draws.normal(*encoded.clean.shape[1:]).to(self.device)
+        if condition.history is not None:
+            noisy = draws.normal(*condition.history.shape[1:]).to(self.device)
+            condition = condition.with_noisy_history(noisy)
         sigmas = self._sigmas.to(self.device)
         points = follow(
             lambda latents, sigma: self._teacher_flow(latents, sigma, condition),
@@ -147,14 +150,14 @@ class DistillTrainer(Trainer):
     ) -> Loss:
         student = self.weights.worker
         target = as_predicted(student.prediction, flow, latents, sigma)
-        predicted = _denoise(student, latents, sigma, condition, condition.text)
+        predicted = denoise(student, latents, 1000 * sigma, condition, condition.text)
         return sample_loss(predicted, target, weights, self.config.objective.huber_delta)
 
     def _teacher_flow(self, latents: Tensor, sigma: Tensor, condition: Conditioning) -> Tensor:
-        out = _denoise(self.teacher, latents, sigma, condition, condition.text)
+        out = denoise(self.teacher, latents, 1000 * sigma, condition, condition.text)
         if self._negative is not None:
-            negative = self._negative.expand(len(latents), -1, -1)
-            away = _denoise(self.teacher, latents, sigma, condition, negative)
+            negative = self._negative.to(self.teacher.dtype).expand(len(latents), -1, -1)
+            away = denoise(self.teacher, latents, 1000 * sigma, condition, negative)
             out = away + self.guidance * (out - away)
         return flow_of(self.teacher, out, latents, sigma)
 
@@ -181,27 +184,6 @@ class DistillTrainer(Trainer):
             adapter=None,
         )
         save_checkpoint(student, folder, dtype=dtype)
-
-
-def _denoise(
-    transformer: MultiViewWanTransformer,
-    latents: Tensor,
-    sigma: Tensor,
-    condition: Conditioning,
-    text: Tensor | None,
-) -> Tensor:
-    dtype = transformer.dtype
-    return transformer(
-        latents.to(dtype),
-        (1000 * sigma).expand(len(latents)),
-        control=condition.control,
-        start=condition.start,
-        reference=condition.reference,
-        start_control=condition.start_control,
-        encoder_hidden_states=None if text is None else text.to(dtype),
-        encoder_hidden_states_image=None if condition.image is None else condition.image.to(dtype),
-        actions=condition.actions,
-    ).float()
 
 
 def distill(

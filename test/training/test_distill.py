@@ -107,7 +107,7 @@ def test_another_teacher_into_the_same_folder_is_refused(
     teacher: Path, episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
 ) -> None:
     (tmp_path / 'distillation.json').write_text(
-        json.dumps({'num_steps': 4, 'teacher_steps': 16, 'teacher': {'steps': 7}})
+        json.dumps({'num_steps': 4, 'teacher_steps': 32, 'teacher': {'steps': 7}})
     )
     with pytest.raises(TrainingError, match='another distillation: its teacher differ'):
         distill(
