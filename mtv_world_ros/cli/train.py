@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.cli.held_out import add_held_out, held_out
 from mtv_world_ros.cli.options import add_dtype
 
 if TYPE_CHECKING:
@@ -57,6 +58,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--threads', type=int, default=0, help='CPU threads a process; 0 = its share of all cores'
     )
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    parser.add_argument(
+        '--peak-tflops',
+        type=float,
+        default=0.0,
+        metavar='N',
+        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
+        'large matrices, measured at the start',
+    )
+    add_held_out(parser)
     parser.set_defaults(handler=_train)
 
 
@@ -85,9 +95,10 @@ def _train(arguments: argparse.Namespace) -> int:
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(1, len(os.sched_getaffinity(0)) // processes)
     torch.set_num_threads(arguments.threads or cores)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
     folder = train(
         config,
-        select(arguments.dataset, arguments.split, default='train').paths,
+        paths,
         arguments.out,
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter(device=arguments.device),
@@ -98,6 +109,8 @@ def _train(arguments: argparse.Namespace) -> int:
         num_episodes=arguments.episodes,
         initial=arguments.init and checkpoint_path(arguments.init),
         cache=arguments.cache,
+        held_out=held_out(arguments, paths, dtype),
+        peak_flops=arguments.peak_tflops * 1e12,
     )
     print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
     return 0

@@ -24,15 +24,24 @@ class TrainingLog:
         step: that the training starts from; what was logged after it is made again.
         total: steps of the training.
         active: False writes nothing, for processes but the main one.
+        ideal_seconds: of a step whose model arithmetic runs at the machine's peak; None = unknown.
     """
 
-    def __init__(self, folder: Path, *, step: int, total: int, active: bool = True) -> None:
-        self._total, self._active = total, active
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        step: int,
+        total: int,
+        active: bool = True,
+        ideal_seconds: float | None = None,
+    ) -> None:
+        self._total, self._active, self._ideal = total, active, ideal_seconds
         self._bar = tqdm(
             total=total, initial=step, desc='training', unit='step', disable=not active
         )
         self._started = time.time()
-        self._seconds = self._waited = 0.0
+        self._steps, self._seconds, self._waited = 0, 0.0, 0.0
         if active:
             self._file = _cut(folder / 'log.jsonl', step).open('a')
             self._board = SummaryWriter(str(folder / 'tensorboard'), purge_step=step + 1)
@@ -49,6 +58,7 @@ class TrainingLog:
     def add(self, report: StepReport) -> None:
         """Counts a step; every tenth one, and the last, is written."""
         self._bar.update()
+        self._steps += 1
         self._seconds += report.seconds
         self._waited += report.waited
         if not self._active or (report.step % _EVERY and report.step != self._total):
@@ -58,11 +68,22 @@ class TrainingLog:
             'loss': round(report.average, 6),
             'learning_rate': report.learning_rate,
             'grad_norm': round(report.grad_norm, 4),
-            'wait_share': round(self._waited / max(self._seconds, 1e-9), 4),
+            **self._speed(),
             'seconds': round(time.time() - self._started, 1),
         }
-        self._seconds = self._waited = 0.0
         self.write(report.step, row)
+
+    def _speed(self) -> dict[str, float]:
+        """Of the steps since the last row."""
+        seconds = max(self._seconds, 1e-9)
+        found = {
+            'steps_per_second': round(self._steps / seconds, 4),
+            'wait_share': round(self._waited / seconds, 4),
+        }
+        if self._ideal is not None:
+            found['mfu'] = round(self._steps * self._ideal / seconds, 4)
+        self._steps, self._seconds, self._waited = 0, 0.0, 0.0
+        return found
 
     def write(self, step: int, row: dict[str, Any]) -> None:
         """Writes numbers of a step."""

@@ -19,8 +19,10 @@ from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.training.actions import kept_actions
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.held_out import HeldOut
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.speed import ideal_seconds, measured_peak
 from mtv_world_ros.training.trainer import Trainer
 
 
@@ -93,7 +95,12 @@ def train(
     num_episodes: int | None = None,
     initial: Path | None = None,
     cache: Path | None = None,
+<<<<<<< HEAD
     make_trainer: Callable[..., Trainer] = Trainer,
+=======
+    held_out: HeldOut | None = None,
+    peak_flops: float | None = None,
+>>>>>>> 7864694 (Training: held-out episodes scored and shown on the way, the best checkpoint kept; wait share and FLOP utilisation in the log)
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
@@ -113,7 +120,13 @@ def train(
         num_episodes: use only so many, spread evenly over all.
         initial: checkpoint whose weights a new run starts from; a resumed one has its own.
         cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
+<<<<<<< HEAD
         make_trainer: what trains, with the arguments of `Trainer`.
+=======
+        held_out: judges checkpoints now and then, and keeps the best.
+        peak_flops: operations a second that a process's device can do at best, 0 = measure them;
+            the log then has the share that the model's arithmetic makes of them. None = not.
+>>>>>>> 7864694 (Training: held-out episodes scored and shown on the way, the best checkpoint kept; wait share and FLOP utilisation in the log)
 
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
@@ -171,8 +184,12 @@ def train(
             f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '
             f'{trainer.step}; {processes.count} processes'
         )
+    ideal = None
+    if peak_flops is not None and processes.is_main:
+        peak = peak_flops or measured_peak(processes.device, dtype)
+        ideal = ideal_seconds(config, actions, dtype, peak * processes.count)
     try:
-        _loop(trainer, source, save_every)
+        _loop(trainer, source, save_every, held_out, ideal)
     finally:
         source.close()
     return out / 'checkpoint'
@@ -184,10 +201,21 @@ def _steps_of(checkpoint: Path) -> int | None:
     return json.loads(card.read_text())['trained_on']['steps'] if card.is_file() else None
 
 
-def _loop(trainer: Trainer, source: BatchSource, save_every: int) -> None:
+def _loop(
+    trainer: Trainer,
+    source: BatchSource,
+    save_every: int,
+    held_out: HeldOut | None,
+    ideal: float | None,
+) -> None:
     folder, is_main = trainer.folder, trainer.processes.is_main
-    total = trainer.config.optimizer.steps
-    with TrainingLog(folder, step=trainer.step, total=total, active=is_main) as log:
+    with TrainingLog(
+        folder,
+        step=trainer.step,
+        total=trainer.config.optimizer.steps,
+        active=is_main,
+        ideal_seconds=ideal,
+    ) as log:
         reports = trainer.run(
             source,
             save_every=save_every,
@@ -195,3 +223,5 @@ def _loop(trainer: Trainer, source: BatchSource, save_every: int) -> None:
         )
         for report in reports:
             log.add(report)
+            if held_out is not None and is_main:
+                held_out.after(report.step, trainer, log)
