@@ -95,12 +95,9 @@ def train(
     num_episodes: int | None = None,
     initial: Path | None = None,
     cache: Path | None = None,
-<<<<<<< HEAD
     make_trainer: Callable[..., Trainer] = Trainer,
-=======
     held_out: HeldOut | None = None,
     peak_flops: float | None = None,
->>>>>>> 7864694 (Training: held-out episodes scored and shown on the way, the best checkpoint kept; wait share and FLOP utilisation in the log)
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
@@ -120,13 +117,10 @@ def train(
         num_episodes: use only so many, spread evenly over all.
         initial: checkpoint whose weights a new run starts from; a resumed one has its own.
         cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
-<<<<<<< HEAD
         make_trainer: what trains, with the arguments of `Trainer`.
-=======
         held_out: judges checkpoints now and then, and keeps the best.
         peak_flops: operations a second that a process's device can do at best, 0 = measure them;
             the log then has the share that the model's arithmetic makes of them. None = not.
->>>>>>> 7864694 (Training: held-out episodes scored and shown on the way, the best checkpoint kept; wait share and FLOP utilisation in the log)
 
     Raises:
         TrainingError: no usable episode, or the loss is not finite.
