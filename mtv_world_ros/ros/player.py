@@ -102,7 +102,7 @@ class Player(Node):
         while lonely := self._lonely(needed):
             if time.monotonic() > end_s:
                 raise ConfigError(
-                    f'nobody is connected to {lonely} after {self._options.wait_timeout:g} s; is '
+                    f'nobody subscribes to {lonely} after {self._options.wait_timeout:g} s; is '
                     'the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
                 )
             self._executor.spin_once(timeout_sec=0.05)

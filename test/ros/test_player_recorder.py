@@ -1,5 +1,6 @@
 """An episode is played into the node and what the node publishes is recorded."""
 
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -202,3 +203,46 @@ def test_recorder_leaves_no_half_written_folder(launch, tmp_path):
     out.mkdir()
     code, said = finish(launch('recorder', out, '/silence'))
     assert code == 1 and 'exists already' in said and 'Traceback' not in said
+
+
+def test_a_recorder_whose_parent_is_killed_closes_its_bag_and_ends(tmp_path, ros):
+    client = ros.Client()
+    out = tmp_path / 'bag'
+    parent = (
+        'import sys, time\n'
+        'from pathlib import Path\n'
+        'from mtv_world_ros.demo.child_processes import module_command, start_process\n'
+        "child = start_process('recorder', module_command('recorder', sys.argv[1], '/said'),\n"
+        '                      Path(sys.argv[1]).parent)\n'
+        'print(child.pid, flush=True)\n'
+        'time.sleep(100)\n'
+    )
+    process = subprocess.Popen(
+        [sys.executable, '-c', parent, str(out)], env=ros.ENVIRONMENT, stdout=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    try:
+        child = int(process.stdout.readline())
+        publisher = client.node.create_publisher(String, '/said', 10)
+        client.wait(publisher.get_subscription_count, 'the recorder')
+        log = tmp_path / 'recorder.log'
+        client.wait(lambda: ': recording' in log.read_text(), 'the recorder')
+        for text in ('a', 'b', 'c'):
+            publisher.publish(String(data=text))
+        publisher.wait_for_all_acked()
+        process.kill()
+        process.wait()
+        client.wait(out.is_dir, 'the closed bag')
+        assert len(list(BagReader(out).messages())) == 3
+        client.wait(lambda: not is_alive(child), 'the end of the recorder')
+    finally:
+        process.kill()
+        client.close()
+
+
+def is_alive(pid):
+    stat = Path(f'/proc/{pid}/stat')
+    try:
+        return stat.read_text().rsplit(')', 1)[1].split()[0] != 'Z'
+    except OSError:
+        return False
