@@ -50,6 +50,17 @@ class History:
         frames = np.concatenate([self.frames, start_frame[:, None], predicted[:, :-1]], axis=1)
         return History(anchor=self.anchor, frames=frames[:, max(frames.shape[1] - num_kept, 0) :])
 
+    def filled(self, num_frames: int) -> ByteArray:
+        """Returns (V, num_frames, H, W, 3) frames; where there are fewer, the oldest is repeated.
+
+        Between its first chunk and the N-th predicted frame a rollout has less than N of them, and
+        a causal autoencoder takes no less. Zeros where there is none at all.
+        """
+        count = self.frames.shape[1]
+        if not count:
+            return np.zeros_like(self.anchor[:, None]).repeat(num_frames, axis=1)
+        return self.frames[:, [max(count - num_frames + k, 0) for k in range(num_frames)]]
+
 
 def fit_history(history: History | None, start: Observation) -> History:
     """Returns the history of a rollout that goes on from an observation, or begins there.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,9 +42,10 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.model.import_weights import import_weights
-    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
-    config = load_training_config(arguments.preset)
+    # public weights never saw a history: they take one once they are trained with it
+    config = replace(load_training_config(arguments.preset), history=HistoryConfig())
     text = {
         'prompt': arguments.prompt,
         'negative_prompt': arguments.negative_prompt,

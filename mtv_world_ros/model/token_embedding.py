@@ -65,8 +65,10 @@ def embed_reference(
         anchor: the same of the rollout's first frame; None = the start image is the reference.
         temb: (B, D) embedding of the video's noise level.
     """
+    if anchor is not None and transformer.stem != 'conv':
+        reference = anchor  # nothing is copied there
     tokens, keys = _tokens_and_keys(transformer, reference, start_control, temb)
-    if anchor is not None:
+    if anchor is not None and transformer.stem == 'conv':
         none = None if start_control is None else torch.zeros_like(start_control)
         tokens = _tokens_and_keys(transformer, anchor, none, temb)[0]
     return tokens.unflatten(0, reference.shape[:2]).movedim(2, -1).unsqueeze(2), keys

@@ -25,12 +25,11 @@ from mtv_world_ros.model.conditioning import (
 from mtv_world_ros.model.followers import Followers
 from mtv_world_ros.model.history import (
     check_history,
-    filled,
-    history_settings,
     with_anchor,
     with_history,
     without_history,
 )
+from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
@@ -204,7 +203,7 @@ class DiffusionWorldModel:
             return latents
         if not history.frames.shape[1]:
             return without_history(self.autoencoder, latents, count)
-        frames = filled(self._tensor(history.frames), count)
+        frames = self._tensor(history.filled(count))
         sigmas = torch.full((1,), level, device=self.device)
         return with_history(self.autoencoder, latents, frames, sigmas)
 

@@ -23,8 +23,9 @@ from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.segmenter import Segmenter
-from mtv_world_ros.training.config import AugmentConfig, SelfRolloutConfig
+from mtv_world_ros.training.config import AugmentConfig, HistoryConfig, SelfRolloutConfig
 from mtv_world_ros.training.controls import ControlMaker
+from mtv_world_ros.training.history import draw_past, history_before, history_of_lead, Past
 from mtv_world_ros.training.leads import Lead, lead_before
 
 
@@ -38,6 +39,10 @@ class Batch:
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         actions: what `ActionEncoding` gives, where they are not drawn.
+        anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
+            history; see `history.py`.
+        history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
+        history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
         leads: B of them, what comes before the clips that are to start from the model's own
             prediction, None for the others; empty = none is.
         step: of the training, from 0.
@@ -50,6 +55,9 @@ class Batch:
     trajectory: Tensor | None
     object_ids: Tensor | None
     actions: Tensor | None = None
+    anchor: Tensor | None = None
+    history: Tensor | None = None
+    history_sigmas: Tensor | None = None
     leads: tuple[Lead | None, ...] = ()
     step: int = 0
     numbers: Sequence[int] = ()
@@ -73,6 +81,7 @@ class _Sample(NamedTuple):
     object_ids: ByteArray | None
     actions: np.ndarray | None
     lead: Lead | None
+    past: Past | None
 
 
 class BatchSource:
@@ -89,6 +98,8 @@ class BatchSource:
         batch_size: clips of a step, over all processes.
         seed: of choice and disturbances.
         actions: how positions become actions, where they are not drawn.
+        self_rollout: which clips start from the model's own prediction.
+        history: what clips are shown of what came before them.
         numbers: the clips of a step that this process makes; None: all.
     """
 
@@ -106,6 +117,7 @@ class BatchSource:
         seed: int,
         actions: ActionEncoding | None = None,
         self_rollout: SelfRolloutConfig | None = None,
+        history: HistoryConfig | None = None,
         numbers: Sequence[int] | None = None,
     ) -> None:
         self._numbers = range(batch_size) if numbers is None else numbers
@@ -126,6 +138,7 @@ class BatchSource:
         )
         self._spec, self._augment, self._seed = spec, augment, seed
         self._self_rollout = self_rollout or SelfRolloutConfig()
+        self._history = history or HistoryConfig()
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._ahead: tuple[int, Future[Batch]] | None = None
@@ -161,6 +174,7 @@ class BatchSource:
             object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
             actions=torch.from_numpy(collate(encoded)) if encoded else None,
             leads=tuple(s.lead for s in samples),
+            **_pasts([s.past for s in samples]),
         )
 
     def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
@@ -171,19 +185,33 @@ class BatchSource:
             clip = cut_clip(recording, start, self._spec)
         else:
             clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        past = self._past(recording, start, lead, rng)
         names = clip.objects or objects_from_instruction(recording.instruction)
         trajectory, actions = self.controls.make(clip, names, clip.frames[:, 0])
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
             colours = rng.permutation(3)
             frames = frames[..., colours]
+            past = past and Past(past.anchor[..., colours], past.frames[..., colours], past.sigma)
             lead = lead and replace(lead, colours=tuple(colours.tolist()))
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
         lead = lead and replace(lead, names=names)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead, past)
+
+    def _past(
+        self, recording: Recording, start: int, lead: Lead | None, rng: np.random.Generator
+    ) -> Past | None:
+        """What the clip is shown of what came before it, in models that take that."""
+        if not self._history.on:  # nothing is drawn: runs without history keep their clips
+            return None
+        if lead is None:
+            history = history_before(recording, start, self._spec, self._history, rng)
+        else:
+            history = history_of_lead(lead, self._history)
+        return draw_past(history, self._history, rng)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
         """An episode and the starts of its clips; failed ones as often as they are asked for."""
@@ -192,6 +220,18 @@ class BatchSource:
         if share is not None and self._failed and rng.random() < share:
             pool = self._failed
         return pool[rng.integers(len(pool))]
+
+
+def _pasts(pasts: Sequence[Past | None]) -> dict[str, Tensor]:
+    """Fields of a batch."""
+    known = [past for past in pasts if past is not None]
+    if not known:
+        return {}
+    return {
+        'anchor': torch.from_numpy(np.stack([past.anchor for past in known])),
+        'history': torch.from_numpy(np.stack([past.frames for past in known])),
+        'history_sigmas': torch.tensor([past.sigma for past in known]),
+    }
 
 
 def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:

@@ -11,6 +11,7 @@ import yaml
 
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
+from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
 
@@ -117,6 +118,33 @@ class AugmentConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryConfig(HistorySettings):
+    """How clips are shown what came before them; see `history.py`.
+
+    Attributes:
+        max_noise: noise levels are drawn from 0 up to this; serving has `noise_level`.
+        first_share: share of clips that a rollout begins with, as every rollout does.
+        dropout: probability that a clip within a rollout has no history tokens.
+    """
+
+    max_noise: float = 0.3
+    first_share: float = 0.3
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        HistorySettings.__post_init__(self)
+        for name in ('first_share', 'dropout'):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ConfigError(f'history.{name} is {value}; it must be in [0, 1]')
+        if not self.noise_level <= self.max_noise < 1:
+            raise ConfigError(
+                f'history.max_noise is {self.max_noise}; it must be below 1 and at least '
+                f'history.noise_level, {self.noise_level}, so that serving shows nothing new'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SelfRolloutConfig:
     """Clips that start where the model's own rollout ended; see `self_rollout.py`.
 
@@ -190,6 +218,7 @@ class TrainingConfig:
         rendering: how trajectory videos look.
         objective: the loss.
         augment: disturbances.
+        history: what clips are shown of what came before them; off by default.
         self_rollout: clips that start from the model's own predictions.
         optimizer: steps and rates.
     """
@@ -201,6 +230,7 @@ class TrainingConfig:
     rendering: TrajectoryVideoConfig = TrajectoryVideoConfig()
     objective: ObjectiveConfig = ObjectiveConfig()
     augment: AugmentConfig = AugmentConfig()
+    history: HistoryConfig = HistoryConfig()
     self_rollout: SelfRolloutConfig = SelfRolloutConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
 
@@ -221,6 +251,7 @@ class TrainingConfig:
             'control': video.control,
             'object_mask': video.object_mask,
             'rendering': self.as_dict()['rendering'],
+            **self.history.as_card(),
             'trained_on': dict(trained_on),
         }
 

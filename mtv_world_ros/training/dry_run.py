@@ -156,8 +156,7 @@ def _inputs(
     """Arguments of the transformer for one batch, all zero."""
     video, batch = config.video, config.optimizer.batch_size
     views, dim = len(video.views), transformer.config['latent_channels']
-    autoencoder = _latent_size(config)
-    frames, height, width = autoencoder
+    frames, num_history, height, width = _latent_size(config)
 
     def zeros(*shape: int, kind: torch.dtype = dtype) -> Tensor:
         return torch.zeros(batch, *shape, dtype=kind)
@@ -172,6 +171,11 @@ def _inputs(
         'reference': image,
         'start_control': image,
     }
+    if num_history:
+        values['history'] = zeros(views, dim, num_history, height, width)
+        values['history_timestep'] = values['timestep']
+    if config.history.anchored:
+        values['anchor'] = image
     if transformer.with_text:
         values['encoder_hidden_states'] = zeros(NUM_TEXT_TOKENS, config.transformer['text_dim'])
     if config.transformer.get('image_dim'):
@@ -187,11 +191,13 @@ def _inputs(
     return values
 
 
-def _latent_size(config: TrainingConfig) -> tuple[int, int, int]:
-    """F, h, w."""
+def _latent_size(config: TrainingConfig) -> tuple[int, int, int, int]:
+    """F, latent frames of the history, h, w."""
     with torch.device('meta'):
         autoencoder = build_autoencoder(config.autoencoder)
     video = config.video
     block = getattr(autoencoder, 'block_size', 8)
     frames = autoencoder.num_latent_frames(video.num_frames)
-    return frames, video.height // block, video.width // block
+    count = config.history.num_frames
+    num_history = count and autoencoder.num_latent_frames(count - int(autoencoder.includes_start))
+    return frames, num_history, video.height // block, video.width // block

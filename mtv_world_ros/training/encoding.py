@@ -17,6 +17,8 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     encode_chunk,
 )
+from mtv_world_ros.model.history import with_anchor, with_history
+from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.model.image_encoder import ImageEncoder
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.training.batches import Batch
@@ -34,11 +36,13 @@ class Encoders:
         text: (1, 512, text_dim) umT5 tokens of the prompt that all clips share, in models with
             text; the paper has one for all tasks.
         image: CLIP, in models with text.
+        history: what the model takes of what came before a chunk.
     """
 
     autoencoder: Autoencoder
     text: Tensor | None = None
     image: ImageEncoder | None = None
+    history: HistorySettings = HistorySettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,11 +87,27 @@ def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> C
     else:
         num_frames = batch.frames.shape[2] - 1
         latents = condition_on_actions(autoencoder, start, batch.actions.to(device), num_frames)
+    latents = _with_past(encoders, latents, batch, device)
     if encoders.text is None or encoders.image is None:
         return latents
     tokens = torch.stack([encoders.image.encode(images).flatten(0, 1) for images in start])
     text = encoders.text.to(device).expand(len(start), -1, -1)
     return replace(latents, text=text, image=tokens.to(device).clone())
+
+
+def _with_past(
+    encoders: Encoders, latents: Conditioning, batch: Batch, device: torch.device
+) -> Conditioning:
+    """Adds what the clips are shown of what came before them, in models that take that."""
+    settings = encoders.history
+    if settings.anchored:
+        assert batch.anchor is not None
+        latents = with_anchor(encoders.autoencoder, latents, batch.anchor.to(device))
+    if not settings.num_frames:
+        return latents
+    assert batch.history is not None and batch.history_sigmas is not None
+    frames, sigmas = batch.history.to(device), batch.history_sigmas.to(device)
+    return with_history(encoders.autoencoder, latents, frames, sigmas)
 
 
 def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor:
@@ -107,7 +127,7 @@ def drop_conditions(
     """
     dropped = {
         ('control', 'start_control'): augment.control_dropout,
-        ('reference', 'start'): augment.reference_dropout,
+        ('reference', 'start', 'anchor'): augment.reference_dropout,
         ('image',): augment.image_dropout,
     }
     changes = {}

@@ -51,7 +51,7 @@ def lead_before(
     if step < config.start_step or config.share == 0 or rng.random() >= config.share:
         return None
     for num_chunks in range(int(rng.integers(config.max_chunks)) + 1, 0, -1):
-        first = _frame_before(recording, start, num_chunks * spec.chunk_seconds)
+        first = frame_before(recording, start, num_chunks * spec.chunk_seconds)
         num_frames = (num_chunks + 1) * spec.num_frames
         if first is None or frame_indices(recording, first, spec, num_frames) is None:
             continue
@@ -60,8 +60,8 @@ def lead_before(
     return None
 
 
-def _frame_before(recording: Recording, start: int, seconds: float) -> int | None:
-    """The frame nearest to so long before another; None where the episode began later."""
+def frame_before(recording: Recording, start: int, seconds: float) -> int | None:
+    """Returns the recorded frame nearest to so long before another; None = before the first."""
     wanted = recording.times[start] - seconds
     if wanted < recording.times[0] - 1e-6:
         return None

@@ -47,17 +47,23 @@ def batch_loss(
     noisy = add_noise(clean, noise, sigmas.to(device))
     kept = _kept(draws, config, device)
     cond = drop_conditions(batch.conditioning, config.augment, draws)
+    if cond.history is not None:
+        cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
+    cond = cond.in_dtype(dtype)
     predicted = transformer(
         noisy.to(dtype),
         (sigmas * 1000).to(device),
-        control=cond.control.to(dtype),
-        start=cond.start.to(dtype),
-        reference=cond.reference.to(dtype),
-        start_control=cond.start_control.to(dtype),
+        control=cond.control,
+        start=cond.start,
+        reference=cond.reference,
+        start_control=cond.start_control,
         encoder_hidden_states=None if cond.text is None else cond.text.to(dtype),
         encoder_hidden_states_image=None if cond.image is None else cond.image.to(dtype),
         actions=cond.actions,
         actions_kept=kept,
+        anchor=cond.anchor,
+        history=cond.history,
+        history_timestep=cond.history_timestep,
     )
     target = clean if transformer.prediction == 'sample' else noise - clean
     by_sigma = sigma_weights(sigmas, objective).to(device)

@@ -162,6 +162,7 @@ def train(
         seed=seed,
         actions=actions,
         self_rollout=config.self_rollout,
+        history=config.history,
         numbers=trainer.clips,
     )
     trained_on['clips'] = source.num_clips

@@ -18,9 +18,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mtv_world_ros.data.clips import chunk_of
 from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import collate
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import Scheduler
@@ -69,17 +71,26 @@ class SelfRollout:
         if not leads:
             return batch
         starts = {i: np.ascontiguousarray(lead.clip.frames[:, 0]) for i, lead in leads.items()}
+        pasts = {i: History.begin(start) for i, start in starts.items()}
         for left in range(max(lead.num_chunks for lead in leads.values()), 0, -1):
             now = {i: lead for i, lead in leads.items() if lead.num_chunks >= left}
             chunks = [lead.num_chunks - left for lead in now.values()]
-            chunk_batch = self._batch(list(now.values()), chunks, [starts[i] for i in now])
+            chunk_batch = self._batch(
+                list(now.values()), chunks, [starts[i] for i in now], [pasts[i] for i in now]
+            )
             seeds = [_noise_seed(self._seed, step, batch.numbers[i], left) for i in now]
-            ends = self._imagine(chunk_batch, seeds, transformer)
-            starts |= dict(zip(now, ends, strict=True))
-        return self._replaced(batch, leads, starts)
+            imagined = self._imagine(chunk_batch, seeds, transformer)
+            for i, frames in zip(now, imagined, strict=True):
+                pasts[i] = pasts[i].after(starts[i], frames, self._encoders.history.num_frames)
+                starts[i] = frames[:, -1]
+        return self._replaced(batch, leads, starts, pasts)
 
     def _batch(
-        self, leads: Sequence[Lead], chunks: Sequence[int], starts: Sequence[ByteArray]
+        self,
+        leads: Sequence[Lead],
+        chunks: Sequence[int],
+        starts: Sequence[ByteArray],
+        pasts: Sequence[History],
     ) -> Batch:
         """Chunk number `chunks[i]` of each lead, from a given start frame, as a batch."""
         clips = [
@@ -98,12 +109,27 @@ class SelfRollout:
             trajectory=torch.from_numpy(np.stack(videos)) if videos else None,
             object_ids=None,
             actions=torch.from_numpy(collate(actions)) if actions else None,
+            **self._shown(pasts),
         )
+
+    def _shown(self, pasts: Sequence[History]) -> dict[str, Tensor]:
+        """The fields of a batch that show the past, at serving's noise level."""
+        settings = self._encoders.history
+        if not settings.on:
+            return {}
+        known = [past.frames.shape[1] > 0 for past in pasts]
+        return {
+            'anchor': torch.from_numpy(np.stack([past.anchor for past in pasts])),
+            'history': torch.from_numpy(
+                np.stack([past.filled(settings.num_frames) for past in pasts])
+            ),
+            'history_sigmas': torch.tensor([settings.noise_level if k else 1.0 for k in known]),
+        }
 
     def _imagine(
         self, batch: Batch, seeds: Sequence[int], transformer: MultiViewWanTransformer
     ) -> list[ByteArray]:
-        """The (V, H, W, 3) last frame of each chunk."""
+        """The (V, T, H, W, 3) frames of each chunk."""
         with torch.inference_mode():
             conditioning = condition_batch(self._encoders, batch, self._device)
             latents = sample_latents(
@@ -114,23 +140,33 @@ class SelfRollout:
                 num_inference_steps=self._steps,
                 should_stop=lambda: False,
             )
-            last = decode_frames(self._encoders.autoencoder, latents)[:, :, -1]
-        return list(last.cpu().numpy())
+            frames = decode_frames(self._encoders.autoencoder, latents)
+        return list(frames.cpu().numpy())
 
     def _replaced(
-        self, batch: Batch, leads: dict[int, Lead], starts: dict[int, ByteArray]
+        self,
+        batch: Batch,
+        leads: dict[int, Lead],
+        starts: dict[int, ByteArray],
+        pasts: dict[int, History],
     ) -> Batch:
         last = [lead.num_chunks for lead in leads.values()]
-        made = self._batch(list(leads.values()), last, [starts[i] for i in leads])
+        made = self._batch(
+            list(leads.values()), last, [starts[i] for i in leads], [pasts[i] for i in leads]
+        )
         start_frame = batch.start_frame.clone()
         trajectory = None if batch.trajectory is None else batch.trajectory.clone()
+        history = None if batch.history is None else batch.history.clone()
         for row, (index, lead) in enumerate(leads.items()):
             # the rollout was made in true colours, which segmenters know
             start_frame[index] = made.start_frame[row][..., list(lead.colours)]
+            if history is not None and made.history is not None:
+                history[index] = made.history[row][..., list(lead.colours)]
             if trajectory is not None and made.trajectory is not None:
                 trajectory[index] = made.trajectory[row]
         # encoded actions do not depend on pictures
-        return replace(batch, start_frame=start_frame, trajectory=trajectory)
+        # nor do anchors on what was imagined: a rollout begins with a recorded frame
+        return replace(batch, start_frame=start_frame, trajectory=trajectory, history=history)
 
 
 def _noise_seed(seed: int, step: int, index: int, left: int) -> int:

@@ -14,6 +14,7 @@ import torch
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.history import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
@@ -105,8 +106,9 @@ class Trainer:
         self.trained_on, self.actions = trained_on, actions
         autoencoder = build_autoencoder(config.autoencoder)
         self.autoencoder = place(autoencoder, self.device, torch.float32)
-        self.encoders = Encoders(autoencoder=self.autoencoder)
+        self.encoders = Encoders(autoencoder=self.autoencoder, history=config.history)
         transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
+        check_history(config.history, self.autoencoder, transformer.config)
         if settings.gradient_checkpointing:
             transformer.enable_gradient_checkpointing()
         self.weights = Weights(transformer, self.device, dtype, settings.ema_decay)

@@ -16,7 +16,7 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.history import History
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.model.history import history_settings
+from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 

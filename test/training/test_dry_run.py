@@ -55,14 +55,16 @@ def test_operations_are_those_of_the_products() -> None:
     dim, ffn, text, image = 1536, 8960, 512, 2 * 257
     grid = 3 * 4 * 8  # latent frames, height, width of a view
     kept = 2 * grid // 4
-    tokens = kept + 2 * (4 * 8) // 4  # and the reference
+    history = 2 * 2 * (4 * 8) // 4  # the last five frames are two latent ones
+    reference = 2 * (4 * 8) // 4
+    tokens = history + reference + kept
     block = tokens * dim * (4 * dim + 2 * dim + 2 * ffn)  # self, query and output, feed forward
     block += 2 * (text + image) * dim * dim  # keys and values of the context
     block += 2 * tokens * dim * (tokens + text + image)  # attention: weights, values
-    embedded = (tokens - kept) * 4 * 16 * dim + kept * 4 * 48 * dim + kept * dim * 64
+    embedded = reference * 4 * 16 * dim + (history + kept) * 4 * 48 * dim + kept * dim * 64
     text_embedder = text * (4096 * dim + dim * dim)
     image_embedder = image * (1280 * 1280 + 1280 * dim)
-    time = 256 * dim + dim * dim + dim * 6 * dim
+    time = 2 * (256 * dim + dim * dim + dim * 6 * dim)  # of the video and of the history
     expected = 2 * (block + embedded + text_embedder + image_embedder + time)
     assert cost.forward_flop == expected
 

@@ -20,7 +20,12 @@ from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training import self_rollout
 from mtv_world_ros.training.batches import BatchSource
-from mtv_world_ros.training.config import load_training_config, SelfRolloutConfig, TrainingConfig
+from mtv_world_ros.training.config import (
+    HistoryConfig,
+    load_training_config,
+    SelfRolloutConfig,
+    TrainingConfig,
+)
 from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
 
@@ -48,6 +53,7 @@ def make_source(config: TrainingConfig, recording: Recording, robot: RobotModel)
         batch_size=config.optimizer.batch_size,
         seed=0,
         self_rollout=config.self_rollout,
+        history=config.history,
     )
 
 
@@ -73,14 +79,27 @@ def seen_batches(monkeypatch: pytest.MonkeyPatch) -> list:
     return seen
 
 
+@pytest.mark.parametrize(
+    'history',
+    [
+        HistoryConfig(),
+        HistoryConfig(num_frames=4, noise_level=0.1, reference='first_frame', dropout=0.0),
+    ],
+    ids=['plain', 'history'],
+)
 def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
+    history: HistoryConfig,
     recording: Recording,
     rolling: TrainingConfig,
     robot: RobotModel,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Serving the exported weights over the same chunks gives the start frames bit for bit."""
+    """Serving the exported weights over the same chunks gives the start frames bit for bit.
+
+    And so the history that the clip is shown, behind the same anchor.
+    """
+    rolling = replace(rolling, history=history)
     trainer = make_trainer(rolling, tmp_path)
     with torch.no_grad():  # an untrained model holds its start frame; this one does not
         for averaged in trainer.weights.ema.shadow_params:
@@ -123,7 +142,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
         index_of = frame_indices(recording, first, spec, len(clip.times) - 1)
         assert np.array_equal(after.frames[index], recording.frames[:, index_of[last:]])
         own_seeds = [seed for number, seed in seeds if number == index]
-        frame = clip.frames[:, 0]
+        frame, past = clip.frames[:, 0], None
         for chunk, seed in enumerate(own_seeds):
             window = slice(chunk * spec.num_frames, (chunk + 1) * spec.num_frames + 1)
             positions = clip.positions[window]
@@ -141,11 +160,20 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
                 instruction=recording.instruction,
                 seed=seed,
                 num_inference_steps=1,
+                history=past,
             )
-            frame = prediction.rollout.video.frames[:, -1]
-        assert np.array_equal(after.start_frame[index], frame)
+            frame, past = prediction.rollout.video.frames[:, -1], prediction.end_history
+        # the embedding of two noise levels rounds otherwise in a batch: a byte shows at most 1
+        apart = np.abs(after.start_frame[index].numpy().astype(int) - frame)
+        assert apart.max() <= (1 if history.on else 0) and apart.mean() < 1e-3
         assert not np.array_equal(after.start_frame[index], after.frames[index][:, 0])
         assert lead.num_chunks == len(own_seeds)
+        if history.on:
+            assert past is not None
+            shown = after.history[index].numpy().astype(int)
+            assert np.abs(shown - past.filled(4)).max() <= 1
+            assert np.array_equal(after.anchor[index], past.anchor)
+            assert 0 <= after.history_sigmas[index] <= history.max_noise
 
 
 def test_a_killed_run_continues_as_if_nothing_had_happened(
