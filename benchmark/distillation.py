@@ -1,0 +1,94 @@
+"""Does a distilled student do in a few steps what its teacher does in many?
+
+    python benchmark/distillation.py TRAIN HELD_OUT --work runs/distillation \
+        --training-steps 2000 --batch-size 8 --device cuda --out benchmark/results
+
+Distils `--checkpoint` into one student for each number of `--student-steps`, scores the teacher in
+`--teacher-steps` and each student in its own number of steps on held-out episodes, every chunk
+from its recorded start frame, and prints one table. Running it again goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import shlex
+import sys
+
+from model_scores import add_options, cells, chunk_seconds, COLUMNS, overrides, score
+from page import publish, table
+import torch
+
+from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card
+from mtv_world_ros.model.runtime import choose_dtype
+from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.distill import distill, DistillConfig
+
+
+def student(steps: int, options: argparse.Namespace) -> Path:
+    """Trains a student, or goes on; returns its checkpoint."""
+    teacher = checkpoint_path(options.checkpoint)
+    return distill(
+        teacher,
+        select(options.train, 'all').paths,
+        options.work / f'student{steps}',
+        load_training_config(options.preset, overrides(options)),
+        DistillConfig(num_steps=steps, teacher_steps=options.path_steps),
+        robot=load_robot(robot_path(read_card(teacher)['robot'])),
+        segmenter=assemble_segmenter('colour'),
+        seed=options.seed,
+        device=options.device,
+        dtype=choose_dtype(options.dtype, options.device),
+        num_episodes=options.episodes,
+        cache=options.work / 'cache',
+    )
+
+
+def row(title: str, checkpoint: str | Path, steps: int, options: argparse.Namespace) -> list[str]:
+    """A line of the table."""
+    summary = score(
+        checkpoint, options.work / 'scores' / title.replace(' ', '_'), options,
+        mode='observe', steps=steps,
+    )  # fmt: skip
+    seconds = chunk_seconds(checkpoint, options, steps)
+    return [title, str(steps), *cells(summary), f'{seconds:.3f}', str(len(summary.results))]
+
+
+def main() -> None:
+    """Trains, scores, prints."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_options(parser)
+    parser.add_argument('--student-steps', default='1,4')
+    parser.add_argument('--teacher-steps', default='1,4,8,32')
+    parser.add_argument('--path-steps', type=int, default=32, help='that the student learns from')
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    students = {
+        int(steps): student(int(steps), options) for steps in options.student_steps.split(',')
+    }
+    rows = [
+        row(f'teacher {steps}', options.checkpoint, int(steps), options)
+        for steps in options.teacher_steps.split(',')
+    ]
+    rows += [row(f'student {steps}', path, steps, options) for steps, path in students.items()]
+    options.repeats = int(rows[0][-1])
+    publish(
+        'distillation',
+        'Few-step distillation',
+        f'python {shlex.join(sys.argv)}',
+        table(['model', 'steps', *COLUMNS, 'model [s a chunk]', 'episodes'], rows)
+        + f'\n\nStudents: {options.training_steps} training steps of batch {options.batch_size} '
+        f'along {options.path_steps}-step paths of the teacher. Brackets: 95 % bootstrap over '
+        'episodes.',
+        options,
+        f'torch {torch.__version__}',
+    )
+
+
+if __name__ == '__main__':
+    main()
