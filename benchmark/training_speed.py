@@ -1,0 +1,196 @@
+"""How fast does a preset train here, does it wait for data, and how is that beside a plain loop?
+
+    python benchmark/training_speed.py TRAIN --work runs/speed --preset small --threads 2 \
+        --repeats 20 --out benchmark/results
+
+Takes turns, step by step, between this trainer and a straight accelerate loop over the same
+batches with the same optimizer and averaged weights, so that whatever else the machine does meets
+both; then lets the trainer run with its data pipeline, and the pipeline run alone. Medians of wall
+time, after two steps to warm up. MFU: operations of the transformer's forward and backward in a
+second, as a share of those of the fastest product of large matrices on this machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+import shlex
+import statistics
+import sys
+import time
+from typing import Any
+
+import accelerate
+from accelerate import Accelerator
+from diffusers.training_utils import EMAModel
+from page import publish, table
+import torch
+import yaml
+
+from mtv_world_ros.assembly import assemble_segmenter, robot_path
+from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.runtime import choose_dtype, place
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.actions import kept_actions, transformer_arguments
+from mtv_world_ros.training.batches import Batch, BatchSource
+from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.draws import Draws
+from mtv_world_ros.training.loss import batch_loss
+from mtv_world_ros.training.run import load_recordings, spec_of, spread
+from mtv_world_ros.training.speed import ideal_seconds, measured_peak
+from mtv_world_ros.training.trainer import Trainer
+
+_WARM_UP = 2
+
+
+def parse() -> argparse.Namespace:
+    """Reads the options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('train', type=Path, help='folder of episodes')
+    parser.add_argument('--work', type=Path, required=True, help='what was read of them')
+    parser.add_argument('--preset', default='small')
+    parser.add_argument('--set', action='append', default=[], metavar='SECTION.KEY=VALUE')
+    parser.add_argument('--episodes', type=int, default=8)
+    parser.add_argument('--device', default='cpu')
+    parser.add_argument('--dtype', default='auto')
+    parser.add_argument('--threads', type=int, default=1)
+    parser.add_argument('--repeats', type=int, default=10, help='steps of each median')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--machine', default='cpu2', help='name of the machine on the page')
+    parser.add_argument('--out', type=Path, help='folder for the page')
+    return parser.parse_args()
+
+
+def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
+    """The trainer and its data, as `mtv-world train` makes them."""
+    values = (item.partition('=') for item in options.set)
+    overrides = {key: yaml.safe_load(value) for key, _, value in values}
+    overrides['optimizer.steps'] = 10**6
+    config = load_training_config(options.preset, overrides)
+    spec, robot = spec_of(config), load_robot(robot_path(config.video.robot))
+    paths = spread(select(options.train, default='train').paths, options.episodes)
+    recordings, _ = load_recordings(paths, spec, robot, options.work / 'cache')
+    actions = kept_actions(options.work, config.video.control, recordings, spec, robot)
+    trainer = Trainer(
+        config,
+        options.work,
+        seed=options.seed,
+        device=options.device,
+        dtype=choose_dtype(options.dtype, options.device),
+        trained_on={},
+        actions=actions,
+    )
+    source = BatchSource(
+        recordings,
+        spec=spec,
+        robot=robot,
+        segmenter=assemble_segmenter('colour'),
+        rendering=config.rendering,
+        object_mask=config.video.object_mask,
+        augment=config.augment,
+        batch_size=config.optimizer.batch_size,
+        seed=options.seed,
+        actions=actions,
+    )
+    return trainer, source
+
+
+def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[Batch], None]:
+    """A step as accelerate's own examples make it: automatic mixed precision, AdamW, EMA."""
+    config, settings = trainer.config, trainer.config.optimizer
+    half = dtype == torch.bfloat16
+    accelerator = Accelerator(
+        cpu=trainer.device.type == 'cpu', mixed_precision='bf16' if half else 'no'
+    )
+    made: Any = MultiViewWanTransformer(**transformer_arguments(config, trainer.actions))
+    if settings.gradient_checkpointing:
+        made.enable_gradient_checkpointing()
+    made = place(made, trainer.device, torch.float32)
+    optimizer: Any = torch.optim.AdamW(
+        made.parameters(), settings.learning_rate, (0.9, 0.95), weight_decay=settings.weight_decay
+    )
+    model, optimizer = accelerator.prepare(made, optimizer)
+    averaged = EMAModel(model.parameters(), decay=settings.ema_decay)
+
+    def step(batch: Batch) -> None:
+        for part in batch.parts(settings.accumulation):
+            draws = Draws(0, part.step, part.numbers)
+            loss = batch_loss(model, trainer.encoders, part, config, draws, trainer.device)
+            accelerator.backward(loss.mean / settings.accumulation)
+        accelerator.clip_grad_norm_(model.parameters(), settings.max_grad_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        averaged.step(model.parameters())
+        loss.mean.item()
+
+    return step
+
+
+def timed(run: Callable[[], object]) -> float:
+    """Seconds that it takes."""
+    started = time.perf_counter()
+    run()
+    return time.perf_counter() - started
+
+
+def alternate(
+    trainer: Trainer, plain: Callable[[Batch], None], batches: list[Batch]
+) -> tuple[float, float, float]:
+    """Median seconds of a step of the trainer and of the plain loop, and of their ratio."""
+    own, other = [], []
+    for batch in batches:
+        own.append(timed(lambda batch=batch: trainer.train_step(batch)))
+        other.append(timed(lambda batch=batch: plain(batch)))
+    own, other = own[_WARM_UP:], other[_WARM_UP:]
+    ratios = [b / a for a, b in zip(own, other, strict=True)]
+    return statistics.median(own), statistics.median(other), statistics.median(ratios)
+
+
+def main() -> None:
+    """Measures, and prints the page."""
+    options = parse()
+    torch.set_num_threads(options.threads)
+    trainer, source = make(options)
+    dtype = trainer.weights.worker.dtype
+    steps = _WARM_UP + options.repeats
+    begun = time.perf_counter()
+    batches = [source.batch(step) for step in range(steps)]
+    clips = steps * len(batches[0].numbers) / (time.perf_counter() - begun)
+    own, other, ratio = alternate(trainer, plain_loop(trainer, dtype), batches)
+    trainer.step = steps
+    reports = trainer.run(source, save_every=10**9, on_save=lambda _: None)
+    whole = [next(reports) for _ in range(steps)][_WARM_UP:]
+    reports.close()
+    source.close()
+    waited = sum(report.waited for report in whole) / sum(report.seconds for report in whole)
+    running = statistics.median(report.seconds for report in whole)
+    peak = measured_peak(trainer.device, dtype)
+    ideal = ideal_seconds(trainer.config, trainer.actions, dtype, peak)
+    rows = [
+        ['steps/s of the trainer with its data', f'{1 / running:.4f}'],
+        ['of it waited for data', f'{100 * waited:.2f} %'],
+        ['steps/s on batches at hand', f'{1 / own:.4f}'],
+        ['steps/s of the plain accelerate loop on the same', f'{1 / other:.4f}'],
+        ['trainer : plain loop (median of the pairs)', f'{ratio:.2f}'],
+        ['MFU of the trainer with its data', f'{100 * ideal / running:.1f} %'],
+        ['measured peak', f'{peak / 1e9:.0f} GFLOP/s'],
+        ['operations a step', f'{ideal * peak / 1e9:.1f} GFLOP'],
+        ['clips/s of the data pipeline alone', f'{clips:.2f}'],
+    ]
+    size = trainer.config.optimizer.batch_size
+    body = (
+        f'Preset `{options.preset}`, batch {size}, {dtype}, device {options.device}, '
+        f'{options.threads} threads, {options.episodes} episodes.\n\n'
+        + table(['what', 'median'], rows)
+    )
+    command = shlex.join(['python', *sys.argv])
+    versions = f'torch {torch.__version__}, accelerate {accelerate.__version__}'
+    publish('training_speed', 'Training speed', command, body, options, versions)
+
+
+if __name__ == '__main__':
+    main()
