@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import cos, isfinite, pi, sin
 
 from mtv_world_ros.evaluation.markup import element, join, Markup
 
@@ -61,6 +61,29 @@ class Bin:
     came_true: float
     interval: tuple[float, float]
     count: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """Two values of one thing with their intervals; NaN = not known.
+
+    Attributes:
+        label: short, beside the mark.
+        title: for those who point at it or cannot see it.
+        x: in [0, 1].
+        y: in [0, 1].
+        x_interval: (low, high).
+        y_interval: (low, high).
+        style: class of the style sheet.
+    """
+
+    label: str
+    title: str
+    x: float
+    y: float
+    x_interval: tuple[float, float]
+    y_interval: tuple[float, float]
+    style: str
 
 
 def dot_chart(title: str, dots: Sequence[Dot]) -> Markup:
@@ -185,6 +208,57 @@ def reliability_chart(title: str, bins: Sequence[Bin], style: str) -> Markup:
         place = at[0] + (-9 if side == 'end' else 9)
         parts.append(_text(f'n={found.count}', place, at[1] + 4, 'tick', side))
     return _svg(height, title, parts, width=left + size + 44)
+
+
+def scatter_chart(title: str, points: Sequence[Point], x_label: str, y_label: str) -> Markup:
+    """Returns values against values, both in [0, 1], with intervals; equal ones on the diagonal.
+
+    Marks at the same place lie on a small ring around it, so that none hides another.
+    """
+    left, top, size, height = 34.0, 22.0, 300.0, 366.0
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return left + x * size, top + (1 - y) * size
+
+    parts: list[Markup] = [_text(y_label, 0.0, 10.0, 'tick')]
+    for tick in _TICKS:
+        parts += [
+            _line(place(0, tick), place(1, tick), 'grid'),
+            _line(place(tick, 0), place(tick, 1), 'grid'),
+            _text(f'{tick:g}', 26.0, place(0, tick)[1] + 4, 'tick', 'end'),
+            _text(f'{tick:g}', place(tick, 0)[0], top + size + 17, 'tick', 'middle'),
+        ]
+    parts.append(_line(place(0, 0), place(1, 1), 'honest'))
+    parts.append(_text(x_label, left + size, height - 6, 'tick', 'end'))
+    shown = [point for point in points if isfinite(point.x) and isfinite(point.y)]
+    for point in shown:
+        together = [p for p in shown if (p.x, p.y) == (point.x, point.y)]
+        angle = 2 * pi * together.index(point) / len(together)
+        radius = 0.0 if len(together) == 1 else 9.0
+        x, y = place(point.x, point.y)
+        shift = (radius * cos(angle), radius * sin(angle))
+        parts.append(_point(point, (x + shift[0], y + shift[1]), shift, place))
+    return _svg(height, title, parts, width=left + size + 44)
+
+
+def _point(
+    point: Point,
+    at: tuple[float, float],
+    shift: tuple[float, float],
+    place: Callable[[float, float], tuple[float, float]],
+) -> Markup:
+    """A mark with its label, intervals through it."""
+    ends = [(place(value, point.y)[0] + shift[0], at[1]) for value in point.x_interval]
+    ends += [(at[0], place(point.x, value)[1] + shift[1]) for value in point.y_interval]
+    style = f'interval thin {point.style}'
+    return element(
+        'g',
+        element('title', f'{point.title}: {point.x:.2f}, {point.y:.2f}'),
+        _line(ends[0], ends[1], style),
+        _line(ends[2], ends[3], style),
+        element('circle', cx=at[0], cy=at[1], r=4.5, class_=f'mark {point.style}'),
+        _text(point.label, at[0] + 6, at[1] - 6, 'label'),
+    )
 
 
 def _svg(height: float, title: str, parts: Sequence[Markup], width: float = _WIDTH) -> Markup:

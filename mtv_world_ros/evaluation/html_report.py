@@ -78,6 +78,12 @@ def page(evaluations: Sequence[Evaluated]) -> str:
     }
     links = [element('a', words, href=f'#{key}') for key, words in _NAV.items() if sections[key]]
     title = f'Evaluation of {", ".join(found.name for found in evaluations)}'
+    parts = [_header(evaluations), element('nav', *links), *sections.values()]
+    return document(title, join(parts))
+
+
+def document(title: str, content: Markup) -> str:
+    """Returns a whole page in the report's style, from which no request leaves."""
     style = share_path('resource', 'report.css').read_text(encoding='utf-8')
     head = element(
         'head',
@@ -87,8 +93,8 @@ def page(evaluations: Sequence[Evaluated]) -> str:
         element('title', title),
         element('style', Markup(style)),
     )
-    body = element('main', _header(evaluations), element('nav', *links), *sections.values())
-    return f'<!DOCTYPE html>\n{element("html", head, element("body", body), lang="en")}\n'
+    body = element('body', element('main', content))
+    return f'<!DOCTYPE html>\n{element("html", head, body, lang="en")}\n'
 
 
 def _header(evaluations: Sequence[Evaluated]) -> Markup:

@@ -1,0 +1,145 @@
+"""`mtv-world rank`."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.options import (
+    add_checkpoint,
+    add_dtype,
+    add_model_options,
+    add_segmenter,
+)
+from mtv_world_ros.cli.provenance import provenance
+
+if TYPE_CHECKING:
+    from mtv_world_ros.ranking.job import Job
+
+_DESCRIPTION = """\
+Runs policies on the same episodes in the simulator and in imagination, and says how well the two
+agree. DIR gets ranking.json, ranking.md, ranking.html and a file for every rollout; running the
+same command again goes on where it was stopped.
+"""
+_EPILOG = """\
+A policy is `expert`, followed by faults with their sizes: noise (rad), miss (probability), shift
+and place (m), wrong (probability), late (s), stop (share of the plan), e.g. expert-noise-0.03.
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'rank',
+        help='rank policies in imagination, and compare with the simulator',
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )
+    parser.add_argument('--policies', metavar='LIST', help='comma-separated; default: ten')
+    parser.add_argument('--tasks', metavar='LIST', help='comma-separated; default: three')
+    parser.add_argument('--episodes', type=int, default=10, help='of each task')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument(
+        '--ray',
+        nargs='?',
+        const='',
+        metavar='ADDRESS',
+        help='fan out with Ray; default address: RAY_ADDRESS, else a new one on this machine',
+    )
+    parser.add_argument(
+        '--true-episodes',
+        type=int,
+        default=5,
+        metavar='M',
+        help='the prediction-powered rates use the true outcomes of the first M of each task',
+    )
+    parser.add_argument('--max-chunks', type=int, default=8, help='answers of a policy at most')
+    add_checkpoint(parser)
+    add_dtype(parser)
+    add_model_options(parser)
+    add_segmenter(parser)
+    parser.set_defaults(handler=_rank, steps=1)
+
+
+def _rank(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.ranking.page import write_ranking
+    from mtv_world_ros.ranking.rank import run_jobs
+    from mtv_world_ros.ranking.runner import RolloutConfig
+    from mtv_world_ros.ranking.summary import Summary
+    from mtv_world_ros.ranking.words import console
+
+    if arguments.true_episodes < 0:
+        raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
+    cores = len(os.sched_getaffinity(0))
+    make_pipeline = partial(
+        load_pipeline,
+        arguments.checkpoint,
+        robot=arguments.robot,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        num_threads=arguments.threads or max(cores // max(arguments.workers, 1), 1),
+        segmenter=arguments.segmenter,
+    )
+    settings = _settings(arguments)
+    results, failed = run_jobs(
+        _jobs(arguments),
+        make_pipeline,
+        arguments.out,
+        config=RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks),
+        settings=settings,
+        workers=arguments.workers,
+        ray_address=arguments.ray,
+    )
+    summary = Summary(
+        results=results,
+        failed=failed,
+        num_true=arguments.true_episodes,
+        provenance={**provenance(arguments), 'checkpoint': settings['checkpoint']},
+        seed=arguments.seed,
+    )
+    path = write_ranking(summary, arguments.out)
+    print(f'{console(summary)}\n\nreport: {path}')
+    return 0
+
+
+def _jobs(arguments: argparse.Namespace) -> list[Job]:
+    from mtv_world_ros.assembly import checkpoint_path, robot_path
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.ranking.job import (
+        DEFAULT_POLICIES,
+        DEFAULT_TASKS,
+        make_jobs,
+        policies_named,
+    )
+    from mtv_world_ros.sim.expert import Expert
+    from mtv_world_ros.sim.tasks import tasks_named
+
+    policies = policies_named(
+        ','.join(DEFAULT_POLICIES) if arguments.policies is None else arguments.policies
+    )
+    tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(DEFAULT_TASKS))]
+    robot = arguments.robot or read_card(checkpoint_path(arguments.checkpoint))['robot']
+    expert = Expert(load_robot(robot_path(robot)))
+    jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
+    print(f'{len(policies)} policies, {len(tasks)} tasks, {len(jobs)} rollouts in each world')
+    return jobs
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, str]:
+    """What rollouts depend on: those of other settings are run again."""
+    from mtv_world_ros.assembly import fingerprint
+    from mtv_world_ros.resources import share_path
+
+    return {
+        'checkpoint': fingerprint(arguments.checkpoint),
+        'task files': fingerprint(share_path('config', 'tasks')).split()[-1],
+        'robot': arguments.robot or '',
+        'segmenter': arguments.segmenter,
+    }

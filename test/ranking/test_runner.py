@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+
+from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.ranking.job import make_jobs
+from mtv_world_ros.ranking.rank import run_jobs
+from mtv_world_ros.ranking.runner import RolloutConfig
+
+TASK = 'place_block_a2b_left'
+
+
+@pytest.fixture(scope='module')
+def results(runner, expert):
+    jobs = make_jobs(('expert', 'expert-stop-0.3'), (TASK,), 1, 0, expert)
+    return {job.policy: runner.score(job) for job in jobs}
+
+
+def test_true_success_is_the_predicate_s_at_the_end(results):
+    assert results['expert'].final and results['expert'].ever
+    assert not results['expert-stop-0.3'].final
+    for result in results.values():
+        # plan of at most 6.5 s and .6 s at rest, in answers of 3.2 s
+        assert result.num_chunks == result.num_imagined == 3 and result.is_over
+
+
+def test_a_perfect_imagination_is_judged_like_the_simulator_s_own_frames(results):
+    for result in results.values():
+        assert result.imagined.probability == pytest.approx(result.seen.probability, abs=0.15)
+    assert results['expert'].imagined.success == 1.0
+    stopped = results['expert-stop-0.3'].imagined
+    assert stopped.success == 0.0 or np.isnan(stopped.probability)
+
+
+def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_result):
+    """A second run takes what is there; other settings or a broken file are run again."""
+    jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
+    scored = []
+
+    class Counting:
+        def score(self, job):
+            scored.append(job.index)
+            return make_result(job.policy, job.index, True, np.nan, job.task, seed=job.seed)
+
+    monkeypatch.setattr(
+        'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Counting()
+    )
+
+    def run(**settings):
+        found, failed = run_jobs(
+            jobs, lambda: None, tmp_path, config=RolloutConfig(), settings=settings,
+            show_progress=False,
+        )  # fmt: skip
+        assert not failed
+        return found
+
+    first = run(checkpoint='a')
+    assert scored == [0, 1] and [result.index for result in first] == [0, 1]
+    again = run(checkpoint='a')
+    assert scored == [0, 1]
+    np.testing.assert_equal(again[0].as_json()['seen'], first[0].as_json()['seen'])
+    (tmp_path / 'rollouts' / f'{jobs[1].name}.json').write_text('{"settings"')
+    run(checkpoint='a')
+    assert scored == [0, 1, 1]
+    run(checkpoint='b')
+    assert scored == [0, 1, 1, 0, 1]
+    assert not list(tmp_path.rglob('*.part'))
+
+
+def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
+    expert, tmp_path, monkeypatch, make_result
+):
+    class Failing:
+        def score(self, job):
+            if job.index == 0:
+                raise PolicyError('its server is gone')
+            return make_result('expert', 1, True, 0.9, seed=job.seed)
+
+    monkeypatch.setattr(
+        'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Failing()
+    )
+    jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
+    found, failed = run_jobs(
+        jobs, lambda: None, tmp_path, config=RolloutConfig(), settings={}, show_progress=False
+    )
+    assert [result.index for result in found] == [1]
+    assert failed == {jobs[0].name: 'its server is gone'}
+
+
+def test_wrong_limits_are_refused():
+    with pytest.raises(ConfigError, match='--max-chunks'):
+        RolloutConfig(max_chunks=0)

@@ -1,0 +1,114 @@
+import json
+from math import isnan, nan
+import re
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from mtv_world_ros.ranking.page import write_ranking
+from mtv_world_ros.ranking.result import Result
+from mtv_world_ros.ranking.summary import Summary
+from mtv_world_ros.ranking.words import markdown, remarks
+
+#: (policy, true outcomes, imagined probabilities) of four episodes
+POLICIES = (
+    ('good', (1, 1, 1, 1), (0.9, 0.8, 0.7, 0.6)),
+    ('fair', (1, 1, 0, 0), (0.9, 0.1, 0.2, nan)),
+    ('bad', (0, 0, 0, 0), (0.1, 0.6, 0.2, 0.3)),
+)
+
+
+@pytest.fixture
+def summary(make_result):
+    results = [
+        make_result(policy, index, bool(final), probability)
+        for policy, finals, probabilities in POLICIES
+        for index, (final, probability) in enumerate(zip(finals, probabilities, strict=True))
+    ]
+    return Summary(
+        results=results, failed={'x_00000_<b>': 'gone'}, num_true=2,
+        provenance={'command': 'mtv-world rank'}, num_resamples=100,
+    )  # fmt: skip
+
+
+def test_rates_count_abstentions_apart(summary):
+    fair = summary.judged_rate('fair', None, 'imagined')
+    assert (fair.hits, fair.count, fair.num_abstained) == (1, 3, 1)
+    assert summary.true_rate('fair', None).value == 0.5
+    assert summary.policies == ('good', 'fair', 'bad')
+    assert summary.abstained('imagined').hits == 1 and summary.abstained('seen').hits == 0
+    counts = {'success_success': 5, 'success_failure': 1, 'failure_success': 1}
+    assert summary.confusion('imagined') == {**counts, 'failure_failure': 4}
+
+
+def test_agreement_is_that_of_the_rates(summary):
+    # rates judged 1, 1/3, 1/4 against true 1, 1/2, 0: by hand .375 / sqrt(.337963 * .5)
+    found = summary.agreement('imagined', None)
+    assert found['pearson'].value == pytest.approx(0.9122, abs=1e-4)
+    assert found['mmrv'].value == 0.0 and found['mmrv'].num_policies == 3
+    low, high = found['pearson'].interval
+    assert low <= found['pearson'].value <= high
+    assert summary.agreement('seen', None)['pearson'].value == pytest.approx(1.0)
+
+
+def test_powered_estimates_use_the_first_true_outcomes_alone(summary):
+    found = summary.powered('fair')
+    # true outcomes 1, 1 do not vary: they and imagination cannot give an interval with weight 0
+    assert (found.num_true, found.num_more) == (2, 2)
+    good = summary.powered('good')
+    assert good.value == pytest.approx(1.0) and isnan(good.interval[0])
+
+
+def test_speed_compares_both_worlds(summary):
+    speed = summary.speed()
+    assert speed['imagined episodes an hour'] == pytest.approx(1800)
+    assert speed['simulated episodes an hour, with pictures'] == pytest.approx(9000)
+    assert speed['simulated episodes an hour, physics alone'] == pytest.approx(36000)
+
+
+def test_the_page_says_what_the_numbers_hide(summary, make_result):
+    text = ' '.join(remarks(summary))
+    assert 'abstained in 1 of 12 imagined episodes (stack_blocks_two: 1)' in text
+    assert '1 rollouts have no result' in text and 'x_00000_<b>: gone' in text
+    blind = Summary(
+        results=[make_result(p, 0, p == 'a', nan) for p in 'ab'],
+        failed={}, num_true=1, provenance={}, num_resamples=10,
+    )  # fmt: skip
+    text = ' '.join(remarks(blind))
+    assert 'r is not defined' in text and 'It judged nothing of stack_blocks_two' in text
+    assert 'not defined' in markdown(blind)
+    alike = [make_result(p, i, i < 2, 0.9 if i < 2 else 0.1) for p in 'ab' for i in range(4)]
+    same = Summary(results=alike, failed={}, num_true=1, provenance={}, num_resamples=10)
+    assert 'rates are alike' in ' '.join(remarks(same))
+
+
+def test_the_page_says_that_two_policies_prove_nothing(make_result):
+    pair = [make_result(p, i, p == 'a', 0.9 if p == 'a' else 0.1) for p in 'ab' for i in range(4)]
+    two = Summary(results=pair, failed={}, num_true=1, provenance={}, num_resamples=10)
+    assert two.agreement('imagined', None)['pearson'].value == pytest.approx(1.0)
+    assert 'Of two policies r is 1 or -1 whatever they do' in ' '.join(remarks(two))
+
+
+def test_files_hold_the_same_numbers_and_the_page_is_whole(summary, tmp_path):
+    path = write_ranking(summary, tmp_path)
+    held = json.loads((tmp_path / 'ranking.json').read_text())
+    assert held['policies']['fair']['rates']['all tasks']['imagined']['abstained'] == 1
+    assert held['agreement']['imagined']['all tasks']['pearson']['value'] == pytest.approx(
+        0.9122, abs=1e-4
+    )
+    assert '0.33 [0.06, 0.79] of 3, 1 abstained' in (tmp_path / 'ranking.md').read_text()
+    page = path.read_text()
+    assert '&lt;b&gt;' in page and '<b>' not in page
+    charts = re.findall(r'<svg.*?</svg>', page, re.DOTALL)
+    for chart in charts:
+        tree = ElementTree.fromstring(chart)
+        assert len(list(tree.iter('circle'))) == 3
+    assert len(charts) == 4 and not list(tmp_path.rglob('*.part'))
+
+
+def test_a_result_survives_its_file(make_result):
+    result = make_result('a', 0, True, nan)
+    values = json.loads(json.dumps(result.as_json()).replace('NaN', 'null'))
+    back = Result.from_json(values)
+    assert isnan(back.imagined.probability) and back.seen == result.seen
+    assert back.imagined.reasons == ('why',) and back.seconds == result.seconds
