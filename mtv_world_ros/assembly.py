@@ -14,10 +14,12 @@ from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySett
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import content_digest, share_path
+from mtv_world_ros.success.calibration import CALIBRATION, Calibration, load_calibration
 from mtv_world_ros.success.describer import Describer, InstructionDescriber
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.success.segmenter_choice import choose_segmenter
+from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon
 
 if TYPE_CHECKING:
     from mtv_world_ros.success.describer_config import DescriberConfig
@@ -33,9 +35,15 @@ def checkpoint_path(name: str | Path) -> Path:
     return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
 
 
-def fingerprint(checkpoint: str | Path) -> str:
-    """Returns the checkpoint's name and a hash of its files: other weights, other name."""
-    return f'{checkpoint} ({content_digest(checkpoint_path(checkpoint))[:8]})'
+def fingerprint(checkpoint: str | Path, *, calibrated: bool = True) -> str:
+    """Returns the checkpoint's name and a hash of its files: other weights, other name.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        calibrated: the calibration counts too.
+    """
+    without = () if calibrated else (CALIBRATION, HORIZON)
+    return f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})'
 
 
 def robot_path(name: str | Path) -> Path:
@@ -63,6 +71,7 @@ def load_pipeline(
     num_threads: int = 0,
     segmenter: str = 'auto',
     serving: str = '',
+    calibrated: bool = True,
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -77,6 +86,7 @@ def load_pipeline(
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
         serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
             `ServingOptions`.
+        calibrated: use the checkpoint's calibration of the success estimate, where it has one.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
@@ -104,6 +114,8 @@ def load_pipeline(
         objects=objects,
         task=task,
         segmenter=assemble_segmenter(segmenter, device=device),
+        calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
+        horizon=load_horizon(checkpoint_path(checkpoint)),
     )
 
 
@@ -115,20 +127,29 @@ def assemble(
     objects: tuple[str, ...] = (),
     task: str | None = None,
     segmenter: Segmenter | None = None,
+    calibration: Calibration | None = None,
+    horizon: HorizonCurve | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says.
 
     Raises:
         CheckpointError: the robot is not the one the model was trained with.
     """
+    segmenter = segmenter or assemble_segmenter()
     return Pipeline(
         robot=_robot_of(card, robot),
         world_model=world_model,
-        segmenter=segmenter or assemble_segmenter(),
-        estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks')), task=task),
+        segmenter=segmenter,
+        estimator=SuccessEstimator(
+            load_tasks(share_path('config', 'tasks')),
+            task=task,
+            calibration=calibration,
+            segmenter=segmenter.name,
+        ),
         rendering=TrajectoryVideoConfig(**card['rendering']),
         object_mask=card['object_mask'],
         objects=objects,
+        horizon=horizon,
     )
 
 

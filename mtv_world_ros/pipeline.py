@@ -38,6 +38,7 @@ from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.footage import footage_of
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.segmenter import Segmenter
+from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
 
 class WorldModel(Protocol):
@@ -95,6 +96,7 @@ class Pipeline:
         rendering: how trajectory videos look; must be what the model was trained with.
         object_mask: whether trajectory videos carry the object masks.
         objects: names of the objects; empty = the ones the instruction names.
+        horizon: how J falls with the horizon, where it was measured.
         limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
@@ -105,6 +107,7 @@ class Pipeline:
     rendering: TrajectoryVideoConfig
     object_mask: bool = True
     objects: tuple[str, ...] = ()
+    horizon: HorizonCurve | None = None
     limit_tolerance: float = 1e-3
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 import hashlib
 from pathlib import Path
 import sys
@@ -41,10 +42,16 @@ def share_path(*parts: str) -> Path:
     raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")
 
 
-def content_digest(folder: Path) -> str:
-    """Returns the SHA-256 of a folder's files: other names or contents, another digest."""
+def content_digest(folder: Path, without: Collection[str] = ()) -> str:
+    """Returns the SHA-256 of a folder's files: other names or contents, another digest.
+
+    Args:
+        folder: is looked through with all folders in it.
+        without: names of files that do not count.
+    """
     digest = hashlib.sha256()
-    for file in sorted(path for path in folder.rglob('*') if path.is_file()):
+    files = (path for path in folder.rglob('*') if path.is_file() and path.name not in without)
+    for file in sorted(files):
         digest.update(file.relative_to(folder).as_posix().encode())
         with file.open('rb') as opened:
             while block := opened.read(2**24):

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from mtv_world_ros.cli import (
+    calibrate,
     collect,
     demo,
     distill,
@@ -30,6 +31,7 @@ COMMANDS = (
     distill,
     evaluate,
     rank,
+    calibrate,
     report,
     doctor,
     import_dataset,

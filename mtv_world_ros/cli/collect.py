@@ -32,6 +32,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='SHARE',
         help='share of the episodes whose cameras stand elsewhere; zero-shot views stay unseen',
     )
+    parser.add_argument(
+        '--failures-of-ten',
+        type=int,
+        default=2,
+        metavar='N',
+        help='so many of ten episodes of a task miss their grasp; 5 for mtv-world calibrate',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
@@ -56,6 +63,7 @@ def _collect(arguments: argparse.Namespace) -> int:
         arguments.out,
         zero_shot=arguments.zero_shot,
         workers=arguments.workers,
+        failures_of_ten=arguments.failures_of_ten,
         config=CollectConfig(randomization=size, moved_share=arguments.moved_cameras),
         sheets=arguments.sheets,
     )

@@ -132,12 +132,12 @@ class EpisodeScorer:
             recording, donor = self._load(job.path), self._donor(job)
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
-        probability, reasons = np.nan, ()
+        success = None
         names = job.objects or self.pipeline.objects or recording.objects
         names = names or objects_from_instruction(recording.instruction)
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
-            probability, reasons = chunks[-1].success.probability, chunks[-1].success.reasons
+            success = chunks[-1].success
             if features:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])
@@ -152,8 +152,9 @@ class EpisodeScorer:
             outcome=recording.outcome,
             rows=tuple(found.rows),
             quality=_mean_quality(found.quality),
-            probability=probability,
-            reasons=reasons,
+            probability=success.probability if success else np.nan,
+            reasons=success.reasons if success else (),
+            features=dict(success.features) if success else {},
             notes=tuple(found.notes),
             seconds_per_chunk=float(np.mean(found.chunk_seconds)),
             seconds=found.seconds,

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
-import numpy as np
-
-from mtv_world_ros.evaluation.charts import Bin, reliability_chart
+from mtv_world_ros.evaluation.charts import reliability_chart
 from mtv_world_ros.evaluation.evaluated import Evaluated, scores
 from mtv_world_ros.evaluation.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.policy_score import wilson
+from mtv_world_ros.evaluation.outcomes import Judgement
+from mtv_world_ros.evaluation.reliability import reliability_bins
 from mtv_world_ros.evaluation.report_numbers import badge, hue, letter, number
 
-_NUM_BINS = 5
 #: parts of metrics.json that have sections of their own
 _SHOWN = {'name', 'label', 'provenance', 'failed', 'notes', 'episodes', 'success'}
 _SHOWN |= {'views', 'overall', 'tasks', 'zero_shot'}
@@ -68,26 +66,14 @@ def _words(key: str) -> str:
 
 
 def _reliability(found: Evaluated, style: str) -> Markup | None:
-    judged = [
-        (result.probability, result.outcome == 'success')
-        for result in found.results.values()
-        if result.outcome in ('success', 'failure') and isfinite(result.probability)
-    ]
-    if not judged:
+    bins = reliability_bins(
+        [
+            Judgement(probability=result.probability, outcome=result.outcome)
+            for result in found.results.values()
+        ]
+    )
+    if not bins:
         return None
-    said = np.array([probability for probability, _ in judged])
-    true = np.array([success for _, success in judged])
-    place = np.minimum((said * _NUM_BINS).astype(int), _NUM_BINS - 1)
-    bins = [
-        Bin(
-            said=float(said[place == k].mean()),
-            came_true=float(true[place == k].mean()),
-            interval=wilson(int(true[place == k].sum()), int((place == k).sum())),
-            count=int((place == k).sum()),
-        )
-        for k in range(_NUM_BINS)
-        if (place == k).any()
-    ]
     return reliability_chart('Share of real successes against the estimate', bins, style)
 
 

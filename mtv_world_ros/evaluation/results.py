@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ class EpisodeResult:
         notes: what was wrong with the recording, and what could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: what the time of the episode went into [s].
+        features: of that estimate, by name; empty where it abstained.
         has_ids: which objects move was read from recorded identities.
     """
 
@@ -43,6 +44,7 @@ class EpisodeResult:
     seconds_per_chunk: float
     seconds: Mapping[str, float]
     has_ids: bool
+    features: Mapping[str, float] = field(default_factory=dict)
 
     def means(self, view: str | None) -> dict[str, float]:
         """Returns the numbers of a view (None = all views) that are averaged over episodes."""
@@ -62,4 +64,6 @@ class EpisodeResult:
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
+        given = values.get('features', {})
+        read['features'] = {k: np.nan if v is None else v for k, v in given.items()}
         return EpisodeResult(**read)

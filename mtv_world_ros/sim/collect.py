@@ -26,7 +26,7 @@ from mtv_world_ros.sim.dataset_card import (
 )
 from mtv_world_ros.sim.dataset_readme import write_readme
 from mtv_world_ros.sim.episode_maker import CollectConfig
-from mtv_world_ros.sim.jobs import Job, jobs_of, zero_shot_jobs
+from mtv_world_ros.sim.jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
 from mtv_world_ros.sim.opengl import load_mujoco
 from mtv_world_ros.sim.tasks import tasks_named
 from mtv_world_ros.sim.workers import locked, made
@@ -46,6 +46,7 @@ def collect(
     zero_shot: str | Sequence[str] = (),
     workers: int = 1,
     config: CollectConfig | None = None,
+    failures_of_ten: int = NUM_MISSED,
     sheets: bool = False,
     progress: bool = True,
 ) -> list[EpisodeEntry]:
@@ -62,6 +63,7 @@ def collect(
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
         workers: processes.
         config: what is randomised and how it is sampled.
+        failures_of_ten: how many of ten episodes of a task miss their grasp; not of zero-shot.
         sheets: also write a larger contact sheet of every task.
         progress: show a progress bar.
 
@@ -83,7 +85,7 @@ def collect(
     jobs = (
         zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
         if kinds
-        else jobs_of(chosen, num_episodes, seed, out)
+        else jobs_of(chosen, num_episodes, seed, out, failures_of_ten)
     )
     with locked(out):
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)

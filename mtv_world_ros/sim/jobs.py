@@ -9,11 +9,13 @@ import zlib
 
 import numpy as np
 
+from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.tasks import Task
 from mtv_world_ros.sim.zero_shot import tasks_of
 
-#: of every ten episodes of a task, one of even and one of odd index misses (the paper's 8:2)
 BLOCK = 10
+#: of every ten episodes of a task, one of even and one of odd index misses (the paper's 8:2)
+NUM_MISSED = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,21 +47,39 @@ def episode_seed(
     return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
 
-def misses(seed: int, task: str, index: int, zero_shot: str | None = None) -> bool:
-    """Returns whether this episode is one of the two in ten whose grasp misses."""
+def misses(
+    seed: int, task: str, index: int, zero_shot: str | None = None, num_of_ten: int = NUM_MISSED
+) -> bool:
+    """Returns whether this episode is one of the `num_of_ten` whose grasp misses."""
     block, place = divmod(index, BLOCK)
-    entropy = [seed, _number(task, zero_shot), block]
-    even, odd = np.random.default_rng(entropy).integers(0, BLOCK // 2, 2)
-    return place in (2 * even, 2 * odd + 1)
+    rng = np.random.default_rng([seed, _number(task, zero_shot), block])
+    if num_of_ten == NUM_MISSED:
+        even, odd = rng.integers(0, BLOCK // 2, NUM_MISSED)
+        return place in (2 * even, 2 * odd + 1)
+    return place in rng.permutation(BLOCK)[:num_of_ten]
 
 
 def _number(task: str, zero_shot: str | None) -> int:
     return zlib.crc32((task if zero_shot is None else f'{zero_shot}:{task}').encode())
 
 
-def jobs_of(tasks: Sequence[Task], num_episodes: int, seed: int, out: Path) -> list[Job]:
-    """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed."""
-    return [_job(task, index, seed, out) for index in range(num_episodes) for task in tasks]
+def jobs_of(
+    tasks: Sequence[Task], num_episodes: int, seed: int, out: Path, num_of_ten: int = NUM_MISSED
+) -> list[Job]:
+    """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
+
+    Raises:
+        SimulatorError: not 0 to 10 of ten episodes are to miss.
+    """
+    if not 0 <= num_of_ten <= BLOCK:
+        raise SimulatorError(
+            f'{num_of_ten} of {BLOCK} episodes are to miss; set --failures-of-ten to 0 ... {BLOCK}'
+        )
+    return [
+        _job(task, index, seed, out, num_of_ten=num_of_ten)
+        for index in range(num_episodes)
+        for task in tasks
+    ]
 
 
 def zero_shot_jobs(
@@ -75,13 +95,20 @@ def zero_shot_jobs(
     return jobs
 
 
-def _job(task: Task, index: int, seed: int, out: Path, kind: str | None = None) -> Job:
+def _job(
+    task: Task,
+    index: int,
+    seed: int,
+    out: Path,
+    kind: str | None = None,
+    num_of_ten: int = NUM_MISSED,
+) -> Job:
     name = f'{task.name}_{index:05d}'
     return Job(
         task=task.name,
         index=index,
         seed=seed,
-        miss=misses(seed, task.name, index, kind),
+        miss=misses(seed, task.name, index, kind, num_of_ten),
         path=out / (name if kind is None else f'{kind}_{name}'),
         zero_shot=kind,
     )

@@ -12,6 +12,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.success.calibration import Calibration
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, view_mean
 from mtv_world_ros.success.footage import Footage
 from mtv_world_ros.success.relations import CannotTell, Margin
@@ -52,6 +53,12 @@ class EstimatorConfig:
         return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
 
 
+def capped(probability: float, features: Mapping[str, float]) -> float:
+    """Returns the probability, small where `released` says that a gripper is still closed."""
+    closed = features.get('released', nan) == 0.0
+    return min(probability, CLOSED_PROBABILITY) if closed else probability
+
+
 class Judged(NamedTuple):
     """The estimate after a chunk, and what to remember for the next one."""
 
@@ -67,6 +74,8 @@ class SuccessEstimator:
         tasks: Sequence[TaskSpec] = (),
         task: str | None = None,
         config: EstimatorConfig | None = None,
+        calibration: Calibration | None = None,
+        segmenter: str = '',
     ) -> None:
         """Sets what may be judged.
 
@@ -75,6 +84,8 @@ class SuccessEstimator:
             task: name of the one to judge; default: the one the instruction matches. Where the
                 instruction names no objects for it, they take the task's placeholders in order.
             config: weights and limits.
+            calibration: fitted weights, used where they hold.
+            segmenter: what finds the masks.
 
         Raises:
             ConfigError: `task` is not among `tasks`.
@@ -88,6 +99,7 @@ class SuccessEstimator:
         self.tasks = tuple(known for known in tasks if task in (None, known.name))
         self.is_given = task is not None
         self.config = config or EstimatorConfig()
+        self.calibration, self.segmenter = calibration, segmenter
 
     def estimate(
         self, footage: Footage, instruction: str = '', memory: RolloutMemory | None = None
@@ -130,9 +142,15 @@ class SuccessEstimator:
         raise CannotTell(f"'{instruction}' is no known task (known: {known})")
 
     def _judge(self, task: TaskSpec, evidence: Evidence, views: Views) -> SuccessEstimate:
-        features, spread = evidence.features, 1.96 * evidence.sigma
+        features, spread = dict(evidence.features), 1.96 * evidence.sigma
+        features['released'] = _released(task, views.footage.openings)
+        basis = self._objection(task)
+        weigh = self.config if basis or not self.calibration else self.calibration
         low, middle, high = (
-            self.config.probability({**features, 'margin': clipped(features['margin'] + shift)})
+            capped(
+                weigh.probability({**features, 'margin': clipped(features['margin'] + shift)}),
+                features,
+            )
             for shift in (-spread, 0.0, spread)
         )
         first = [view_mean(views.start_jaccard(item)) for item in evidence.goal_jaccard]
@@ -144,25 +162,40 @@ class SuccessEstimator:
                 f'J with the goal mask {g:.2f}, with the start mask {s:.2f}' for g, s in pairs
             ]
         reasons += evidence.notes
-        openings = views.footage.openings
-        if task.gripper == 'open' and openings is None:
+        if task.gripper == 'open' and views.footage.openings is None:
             reasons.append('gripper not checked')
-        elif task.gripper == 'open' and openings is not None and _is_closed(openings):
-            low, middle = 0.0, min(middle, CLOSED_PROBABILITY)
-            high = max(middle, min(high, CLOSED_PROBABILITY))
+        elif features['released'] == 0.0:
+            low = 0.0
             reasons.append('a gripper is still closed')
-        reasons.append('uncalibrated: a logistic with stated weights, given the world model')
+        reasons.append(basis or f'calibrated: {_origin(self.calibration)}, given the world model')
         return SuccessEstimate(
             probability=middle,
             interval=(low, high),
             jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
             reasons=tuple(reasons),
             features=features,
+            is_calibrated=not basis,
         )
 
+    def _objection(self, task: TaskSpec) -> str:
+        """Why the probability is not a fitted one; empty = it is."""
+        stated = 'a logistic with stated weights, given the world model'
+        if self.calibration is None:
+            return f'uncalibrated: {stated}'
+        objection = self.calibration.objection(task.name, self.segmenter)
+        return objection and f'{objection}: {stated}'
 
-def _is_closed(openings: FloatArray) -> bool:
-    return float(np.min(openings[:, -1])) < OPEN_GRIPPER
+
+def _origin(calibration: Calibration | None) -> str:
+    assert calibration is not None
+    return f'fitted on {calibration.num_episodes} episodes of {len(calibration.tasks)} tasks'
+
+
+def _released(task: TaskSpec, openings: FloatArray | None) -> float:
+    """Whether the grippers are as open as the task asks; NaN = not known, or it does not ask."""
+    if openings is None or task.gripper != 'open':
+        return nan
+    return float(np.min(openings[:, -1]) >= OPEN_GRIPPER)
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:

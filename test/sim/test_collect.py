@@ -16,8 +16,9 @@ from mtv_world_ros.data.mcap_reader import iter_messages, read_episode, read_inf
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.sim.collect import collect
 from mtv_world_ros.sim.episode_maker import CollectConfig
-from mtv_world_ros.sim.jobs import episode_seed, misses
+from mtv_world_ros.sim.jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.sim.randomize import RandomizationConfig
+from mtv_world_ros.sim.tasks import tasks_named
 from mtv_world_ros.sim.workers import locked
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))
@@ -239,3 +240,17 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path, opengl):
     (tmp_path / 'file').write_text('')
     with pytest.raises(SimulatorError, match='cannot write into .*file'):
         _collect(tmp_path / 'file' / 'set')
+
+
+@pytest.mark.parametrize('num', [0, 2, 5, 10])
+def test_so_many_of_ten_episodes_of_a_task_are_to_miss(tmp_path, num):
+    tasks = tasks_named('stack_blocks_two,shake_bottle')
+    jobs = jobs_of(tasks, 20, 3, tmp_path, num)
+    for task in tasks:
+        missed = [job.miss for job in jobs if job.task == task.name]
+        assert sum(missed[:10]) == sum(missed[10:]) == num
+
+
+def test_more_than_ten_of_ten_cannot_miss(tmp_path):
+    with pytest.raises(SimulatorError, match='--failures-of-ten'):
+        jobs_of(tasks_named('shake_bottle'), 1, 0, tmp_path, 11)

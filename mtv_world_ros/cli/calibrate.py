@@ -1,0 +1,157 @@
+"""`mtv-world calibrate`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, add_serving
+from mtv_world_ros.cli.provenance import provenance
+
+if TYPE_CHECKING:
+    from mtv_world_ros.evaluation.dataset import Selection
+    from mtv_world_ros.evaluation.results import EpisodeResult
+    from mtv_world_ros.evaluation.summary import Summary
+    from mtv_world_ros.success.trusted_horizon import HorizonCurve
+
+#: seeds of one episode lie so far apart that their chunks' seeds never meet
+SEED_STEP = 1_000_003
+_EPILOG = """\
+Every episode is imagined as a whole from its first frame with its own commands; what the success
+estimate then sees is fitted to what really happened. The checkpoint gets success_calibration.json
+and horizon.json, DIR gets calibration.md, reliability.html and calibration.json. Half of the
+episodes should be failures: mtv-world collect --failures-of-ten 5. Running the same command again
+goes on where it was stopped.
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'calibrate',
+        help="fit a checkpoint's success estimate to recorded outcomes",
+        epilog=_EPILOG,
+    )
+    parser.add_argument('checkpoint', help="folder, or 'bundled'")
+    parser.add_argument('dataset', type=Path, help='folder of episodes with outcomes')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: test where there is one"
+    )
+    parser.add_argument('--episodes', type=int, help='use only so many')
+    parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
+    parser.add_argument('--seeds', type=_count, default=1, help='rollouts of each episode')
+    parser.add_argument('--l2', type=float, default=1.0, help='penalty on the weights')
+    parser.add_argument(
+        '--no-store',
+        dest='store',
+        action='store_false',
+        help='write the report only; leave the checkpoint as it is',
+    )
+    add_dtype(parser)
+    add_model_options(parser)
+    add_serving(parser)
+    add_segmenter(parser)
+    parser.set_defaults(handler=_calibrate)
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more')
+    return number
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import checkpoint_path
+    from mtv_world_ros.evaluation.calibrate import calibrate, samples_of
+    from mtv_world_ros.evaluation.calibration_report import write_calibration_report
+    from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.success.calibration import save_calibration
+    from mtv_world_ros.success.trusted_horizon import save_horizon
+
+    selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    print(f'{arguments.dataset}: {selection}')
+    made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
+    runs = _imagine(arguments, selection)
+    segmenter = str(runs[0].settings['segmenter'])
+    found = calibrate(
+        samples_of([run.results for run in runs]), segmenter=segmenter, l2=arguments.l2, made=made
+    )
+    horizon = _horizon([run.results for run in runs], runs[0], made)
+    text = write_calibration_report(arguments.out, found, horizon)
+    if arguments.store:
+        folder = checkpoint_path(arguments.checkpoint)
+        print(f'stored: {save_calibration(folder, found.calibration)}')
+        if horizon is not None:
+            print(f'stored: {save_horizon(folder, horizon)}')
+    print(text)
+    return 0
+
+
+def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
+    """Imagines and scores the episodes once a seed."""
+    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+
+    load = partial(
+        load_pipeline,
+        arguments.checkpoint,
+        robot=arguments.robot,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        segmenter=arguments.segmenter,
+        serving=arguments.serving,
+        calibrated=False,
+    )
+    pipeline = load(num_threads=arguments.threads)
+    cores = len(os.sched_getaffinity(0))
+    threads = arguments.threads or max(cores // max(arguments.workers, 1), 1)
+    return [
+        evaluate(
+            pipeline,
+            selection.paths,
+            arguments.out / f'seed_{index}',
+            name=fingerprint(arguments.checkpoint, calibrated=False),
+            zero_shot=selection.zero_shot,
+            provenance=provenance(arguments),
+            parallel=Parallel(
+                workers=arguments.workers,
+                make_pipeline=partial(load, num_threads=threads),
+                threads=threads,
+            ),
+            mode='imagine',
+            seed=arguments.seed + SEED_STEP * index,
+            num_inference_steps=arguments.steps,
+            actions=('true',),
+            ceiling=False,
+        )
+        for index in range(arguments.seeds)
+    ]
+
+
+def _horizon(
+    runs: Sequence[Sequence[EpisodeResult]], summary: Summary, made: dict[str, str]
+) -> HorizonCurve | None:
+    """J of the objects that move against the horizon; None = nothing moves."""
+    from mtv_world_ros.evaluation.horizon import curve
+    from mtv_world_ros.success.trusted_horizon import HorizonCurve
+
+    rows: dict[str, list] = {}
+    for result in (result for run in runs for result in run):
+        rows.setdefault(result.episode, []).extend(result.rows)
+    found = curve(list(rows.values()), None, 'j_frames')
+    if not found.values:
+        return None
+    return HorizonCurve(
+        period_s=1 / summary.spec.fps,
+        values=found.values,
+        lower=tuple(low for low, _ in found.band),
+        segmenter=str(summary.settings['segmenter']),
+        num_episodes=len(rows),
+        made=made,
+    )

@@ -1,0 +1,66 @@
+"""Logistic regression with an L2 penalty, by Newton's method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Logistic:
+    """P(true) = 1 / (1 + exp(-(weights x + bias))).
+
+    Attributes:
+        weights: (F,).
+        bias: is not penalised.
+    """
+
+    weights: FloatArray
+    bias: float
+
+    def probability(self, features: FloatArray) -> FloatArray:
+        """Returns (N,) for features (N, F)."""
+        return _sigmoid(features @ self.weights + self.bias)
+
+
+def fit_logistic(
+    features: FloatArray, labels: BoolArray, *, l2: float = 1.0, num_steps: int = 100
+) -> Logistic:
+    """Minimises -log likelihood + l2 / 2 * |weights|^2 (scikit-learn's with C = 1 / l2).
+
+    Args:
+        features: (N, F).
+        labels: (N,).
+        l2: strength of the penalty; positive, so that there is one minimum.
+        num_steps: of Newton's method at most.
+
+    Raises:
+        ConfigError: there are no rows, or `l2` is not positive.
+    """
+    if not len(features) or l2 <= 0:
+        raise ConfigError(
+            f'a logistic is fitted to {len(features)} episodes with l2 = {l2}; it needs at least '
+            'one episode and a positive l2'
+        )
+    design = np.concatenate([features, np.ones((len(features), 1))], axis=1)
+    penalty = np.full(design.shape[1], l2)
+    penalty[-1] = 1e-9  # keeps the bias finite where all labels are equal
+    theta = np.zeros(design.shape[1])
+    for _ in range(num_steps):
+        said = _sigmoid(design @ theta)
+        gradient = design.T @ (said - labels) + penalty * theta
+        curvature = (design * (said * (1 - said))[:, None]).T @ design + np.diag(penalty)
+        step = np.linalg.solve(curvature, gradient)
+        # far from the minimum a whole step may overshoot
+        theta -= step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-12))
+        if np.abs(step).max() < 1e-10 or np.abs(theta[-1]) > 30:
+            break
+    return Logistic(weights=theta[:-1], bias=float(theta[-1]))
+
+
+def _sigmoid(logits: FloatArray) -> FloatArray:
+    return 0.5 * (1 + np.tanh(logits / 2))

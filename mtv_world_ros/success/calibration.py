@@ -1,0 +1,123 @@
+"""A fitted logistic of the estimate's features, kept with the checkpoint that it is for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+import json
+from math import exp, isfinite, nan
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.errors import CheckpointError, nearest
+
+CALIBRATION = 'success_calibration.json'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """What `mtv-world calibrate` found: F features, standardised, weighed and added up.
+
+    Attributes:
+        features: F names.
+        means: F, subtracted; what takes the place of a feature that says nothing.
+        scales: F, divided by.
+        weights: F, logit per scale.
+        bias: logit of an episode whose features are all at their mean.
+        segmenter: that found the masks.
+        tasks: that it was fitted on.
+        num_episodes: that it was fitted on.
+        num_seeds: rollouts of each.
+        l2: strength of the penalty on the weights.
+        scores: before and after, the latter on tasks that were left out of the fit.
+        made: command, date, machine.
+    """
+
+    features: tuple[str, ...]
+    means: tuple[float, ...]
+    scales: tuple[float, ...]
+    weights: tuple[float, ...]
+    bias: float
+    segmenter: str
+    tasks: tuple[str, ...]
+    num_episodes: int
+    num_seeds: int = 1
+    l2: float = 1.0
+    scores: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    made: Mapping[str, str] = field(default_factory=dict)
+
+    def probability(self, features: Mapping[str, float]) -> float:
+        """Returns the probability of success; features that are NaN count as the mean."""
+        logit = self.bias
+        for name, mean, scale, weight in zip(
+            self.features, self.means, self.scales, self.weights, strict=True
+        ):
+            value = features.get(name, nan)
+            logit += weight * (value - mean) / scale if isfinite(value) else 0.0
+        return 1.0 / (1.0 + exp(-max(min(logit, 50.0), -50.0)))
+
+    def objection(self, task: str, segmenter: str) -> str:
+        """Returns why it does not hold for a task and a segmenter; empty = it does."""
+        if segmenter != self.segmenter:
+            return f"uncalibrated for the segmenter '{segmenter}' (fitted with '{self.segmenter}')"
+        if task not in self.tasks:
+            return f"uncalibrated for the task '{task}' (fitted on {len(self.tasks)} others)"
+        return ''
+
+
+def save_calibration(folder: Path, calibration: Calibration) -> Path:
+    """Writes it into a checkpoint, beside its name first.
+
+    Raises:
+        CheckpointError: the folder cannot be written to.
+    """
+    path = Path(folder) / CALIBRATION
+    beside = path.with_name(f'.{path.name}.part')
+    try:
+        beside.write_text(json.dumps(asdict(calibration), indent=1) + '\n', encoding='utf-8')
+        beside.replace(path)
+    except OSError as error:
+        raise CheckpointError(
+            f"the calibration cannot be stored in the checkpoint '{folder}' ({error}); copy the "
+            'checkpoint to a folder of your own and calibrate that one'
+        ) from error
+    return path
+
+
+def load_calibration(folder: Path) -> Calibration | None:
+    """Returns the calibration of a checkpoint; None = it has none.
+
+    Raises:
+        CheckpointError: the file is not what `mtv-world calibrate` writes.
+    """
+    path = Path(folder) / CALIBRATION
+    if not path.is_file():
+        return None
+    hint = f"run 'mtv-world calibrate {folder} DATASET --out DIR' again, or delete the file"
+    try:
+        values = json.loads(path.read_text(encoding='utf-8'))
+        _check_keys(values)
+        read = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        found = Calibration(**read)
+        _check_numbers(found)
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(f"'{path}' cannot be used: {error}; {hint}") from error
+    return found
+
+
+def _check_keys(values: Any) -> None:
+    known = [item.name for item in fields(Calibration)]
+    if not isinstance(values, dict):
+        raise ValueError('expected keys and values')
+    for key in values:
+        if key not in known:
+            raise ValueError(f"unknown key '{key}'{nearest(key, known)}")
+
+
+def _check_numbers(found: Calibration) -> None:
+    lengths = {len(found.means), len(found.scales), len(found.weights), len(found.features)}
+    numbers = [*found.means, *found.scales, *found.weights, found.bias]
+    if len(lengths) != 1 or not found.features:
+        raise ValueError('features, means, scales and weights are not equally many')
+    if not all(isfinite(number) for number in numbers) or min(found.scales) <= 0:
+        raise ValueError('a number is not finite, or a scale is not positive')
