@@ -14,7 +14,9 @@ from typing import Any
 import torch
 
 from mtv_world_ros.model.context_parallel import join, open_store, receive, split
+from mtv_world_ros.model.preparation import prepare
 from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
 
@@ -26,31 +28,30 @@ def main() -> None:
     device = torch.device(start['device'])
     join(open_store(start['port']), start['rank'], start['size'], device)
     with torch.inference_mode():
-        _follow(lines, start['config'], device, getattr(torch, start['dtype']))
+        _follow(lines, start, device)
 
 
-def _follow(
-    lines: Iterator[dict[str, Any]], config: Any, device: torch.device, dtype: torch.dtype
-) -> None:
+def _follow(lines: Iterator[dict[str, Any]], start: dict[str, Any], device: torch.device) -> None:
     transformer: Any = None
     for line in lines:
         tensors = receive(line['tensors'], device)
         if line['command'] == 'run':
             transformer(**tensors)
         elif transformer is None:
-            transformer = _build(config, tensors, device, dtype)
+            transformer = _build(start, tensors, device)
         else:
             transformer.load_state_dict(tensors)
 
 
 def _build(
-    config: Any, weights: dict[str, torch.Tensor], device: torch.device, dtype: torch.dtype
+    start: dict[str, Any], weights: dict[str, torch.Tensor], device: torch.device
 ) -> MultiViewWanTransformer:
     with torch.device('meta'):
-        transformer: Any = MultiViewWanTransformer.from_config(config)
+        transformer: Any = MultiViewWanTransformer.from_config(start['config'])
     transformer.load_state_dict(weights, assign=True)
-    place(transformer, device, dtype).eval()
+    place(transformer, device, getattr(torch, start['dtype'])).eval()
     split(transformer)
+    prepare(transformer, ServingOptions(**start['serving']), device)
     return transformer
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 import inspect
 import json
 import subprocess
@@ -13,6 +14,7 @@ from torch import distributed, Tensor
 
 from mtv_world_ros.errors import ConfigError, ModelError
 from mtv_world_ros.model.context_parallel import describe, join, open_store, send, split
+from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
 
@@ -24,14 +26,15 @@ class Followers:
 
     Args:
         transformer: on its device; the followers take the next ones.
-        size: processes, this one included.
+        serving: how many processes, this one included, and what each of them makes of the weights.
 
     Raises:
         ConfigError: fewer devices than processes, or a group of processes is there already.
         CheckpointError: see `split`.
     """
 
-    def __init__(self, transformer: MultiViewWanTransformer, size: int) -> None:
+    def __init__(self, transformer: MultiViewWanTransformer, serving: ServingOptions) -> None:
+        size = serving.context_parallel
         devices = _devices(transformer.device, size)
         if distributed.is_initialized():
             raise ConfigError(
@@ -41,7 +44,8 @@ class Followers:
         self._transformer = transformer
         store = open_store()
         self._processes = [
-            _start(transformer, devices[rank], rank, size, store.port) for rank in range(1, size)
+            _start(transformer, serving, devices[rank], rank, store.port)
+            for rank in range(1, size)
         ]
         join(store, 0, size, devices[0])
         self.send_weights()
@@ -91,7 +95,11 @@ def _devices(first: torch.device, size: int) -> list[torch.device]:
 
 
 def _start(
-    transformer: MultiViewWanTransformer, device: torch.device, rank: int, size: int, port: int
+    transformer: MultiViewWanTransformer,
+    serving: ServingOptions,
+    device: torch.device,
+    rank: int,
+    port: int,
 ) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, '-m', 'mtv_world_ros.model.follower'], stdin=subprocess.PIPE, text=True
@@ -99,7 +107,8 @@ def _start(
     assert process.stdin is not None
     start = {
         'rank': rank,
-        'size': size,
+        'size': serving.context_parallel,
+        'serving': asdict(serving),
         'port': port,
         'device': str(device),
         'dtype': str(transformer.dtype).removeprefix('torch.'),

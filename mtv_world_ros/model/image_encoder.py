@@ -36,6 +36,7 @@ class ImageEncoder:
         self.model: Any = model
         self._source, self._num_kept = source, num_kept
         self._kept: OrderedDict[bytes, Tensor] = OrderedDict()
+        self._device, self._stays = torch.device('cpu'), True
 
     @classmethod
     def load(cls, checkpoint: Path, *, dtype: torch.dtype = torch.float32) -> ImageEncoder:
@@ -53,15 +54,19 @@ class ImageEncoder:
             raise CheckpointError(f"'{folder}' cannot be loaded: {error}") from error
         return cls(model.eval(), checkpoint)
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> ImageEncoder:
-        """Moves it, and returns it."""
-        self.model.to(device=device, dtype=dtype)
+    def to(self, device: torch.device, dtype: torch.dtype, *, stays: bool = True) -> ImageEncoder:
+        """Moves it, and returns it; `stays=False`: it is there only while it encodes."""
+        self._device, self._stays = device, stays
+        self.model.to(device=device if stays else 'cpu', dtype=dtype)
         self._kept.clear()
         return self
 
     def encode(self, images: Tensor) -> Tensor:
         """Returns (V, N, D) tokens of (V, H, W, 3) uint8 RGB images; N = 257 for ViT-H/14."""
-        return torch.stack([self._tokens(image) for image in images])
+        tokens = torch.stack([self._tokens(image) for image in images])
+        if not self._stays:
+            self.model.to('cpu')
+        return tokens
 
     def _tokens(self, image: Tensor) -> Tensor:
         key = repr(tuple(image.shape)).encode() + image.cpu().numpy().tobytes()
@@ -74,6 +79,7 @@ class ImageEncoder:
 
     @torch.inference_mode()
     def _encode(self, image: Tensor) -> Tensor:
+        self.model.to(self._device)
         size = self.model.config.image_size
         pixels = image.to(self.model.device).movedim(-1, 0)[None].float().div(255)
         # the whole image, squeezed to a square: Wan crops nothing

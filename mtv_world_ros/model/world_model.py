@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
-from mtv_world_ros.errors import CheckpointError, ModelMemoryError
+from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import spec_of
@@ -31,7 +31,9 @@ from mtv_world_ros.model.history import (
 )
 from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.lora import Adapter, Adapters
+from mtv_world_ros.model.memory import check_memory
 from mtv_world_ros.model.parts import check_video
+from mtv_world_ros.model.preparation import decoder_of, prepare
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
 from mtv_world_ros.model.serving import ServingOptions
@@ -55,6 +57,7 @@ class DiffusionWorldModel:
     Raises:
         CheckpointError: it is needed and missing.
         ConfigError: the serving options are not for this machine.
+        ModelMemoryError: it does not fit the device.
     """
 
     def __init__(
@@ -73,25 +76,48 @@ class DiffusionWorldModel:
             )
         self.actions, self.robot = checkpoint.actions, robot
         self.device = torch.device(device)
-        self.transformer = place(checkpoint.transformer, self.device, dtype).eval()
+        self._serving = serving
+        check_memory(checkpoint, serving, self.device, dtype)
+        home = torch.device('cpu') if serving.offload else self.device
+        self.transformer = place(checkpoint.transformer, home, dtype).eval()
         self._adapters = Adapters(self.transformer, fuse=serving.fuse_lora)
         #: of the checkpoint; None = it has none
         self.own_adapter = checkpoint.adapter
         self._adapters.use(checkpoint.adapter)
         self._followers = None
         if serving.context_parallel > 1:
-            self._followers = Followers(self.transformer, serving.context_parallel)
+            self._followers = Followers(self.transformer, serving)
+        prepare(self.transformer, serving, self.device)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
+        self._decoder = decoder_of(self.autoencoder, serving, dtype)
         self.scheduler = checkpoint.scheduler
         self.card = checkpoint.card
         self.spec = spec_of(checkpoint.card)
         check_video(self.autoencoder, self.transformer.config, self.spec)
+        if serving.tiny_encoder:
+            self.autoencoder = self._decoder
         self.history = history_settings(checkpoint.card)
         check_history(self.history, self.autoencoder, self.transformer.config)
         self.text_encoder = checkpoint.text_encoder
         self.image_encoder = checkpoint.image_encoder
         if self.image_encoder is not None:
-            self.image_encoder.to(self.device, dtype)
+            self.image_encoder.to(self.device, dtype, stays=not serving.offload)
+        if serving.compile or serving.cuda_graphs:
+            self._warm_up()
+
+    def _warm_up(self) -> None:
+        """A prediction that nobody sees, so that the first one of use need not wait."""
+        spec = self.spec
+        shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
+        num_joints = 0 if self.robot is None else len(self.robot.joint_names)
+        self.predict(
+            np.zeros((shape[0], *shape[2:]), np.uint8),
+            np.zeros(shape, np.uint8),
+            positions=np.zeros((shape[1], num_joints)),
+            seed=0,
+            num_inference_steps=1,
+            should_stop=lambda: False,
+        )
 
     def read_adapter(self, path: Path | None) -> Adapter:
         """Returns an adapter that fits, for `use_adapter`; also while a prediction runs.
@@ -112,6 +138,12 @@ class DiffusionWorldModel:
             CheckpointError: it cannot be read or is for another model; the one before stays.
         """
         if adapter != self._adapters.current:
+            if self._serving.weights != 'same':
+                raise ConfigError(
+                    f'weights={self._serving.weights} keeps no weights that an adapter could be '
+                    'added to; start with that adapter in the checkpoint, or with weights=same in '
+                    "'serving'"
+                )
             self._adapters.use(adapter)
             if self._followers is not None:
                 self._followers.send_weights()
@@ -173,9 +205,9 @@ class DiffusionWorldModel:
                     should_stop=should_stop,
                     guidance_scale=float(self.card.get('guidance_scale', 1.0)),
                 )
-                latents = latents.to(self.autoencoder.dtype)
+                latents = latents.to(self._decoder.dtype)
                 # one at a time: decoding takes more memory than denoising
-                frames = [decode_frames(self.autoencoder, one[None]) for one in latents]
+                frames = [decode_frames(self._decoder, one[None]) for one in latents]
                 return torch.cat(frames).cpu().numpy()
         except (torch.OutOfMemoryError, MemoryError) as error:
             raise self._out_of_memory(trajectory_frames, error) from error
@@ -240,6 +272,7 @@ class DiffusionWorldModel:
             torch.cuda.empty_cache()
         return ModelMemoryError(
             f'out of memory on {self.device} with {views} views of {count} frames of '
-            f'{width}x{height}; use a smaller preset, another device, or free memory there '
+            f"{width}x{height}; set offload=true or weights=float8 in 'serving', use a smaller "
+            'preset or another device, or free memory there '
             f'({str(error).splitlines()[0]})'
         )

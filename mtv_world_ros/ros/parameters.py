@@ -72,7 +72,9 @@ TABLE: tuple[Entry, ...] = (
     _at_start(
         'num_threads', 0, 'CPU threads of the model; 0 = all cores but one.', bounds=(0, 1024)
     ),
-    _at_start('serving', '', "What makes the model faster or smaller, e.g. 'context_parallel=2'."),
+    _at_start(
+        'serving', '', "What makes the model faster or smaller, e.g. 'compile=true'; see README."
+    ),
     _at_start(
         'task', '', 'Task to judge (config/tasks); empty = the one the instruction matches.'
     ),

@@ -12,6 +12,7 @@ from wan_files import TRANSFORMER
 
 from mtv_world_ros.errors import ConfigError, ModelError
 from mtv_world_ros.model.followers import Followers
+from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
 #: 1 + 3 token frames of 4 x 4 tokens; three heads do not divide among two processes
@@ -39,7 +40,7 @@ def inputs(views: int, batch: int = 1, frames: int = 3, size: int = 8) -> dict[s
 def pair() -> Iterator[tuple[MultiViewWanTransformer, MultiViewWanTransformer, Followers]]:
     """The same transformer alone and shared by two processes."""
     alone, shared = (build(MODEL).eval().requires_grad_(False) for _ in range(2))
-    followers = Followers(shared, 2)
+    followers = Followers(shared, ServingOptions(context_parallel=2))
     yield alone, shared, followers
     followers.close()
 
@@ -84,7 +85,7 @@ def test_changed_weights_reach_the_other_process(pair) -> None:
 
 def test_a_second_group_is_refused(pair) -> None:
     with pytest.raises(ConfigError, match='has a group already'):
-        Followers(build(MODEL), 2)
+        Followers(build(MODEL), ServingOptions(context_parallel=2))
 
 
 @torch.inference_mode()

@@ -13,65 +13,28 @@ import pytest
 import torch
 from torch import Tensor
 from wan_encoder_reference import clip_tokens, umt5_encode
-from wan_files import (
-    AUTOENCODER,
-    CARD,
-    clip_weights,
-    SCHEDULER,
-    TRANSFORMER,
-    umt5_weights,
-    vae_model,
-    write_videox,
-)
+from wan_files import CARD, clip_weights, umt5_weights, vae_model
+from wan_predictions import frames, imported, predict, T, VIEWS
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
 from mtv_world_ros.model.image_encoder import ImageEncoder
-from mtv_world_ros.model.import_weights import import_weights
 from mtv_world_ros.model.lora import add_adapter, save_adapter
 from mtv_world_ros.model.text_encoder import TextEncoder
 from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
-VIEWS, T = 2, 4
-
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An imported checkpoint, float32."""
-    root = tmp_path_factory.mktemp('wan')
-    import_weights(
-        write_videox(root / 'public', dtype=torch.float32),
-        root / 'checkpoint',
-        transformer=TRANSFORMER,
-        autoencoder=AUTOENCODER,
-        scheduler=SCHEDULER,
-        card=CARD,
-    )
-    return root / 'checkpoint'
+    return imported(tmp_path_factory.mktemp('wan'))
 
 
 def load(folder: Path, dtype: torch.dtype = torch.float32, **card: Any) -> DiffusionWorldModel:
     checkpoint: Checkpoint = load_checkpoint(folder)
     changed = replace(checkpoint, card={**checkpoint.card, **card})
     return DiffusionWorldModel(changed, dtype=dtype)
-
-
-def frames(*shape: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, (*shape, 32, 32, 3), np.uint8)
-
-
-def predict(model: DiffusionWorldModel, seeds: list[int], steps: int = 2, **changes: Any):
-    arguments = {
-        'start_frame': frames(VIEWS),
-        'trajectory_frames': frames(VIEWS, 1 + T, seed=1),
-        'positions': np.zeros((1 + T, 14)),
-        'seeds': seeds,
-        'num_inference_steps': steps,
-        'should_stop': lambda: False,
-    }
-    return model.predict_batch(**{**arguments, **changes})
 
 
 def test_predicts_exactly_the_cards_frames_and_seeds_do_not_meet(folder: Path) -> None:

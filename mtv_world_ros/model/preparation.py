@@ -1,0 +1,67 @@
+"""A loaded model made ready as the serving options say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.model.compiled import capture, compile_blocks
+from mtv_world_ros.model.float8 import convert
+from mtv_world_ros.model.parts import Autoencoder
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.tiny_autoencoder import TinyAutoencoder
+from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
+
+
+def prepare(
+    transformer: MultiViewWanTransformer, serving: ServingOptions, device: torch.device
+) -> None:
+    """Changes the transformer in place, with its adapter in it, on every process alike.
+
+    Raises:
+        ConfigError: an option is not for this machine.
+    """
+    if serving.attention:
+        try:
+            transformer.set_attention_backend(serving.attention)
+        except (ValueError, RuntimeError, ImportError) as error:
+            raise ConfigError(
+                f"serving: attention '{serving.attention}' cannot be used: {error}"
+            ) from error
+    if serving.weights == 'float8':
+        convert(transformer)
+    if serving.offload:
+        # each block comes while the one before computes; a CPU has no streams for that
+        transformer.enable_group_offload(
+            onload_device=device,
+            offload_device=torch.device('cpu'),
+            offload_type='block_level',
+            num_blocks_per_group=1,
+            use_stream=device.type == 'cuda',
+        )
+    if serving.compile:
+        compile_blocks(transformer, device)
+    if serving.cuda_graphs:
+        capture(transformer, device)
+
+
+def decoder_of(
+    autoencoder: Autoencoder, serving: ServingOptions, dtype: torch.dtype
+) -> Autoencoder:
+    """Returns what decodes: the autoencoder, on its device, or the tiny one in its place.
+
+    Raises:
+        CheckpointError: the tiny one's weights cannot be read, or are for other latents.
+    """
+    if not serving.tiny_decoder:
+        return autoencoder
+    if not isinstance(autoencoder, WanAutoencoder):
+        raise CheckpointError(
+            "tiny_decoder decodes Wan's latents, this checkpoint has an autoencoder of its own; "
+            "leave it out of 'serving'"
+        )
+    return place(TinyAutoencoder.load(Path(serving.tiny_decoder)), autoencoder.device, dtype)

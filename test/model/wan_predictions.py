@@ -1,0 +1,44 @@
+"""A small imported Wan checkpoint, and predictions of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from wan_files import AUTOENCODER, CARD, SCHEDULER, TRANSFORMER, write_videox
+
+from mtv_world_ros.model.import_weights import import_weights
+from mtv_world_ros.model.world_model import DiffusionWorldModel
+
+VIEWS, T = 2, 4
+
+
+def imported(root: Path) -> Path:
+    """A checkpoint folder, float32."""
+    import_weights(
+        write_videox(root / 'public', dtype=torch.float32),
+        root / 'checkpoint',
+        transformer=TRANSFORMER,
+        autoencoder=AUTOENCODER,
+        scheduler=SCHEDULER,
+        card=CARD,
+    )
+    return root / 'checkpoint'
+
+
+def frames(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (*shape, 32, 32, 3), np.uint8)
+
+
+def predict(model: DiffusionWorldModel, seeds: list[int], steps: int = 2, **changes: Any):
+    arguments = {
+        'start_frame': frames(VIEWS),
+        'trajectory_frames': frames(VIEWS, 1 + T, seed=1),
+        'positions': np.zeros((1 + T, 14)),
+        'seeds': seeds,
+        'num_inference_steps': steps,
+        'should_stop': lambda: False,
+    }
+    return model.predict_batch(**{**arguments, **changes})
