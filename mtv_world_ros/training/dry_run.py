@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -181,12 +181,20 @@ def _inputs(
     if config.transformer.get('image_dim'):
         width = config.transformer['image_dim']
         values['encoder_hidden_states_image'] = zeros(views * _IMAGE_TOKENS, width)
-    if video.control == FAST_TOKENS:
+    return values | _action_inputs(config, action_dim, zeros)
+
+
+def _action_inputs(
+    config: TrainingConfig, action_dim: int, zeros: Callable[..., Tensor]
+) -> dict[str, Tensor]:
+    control, num_frames = config.video.control, config.video.num_frames
+    values = {}
+    if control == FAST_TOKENS:
         # as many as there are numbers: more than byte-pair encoding leaves
-        values['actions'] = zeros(video.num_frames * action_dim, kind=torch.int64)
-    elif video.control != TRAJECTORY_VIDEO:
-        values['actions'] = zeros(1 + video.num_frames, action_dim)
-    if video.control == EE_MLP:
+        values['actions'] = zeros(num_frames * action_dim, kind=torch.int64)
+    elif control != TRAJECTORY_VIDEO:
+        values['actions'] = zeros(1 + num_frames, action_dim)
+    if control == EE_MLP:
         values['actions_kept'] = zeros(kind=torch.bool)
     return values
 
