@@ -16,6 +16,7 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning
+from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, flow_of
@@ -97,7 +98,10 @@ class DistillTrainer(Trainer):
         if teacher.image_encoder is not None:
             teacher.image_encoder.to(self.device)
         return Encoders(
-            autoencoder=self.autoencoder, text=self._text('prompt'), image=teacher.image_encoder
+            autoencoder=self.autoencoder,
+            text=self._text('prompt'),
+            image=teacher.image_encoder,
+            history=self.config.history,
         )
 
     def _text(self, key: str) -> Tensor | None:
@@ -236,6 +240,7 @@ def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfi
             object_mask=card['object_mask'],
         ),
         rendering=TrajectoryVideoConfig(**card['rendering']),
+        history=replace(config.history, **asdict(history_settings(card))),
     )
 
 

@@ -11,27 +11,32 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.cli import main
+from mtv_world_ros.data.clips import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.batches import BatchSource
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.config import HistoryConfig, TrainingConfig
 from mtv_world_ros.training.distill import (
     distill,
     DistillConfig,
     DistillTrainer,
     student_config,
 )
+from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
 
 
 @pytest.fixture(scope='module')
 def teacher(tiny: TrainingConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model whose answer depends on its noise, unlike that of an untrained one."""
-    folder = tmp_path_factory.mktemp('teacher')
+    return make_teacher(tiny, tmp_path_factory.mktemp('teacher'))
+
+
+def make_teacher(config: TrainingConfig, folder: Path) -> Path:
     trainer = Trainer(
-        tiny, folder, seed=0, device='cpu', dtype=torch.float32, trained_on={'steps': 0}
+        config, folder, seed=0, device='cpu', dtype=torch.float32, trained_on={'steps': 0}
     )
     generator = torch.Generator().manual_seed(0)
     for averaged in trainer.weights.ema.shadow_params:
@@ -68,6 +73,29 @@ def test_a_student_as_slow_as_its_teacher_has_nothing_to_learn(
     faster = make(tmp_path / 'faster', teacher, tiny, num_steps=1, teacher_steps=4)
     batch = source.batch(0)
     assert same.loss(batch).mean.item() < 1e-7 < 1e-5 < faster.loss(batch).mean.item()
+
+
+def test_a_teacher_with_history_has_a_student_with_history(
+    tiny: TrainingConfig, recording: Recording, robot: RobotModel, tmp_path: Path
+) -> None:
+    settings = HistoryConfig(num_frames=2, reference='first_frame')
+    teacher = make_teacher(replace(tiny, history=settings), tmp_path)
+    same = make(tmp_path / 'same', teacher, tiny, num_steps=2, teacher_steps=2)
+    assert same.config.history == settings
+    source = BatchSource(
+        [recording],
+        spec=spec_of(tiny),
+        robot=robot,
+        segmenter=ColourSegmenter(),
+        rendering=tiny.rendering,
+        object_mask=True,
+        augment=tiny.augment,
+        batch_size=2,
+        seed=0,
+        history=same.config.history,
+    )
+    assert same.loss(source.batch(0)).mean.item() < 1e-7
+    source.close()
 
 
 def test_learns_and_a_killed_run_continues_as_if_nothing_had_happened(
