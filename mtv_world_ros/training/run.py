@@ -20,9 +20,11 @@ from mtv_world_ros.training.actions import kept_actions
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.held_out import HeldOut
+from mtv_world_ros.training.left_out import check_clips, counted, num_dropped
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.speed import ideal_seconds, measured_peak
+from mtv_world_ros.training.state import disk_errors_named, DiskError
 from mtv_world_ros.training.trainer import Trainer
 
 
@@ -55,16 +57,22 @@ def load_recordings(
 
     Raises:
         TrainingError: none is usable.
+        DiskError: the cache cannot be written.
     """
     recordings, skipped = [], {}
     for path in tqdm(paths, desc='reading episodes', unit='ep'):
         try:
-            recordings.append(cached_recording(path, spec, robot, cache))
+            with disk_errors_named(cache):
+                recording = cached_recording(path, spec, robot, cache)
+            check_clips(recording, spec)
+        except DiskError:
+            raise
         except MtvWorldError as error:
             skipped[str(path)] = str(error)
+        else:
+            recordings.append(recording)
     if not recordings:
-        first = next(iter(skipped.items()), ('', 'no episode given'))
-        raise TrainingError(f'no usable episode; the first one: {first[0]}: {first[1]}')
+        raise TrainingError(f'no usable episode: {"; ".join(counted(skipped) or ["none given"])}')
     return recordings, skipped
 
 
@@ -123,7 +131,8 @@ def train(
             the log then has the share that the model's arithmetic makes of them. None = not.
 
     Raises:
-        TrainingError: no usable episode, or the loss is not finite.
+        TrainingError: no usable episode, the loss is not finite, or another process is gone.
+        DiskError: a file cannot be written.
     """
     processes = Processes(device)
     out.mkdir(parents=True, exist_ok=True)
@@ -176,15 +185,19 @@ def train(
         (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
         tqdm.write(
             f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
-            f'{source.num_clips} clips; {"resumed at" if resumed else "starting from"} step '
-            f'{trainer.step}; {processes.count} processes'
+            f'{source.num_clips} clips, {num_dropped(recordings, spec_of(config))} dropped for '
+            f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
+            f'{processes.count} processes'
         )
+        for line in counted(skipped):
+            tqdm.write(f'left out: {line}')
     ideal = None
     if peak_flops is not None and processes.is_main:
         peak = peak_flops or measured_peak(processes.device, dtype)
         ideal = ideal_seconds(config, actions, dtype, peak * processes.count)
     try:
-        _loop(trainer, source, save_every, held_out, ideal)
+        with disk_errors_named(out):
+            _loop(trainer, source, save_every, held_out, ideal)
     finally:
         source.close()
     return out / 'checkpoint'

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
@@ -22,13 +23,33 @@ STATE = 'state'
 _TENSORS, _CARD = 'state.safetensors', 'state.json'
 
 
+class DiskError(TrainingError):
+    """Files cannot be read or written; what was saved before is whole."""
+
+
+@contextmanager
+def disk_errors_named(folder: Path) -> Iterator[None]:
+    """Tells a full disk, or a folder that may not be written, from a fault of the program.
+
+    Raises:
+        DiskError: in place of the error.
+    """
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise DiskError(
+            f"files of '{folder}' cannot be read or written: {error}; the last saved state and "
+            'checkpoint are whole: free some space and run the same command again'
+        ) from error
+
+
 def save_state(
     folder: Path, weights: Weights, optimizer: torch.optim.Optimizer, card: Mapping[str, Any]
 ) -> None:
     """Writes the state into `folder/state`, which is the old or the new one at any moment.
 
     Raises:
-        TrainingError: it could not be written; the old one stays.
+        DiskError: it could not be written; the old one stays.
     """
     tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
     tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
@@ -37,20 +58,18 @@ def save_state(
     tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     whole = {**card, 'ema_step': weights.ema.optimization_step}
     partial = folder / f'{STATE}.partial'
-    try:
+    with disk_errors_named(folder):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
-        save_file(tensors, partial / _TENSORS)
-        (partial / _CARD).write_text(json.dumps(whole))
-        for file in partial.iterdir():
-            _flush(file)
+        try:
+            save_file(tensors, partial / _TENSORS)
+            (partial / _CARD).write_text(json.dumps(whole))
+            for file in partial.iterdir():
+                _flush(file)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
+            raise
         _swap(partial, folder / STATE)
-    except (OSError, SafetensorError) as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise TrainingError(
-            f"the state of step {card['step']} could not be written to '{folder}': {error}; the "
-            'one before is whole: free some space and run the same command again'
-        ) from error
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
