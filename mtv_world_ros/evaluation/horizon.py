@@ -45,7 +45,47 @@ def curve(
         seed: of the resampling.
         num_resamples: how often the episodes are drawn with replacement.
     """
-    kept = [
+    sums, counts = _sums(_moving(episodes, view, field))
+    total = counts.sum(0)
+    covered = int((total >= max(min_share * total.max(initial=0), 1)).sum())
+    return _resampled(sums[:, :covered], counts[:, :covered], seed, num_resamples)
+
+
+def by_chunk(
+    episodes: Sequence[Sequence[ScoreRow]],
+    view: str | None,
+    field: str,
+    num_frames: int,
+    *,
+    seed: int = 0,
+    num_resamples: int = 2000,
+) -> Curve:
+    """Returns J of the moving objects of a view for each chunk of its rollouts: how it drifts.
+
+    All frames of a chunk weigh equally; the other arguments are those of `curve`.
+
+    Args:
+        episodes: rows of each episode.
+        view: its name; None = all.
+        field: one of `scores.FRAME_FIELDS`.
+        num_frames: T, frames of a chunk.
+        seed: of the resampling.
+        num_resamples: how often the episodes are drawn with replacement.
+    """
+    sums, counts = _sums(_moving(episodes, view, field))
+    missing = -sums.shape[1] % num_frames
+    chunks = [
+        np.pad(of_frames, ((0, 0), (0, missing))).reshape(len(episodes), -1, num_frames).sum(2)
+        for of_frames in (sums, counts)
+    ]
+    return _resampled(chunks[0], chunks[1], seed, num_resamples)
+
+
+def _moving(
+    episodes: Sequence[Sequence[ScoreRow]], view: str | None, field: str
+) -> list[list[Sequence[float]]]:
+    """Values per frame of each episode's rows of objects that move."""
+    return [
         [
             getattr(row, field)
             for row in rows
@@ -53,19 +93,21 @@ def curve(
         ]
         for rows in episodes
     ]
-    sums, counts = _sums(kept)
-    total = counts.sum(0)
-    covered = int((total >= max(min_share * total.max(initial=0), 1)).sum())
-    if not covered:
+
+
+def _resampled(sums: np.ndarray, counts: np.ndarray, seed: int, num_resamples: int) -> Curve:
+    """Means of (E, T) sums over so many values, and what they are with episodes drawn anew."""
+    num_episodes, length = sums.shape
+    if not length:
         return Curve(values=(), band=())
-    sums, counts = sums[:, :covered], counts[:, :covered]
-    share = np.full(len(kept), 1 / len(kept))
-    weights = np.random.default_rng(seed).multinomial(len(kept), share, size=num_resamples)
+    share = np.full(num_episodes, 1 / num_episodes)
+    weights = np.random.default_rng(seed).multinomial(num_episodes, share, size=num_resamples)
     with np.errstate(invalid='ignore'):
         drawn = (weights @ sums) / (weights @ counts)
+        values = sums.sum(0) / counts.sum(0)
     low, high = np.nanpercentile(drawn, [2.5, 97.5], axis=0)
     return Curve(
-        values=tuple((sums.sum(0) / counts.sum(0)).tolist()),
+        values=tuple(values.tolist()),
         band=tuple(zip(low.tolist(), high.tolist(), strict=True)),
     )
 

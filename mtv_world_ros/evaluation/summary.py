@@ -11,7 +11,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.evaluation import tables
-from mtv_world_ros.evaluation.horizon import curve
+from mtv_world_ros.evaluation.horizon import by_chunk, Curve, curve
 from mtv_world_ros.evaluation.outcomes import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
@@ -163,12 +163,24 @@ class Summary:
             tables.markdown_table(sets, 'zero-shot set · view') if sets else '',
             tables.markdown_table(by_task, 'task · view'),
             tables.controls_table(by_view),
+            self._chunks_table(),
             tables.quality_table(by_view),
             tables.status_table({view: self._statuses(view) for view in views}),
             '\n'.join(f'- not scored: {path}: {why}' for path, why in self.failed.items()),
             '\n'.join(f'- {r.episode}: {note}' for r in self.results for note in r.notes),
         ]
         return '\n\n'.join(part for part in parts if part) + '\n'
+
+    def _chunks_table(self) -> str:
+        """J against the number of the chunk; empty where no rollout has two."""
+        if self.num_chunks < 2:
+            return ''
+        curves = {view: self._by_chunk(view) for view in (*self.spec.views, None)}
+        head = ['J of objects that move, chunk', *(view or 'all views' for view in curves)]
+        return tables.grid(head, [
+            [str(k + 1), *(tables.point(c.values, c.band, k) for c in curves.values())]
+            for k in range(self.num_chunks)
+        ])  # fmt: skip
 
     def _numbers(self, group: Group) -> dict[str, Any]:
         return {
@@ -210,7 +222,28 @@ class Summary:
             drawn = curve(episodes, view, name, min_share=0, seed=self.seed)
             key = f'{name.removesuffix("_frames")}_moving_by_frame'
             found[key], found[f'{key}_interval'] = drawn.values, drawn.band
+        if self.num_chunks > 1:
+            drawn = self._by_chunk(view, group)
+            found |= {'j_moving_by_chunk': drawn.values, 'j_moving_by_chunk_interval': drawn.band}
         return found
+
+    @property
+    def num_chunks(self) -> int:
+        """Chunks of the longest rollout."""
+        frames = [row.num_frames for result in self.results for row in result.rows]
+        return -(-max(frames, default=0) // self.spec.num_frames)
+
+    def _by_chunk(self, view: str | None, group: Group = ALL) -> Curve:
+        """J of moving objects by chunk, with intervals."""
+        episodes = [result.rows for result in self.chosen(group)]
+        return by_chunk(
+            episodes,
+            view,
+            'j_frames',
+            self.spec.num_frames,
+            seed=self.seed,
+            num_resamples=self.num_resamples,
+        )
 
     def _seconds(self) -> dict[str, float]:
         """Mean time of an episode by what it went into [s]."""

@@ -133,6 +133,13 @@ def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     )
 
 
+def point(values: Sequence[float], band: Sequence[tuple[float, float]], index: int) -> str:
+    """Returns a value of a curve with its interval; a dash where the curve does not reach."""
+    if index >= len(values):
+        return cell(None)
+    return cell(Estimate(value=values[index], interval=band[index], num_episodes=0))
+
+
 def cell(estimate: Estimate | None, digits: int = 3) -> str:
     """Returns a number with its interval; a dash where it was not measured."""
     if estimate is None or not math.isfinite(estimate.value):

@@ -167,13 +167,18 @@ def test_every_number_has_an_interval_beside_it(make_pipeline, episodes, tmp_pat
 
 
 def test_j_by_frame_falls_as_the_held_frame_ages_and_has_a_band(make_pipeline, episodes, tmp_path):
-    metrics, _ = run(make_pipeline(), episodes, tmp_path, mode='imagine')
+    metrics, table = run(make_pipeline(), episodes, tmp_path, mode='imagine')
     low = metrics['views']['low']
     assert len(low['j_moving_by_frame']) == len(low['j_moving_by_frame_interval']) == 9
     assert low['j_moving_by_frame'] == sorted(low['j_moving_by_frame'], reverse=True)
     assert low['j_moving_by_frame'] == low['j_copy_moving_by_frame']
     band = low['j_moving_by_frame_interval'][0]
     assert band[0] < low['j_moving_by_frame'][0] < band[1]
+    num = metrics['model']['num_frames']
+    chunks = [low['j_moving_by_frame'][k : k + num] for k in range(0, 9, num)]
+    assert low['j_moving_by_chunk'] == pytest.approx([np.mean(c) for c in chunks], abs=1e-5)
+    assert len(low['j_moving_by_chunk_interval']) == len(chunks) > 1
+    assert 'J of objects that move, chunk' in table
 
 
 def test_held_and_mirrored_actions_are_scored_beside_the_true_ones(

@@ -17,6 +17,7 @@ from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import HistoryConfig, load_training_config, TrainingConfig
+from mtv_world_ros.training.distill import student_config
 from mtv_world_ros.training.history import draw_past, history_before
 from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
@@ -125,6 +126,8 @@ def test_a_model_trained_with_history_serves_with_it(
     trainer.export(tmp_path / 'checkpoint')
     served = DiffusionWorldModel(load_checkpoint(tmp_path / 'checkpoint')).history
     assert (served.num_frames, served.noise_level, served.reference) == (4, 0.05, 'first_frame')
+    student = student_config(tiny, load_checkpoint(tmp_path / 'checkpoint'))
+    assert replace(student.history, max_noise=HISTORY.max_noise) == HISTORY
     plain = Trainer(tiny, tmp_path / 'plain', seed=0, device='cpu', dtype=torch.float32,
                     trained_on={})  # fmt: skip
     plain.export(tmp_path / 'off')
