@@ -210,7 +210,10 @@ class EpisodeRunner(Node):
 
     def _are_recorded(self, topics: Sequence[str]) -> bool:
         is_heard = bool(self._peers.state(self._name(self._options.world_model)))
-        return is_heard and not self._peers.unconnected(topics)
+        # the policy sees these too
+        shared = [t for t in topics if t.endswith(('/image_raw', '/joint_states'))]
+        lonely = self._peers.unconnected(topics) + self._peers.unconnected(shared, least=2)
+        return is_heard and not lonely
 
     # plumbing
 

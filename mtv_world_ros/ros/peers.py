@@ -42,14 +42,19 @@ class Peers:
         """What a node said of itself last."""
         return self._heard[name][1] if name in self._heard else {}
 
-    def unconnected(self, topics: Iterable[str]) -> list[str]:
-        """Those of the topics of which a node says that its publisher has no subscriber yet.
+    def unconnected(self, topics: Iterable[str], least: int = 1) -> list[str]:
+        """Those of the topics of which a node says that its publisher has too few subscribers.
 
         Two that know of each other from the graph may still not be connected, and what is
         published until then is lost.
         """
         states = [state for _, state in self._heard.values()]
-        return [t for t in topics if any(s.get(f'subscribers.{t}') == '0' for s in states)]
+
+        def is_lonely(topic: str) -> bool:
+            counts = (state.get(f'subscribers.{topic}') for state in states)
+            return any(count is not None and int(count) < least for count in counts)
+
+        return [topic for topic in topics if is_lonely(topic)]
 
     def forget(self, name: str) -> None:
         """Forgets what a node said: what it says next is new."""

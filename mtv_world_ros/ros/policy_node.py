@@ -33,7 +33,7 @@ from mtv_world_ros.ros.observation_buffer import FreshnessLimits, ObservationBuf
 from mtv_world_ros.ros.policy_loop import PolicyLoop
 from mtv_world_ros.ros.policy_parameters import PolicySettings
 from mtv_world_ros.ros.predicted_frames import PredictedFrames
-from mtv_world_ros.ros.rejection import Rejection
+from mtv_world_ros.ros.rejection import Reason, Rejection
 from mtv_world_ros.ros.running import run
 from mtv_world_ros.ros.stamps import make_header
 from mtv_world_ros.ros.status_publisher import StatusPublisher
@@ -123,6 +123,12 @@ class PolicyNode(Node):
         Raises:
             Rejection: there is none.
         """
+        if self._lonely():
+            raise Rejection(
+                Reason.WORLD_MODEL_MISSING,
+                f'nobody is connected to {self._lonely()}; is the world model running, and does '
+                "the parameter 'world_model' name it?",
+            )
         return self._buffer.observe(self.get_clock().now().nanoseconds).observation
 
     # what reaches it
@@ -139,9 +145,17 @@ class PolicyNode(Node):
             (JointState, 'predicted/joint_states', frames.add_joint_state),
             (DiagnosticArray, 'report', self._on_report),
         ]
-        for kind, topic, handle in topics:
-            name = f'{world_model}/{topic}'
-            self.create_subscription(kind, name, self._guarded(handle), profile)
+        self._predictions = [
+            self.create_subscription(
+                kind, f'{world_model}/{topic}', self._guarded(handle), profile
+            )
+            for kind, topic, handle in topics
+        ]
+
+    def _lonely(self) -> list[str]:
+        """Topics that the world model is not connected to: what goes over them is lost."""
+        lonely = [s.topic_name for s in self._predictions if not s.get_publisher_count()]
+        return lonely + ([] if self._plans.get_subscription_count() else [self._plans.topic_name])
 
     def _on_report(self, message: DiagnosticArray) -> None:
         for status in message.status:

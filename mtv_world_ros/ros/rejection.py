@@ -32,6 +32,7 @@ class Reason(StrEnum):
     JOINT_NAMES = 'joint_names'
     JOINT_LIMITS = 'joint_limits'
     NO_CLOCK = 'no_clock'
+    WORLD_MODEL_MISSING = 'world_model_missing'
     ROLLOUT_INVALID = 'rollout_invalid'
     OUT_OF_MEMORY = 'out_of_memory'
     INTERNAL_ERROR = 'internal_error'

@@ -63,8 +63,8 @@ class StatusPublisher:
         if self._last is not None:
             age = time.monotonic() - self._last[0]
             values |= {'last_fault': self._last[1], 'last_fault_age_s': age}
-            if not warning and age < _WARN_S:
-                warning = self._last[1]
+            recent = self._last[1] if age < _WARN_S else ''
+            warning = '; '.join(filter(None, (recent, warning)))
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
         name = self._node.get_name()
         status = to_status(name, '', level, warning or 'ready', values)

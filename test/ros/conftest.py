@@ -1,6 +1,7 @@
 """A running node in its own process and a client that talks to it over the middleware."""
 
 from collections import Counter, defaultdict
+import json
 import os
 from pathlib import Path
 import signal
@@ -25,6 +26,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E
 
 from mtv_world_ros.data_types import CameraModel  # noqa: E402
 from mtv_world_ros.geometry.calibration_file import save_calibration  # noqa: E402
+from mtv_world_ros.resources import share_path  # noqa: E402
 from mtv_world_ros.ros.conversions import values_of  # noqa: E402
 from mtv_world_ros.ros.image_conversions import to_compressed, to_image  # noqa: E402
 from mtv_world_ros.ros.stamps import NANO, to_stamp  # noqa: E402
@@ -34,6 +36,7 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2]), 'OMP_NUM_THREADS': '1'}
 FAKE = Path(__file__).with_name('fake_world_model.py')
+FAKE_POLICY = Path(__file__).with_name('fake_policy.py')
 VIEWS = ('low', 'high')
 JOINTS = tuple(
     f'{arm}_{joint}'
@@ -353,6 +356,28 @@ def start_node(folder, *parameters, script=FAKE, remaps=()):
     options += [part for rule in remaps for part in ('-r', rule)]
     command = [sys.executable, str(script), '--ros-args', *options]
     return NodeProcess(command, folder / 'node.log')
+
+
+def make_checkpoint(folder):
+    """A card of the fake world model's sizes, for who reads no weights."""
+    card = json.loads(share_path('resource', 'checkpoint', 'world_model.json').read_text())
+    folder.mkdir()
+    card |= {'num_frames': NUM_FRAMES, 'width': 48, 'height': 36, 'fps': 5.0}
+    (folder / 'world_model.json').write_text(json.dumps(card))
+    return folder
+
+
+def start_policy(folder, *parameters, remaps=()):
+    values = (
+        f'checkpoint:={folder / "checkpoint"}',
+        f'calibration_file:={make_calibration(folder / "calibration.yaml")}',
+        'diagnostics_period_s:=0.2',
+        *parameters,
+    )
+    options = [part for value in values for part in ('-p', value)]
+    options += [part for rule in remaps for part in ('-r', rule)]
+    command = [sys.executable, str(FAKE_POLICY), '--ros-args', *options]
+    return NodeProcess(command, folder / 'policy.log')
 
 
 INPUTS = {

@@ -1,7 +1,6 @@
 """A policy lives in the node's imagination: no gap in the clock, and a record of every fault."""
 
 import json
-from pathlib import Path
 import signal
 import sys
 import time
@@ -13,11 +12,9 @@ from mtv_world_ros.data.bag_reader import BagReader
 from mtv_world_ros.data.mcap_writer import EpisodeWriter
 from mtv_world_ros.data.messages import deserialize, header_stamp
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.resources import share_path
 from mtv_world_ros.ros.conversions import values_of
 from mtv_world_ros.ros.stamps import NANO
 
-FAKE_POLICY = Path(__file__).with_name('fake_policy.py')
 FRAME_NS, NUM_FRAMES = 200_000_000, 4
 START_NS = 1_700_000_000 * NANO
 #: of the runner: episode k has seed 200 + 1000 k, and the fake model blocks at 1200 to 1299
@@ -48,28 +45,6 @@ def write_episode(folder, task, ros):
     return folder / task
 
 
-def make_checkpoint(folder):
-    """A card of the fake model's sizes, for who reads no weights."""
-    card = json.loads(share_path('resource', 'checkpoint', 'world_model.json').read_text())
-    folder.mkdir()
-    card |= {'num_frames': NUM_FRAMES, 'width': 48, 'height': 36, 'fps': 5.0}
-    (folder / 'world_model.json').write_text(json.dumps(card))
-    return folder
-
-
-def start_policy(folder, ros, *parameters, remaps=()):
-    values = (
-        f'checkpoint:={folder / "checkpoint"}',
-        f'calibration_file:={ros.make_calibration(folder / "calibration.yaml")}',
-        'diagnostics_period_s:=0.2',
-        *parameters,
-    )
-    options = [part for value in values for part in ('-p', value)]
-    options += [part for rule in remaps for part in ('-r', rule)]
-    command = [sys.executable, str(FAKE_POLICY), '--ros-args', *options]
-    return ros.NodeProcess(command, folder / 'policy.log')
-
-
 STARTS = ('camera_topics.low:=start/low', 'camera_topics.high:=start/high')
 JOINT_STATES = ('joint_states:=start/joint_states',)
 NO_AGE = ('max_image_age_s:=3600.0', 'max_joint_state_age_s:=3600.0')
@@ -80,13 +55,13 @@ class Stack:
 
     def __init__(self, folder, ros, client):
         self.folder, self.client = folder, client
-        make_checkpoint(folder / 'checkpoint')
+        ros.make_checkpoint(folder / 'checkpoint')
         self.world = ros.start_node(
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001',
             *NO_AGE, *STARTS, remaps=JOINT_STATES,
         )  # fmt: skip
-        self.policy = start_policy(
-            folder, ros, 'answer_timeout_s:=1.5', *NO_AGE, *STARTS, remaps=JOINT_STATES
+        self.policy = ros.start_policy(
+            folder, 'answer_timeout_s:=1.5', *NO_AGE, *STARTS, remaps=JOINT_STATES
         )
         episodes = [write_episode(folder, task, ros) for task in TASKS]
         arguments = [folder / 'out', '--views', 'low', 'high', '--seed', SEED, '--episodes']
@@ -262,47 +237,3 @@ def test_a_dead_policy_ends_the_run_with_its_record_closed(stack, results):
     values = diagnostics_in(results[-1]['bag'], 'world_model')[-1].values
     assert values['mode'] == 'imagine'
     assert results[-1]['how'] == 'policy_died'
-
-
-@pytest.fixture
-def observing_policy(tmp_path, ros):
-    make_checkpoint(tmp_path / 'checkpoint')
-    world = ros.start_node(tmp_path, 'pace:=burst', 'max_image_age_s:=0.6')
-    policy = start_policy(
-        tmp_path, ros, 'mode:=observe', 'max_image_age_s:=0.6', 'observation_timeout_s:=1.2'
-    )
-    yield policy
-    assert [process.stop() for process in (policy, world)] == [0, 0]
-
-
-def test_in_observe_mode_a_camera_that_stops_ends_the_episode_and_says_so(observing_policy, ros):
-    client = ros.Client()
-    try:
-        client.subscribe(ros.REPORT, '/policy/report', 100)
-        client.connect_inputs({t: k for t, k in ros.INPUTS.items() if t != '/joint_trajectory'})
-
-        def reports():
-            return [values_of(s) for s in client.statuses('/policy/report')]
-
-        assert client.call(ros.TRIGGER, '/policy/start', ros.TRIGGER.Request()).success
-        client.wait(lambda: reports(), 'the begin')
-
-        def has_chunk():
-            client.send_scene()
-            client.spin_for(0.1)
-            return any(r['state'] == 'chunk' for r in reports())
-
-        client.wait(has_chunk, 'a chunk')
-        client.wait(lambda: reports()[-1]['state'] == 'ended', 'the end')
-        end = reports()[-1]
-        assert end['how'] == 'no_observation'
-        assert end['text'].startswith('image_stale: ')
-        client.wait(
-            lambda: any(
-                s.name == 'policy' and s.message.startswith('no_observation: image_stale')
-                for s in client.statuses('/diagnostics')
-            ),
-            'the warning',
-        )
-    finally:
-        client.close()
