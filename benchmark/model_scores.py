@@ -19,7 +19,7 @@ from mtv_world_ros.resources import share_path
 from mtv_world_ros.training.run import spread
 
 #: columns of a table, and what `Summary.estimates` calls them
-COLUMNS = {'J moving': 'j_moving', 'J': 'j', 'skill': 'skill'}
+COLUMNS = {'J moving': 'j_moving', 'J objects': 'j_object_mean', 'skill': 'skill'}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
