@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mtv_world_ros.data_types import (
-    ByteArray,
-    FloatArray,
     JointTrajectory,
     Observation,
     SuccessEstimate,
 )
-from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import fit_observation, Pipeline
+from mtv_world_ros.ranking.simulated import SeenChunk
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.success.footage import footage_of
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 
@@ -64,39 +65,24 @@ class ImaginedWorld:
 
 
 def judge(
-    pipeline: Pipeline,
-    start: Observation,
-    frames: ByteArray,
-    positions: FloatArray,
-    instruction: str,
-) -> SuccessEstimate:
-    """Returns the pipeline's estimate of frames that were not imagined.
+    pipeline: Pipeline, chunks: Sequence[SeenChunk], instruction: str
+) -> SuccessEstimate | None:
+    """Returns the pipeline's estimate of an episode that was not imagined; None without a chunk.
 
     Args:
         pipeline: its segmenter and estimator judge.
-        start: what was seen before the frames.
-        frames: (V, T, H, W, 3) uint8 RGB, any size.
-        positions: (J,) commanded at the end [rad or m].
+        chunks: what was seen, any image size.
         instruction: what the robot was told.
     """
-    spec, robot = pipeline.spec, pipeline.robot
-    fitted = fit_observation(start, spec)
-    frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
+    spec, success, memory = pipeline.spec, None, None
     names = pipeline.objects or objects_from_instruction(instruction)
-    start_masks = pipeline.segmenter.segment(fitted.frames[:, None], names)
-    masks = pipeline.segmenter.segment(
-        frames, names, first_masks=start_masks.masks[:, :, 0], first_frames=fitted.frames
-    )
-    ends, starts = (
-        tuple(camera_poses(camera, robot, row[None])[0] for camera in fitted.cameras)
-        for row in (positions, start.positions)
-    )
-    return pipeline.estimator.estimate(
-        masks,
-        start_masks,
-        fitted.cameras,
-        ends,
-        instruction,
-        T_base_camera_start=starts,
-        gripper_openings=robot.gripper_openings(positions[None])[:, 0],
-    )
+    for chunk in chunks:
+        start = fit_observation(chunk.start, spec)
+        frames = np.stack([resize_frames(v, spec.width, spec.height) for v in chunk.frames])
+        start_masks = pipeline.segmenter.segment(start.frames[:, None], names)
+        masks = pipeline.segmenter.segment(
+            frames, names, first_masks=start_masks.masks[:, :, 0], first_frames=start.frames
+        )
+        footage = footage_of(pipeline.robot, start.cameras, chunk.positions, start_masks, masks)
+        success, memory = pipeline.estimator.estimate(footage, instruction, memory)
+    return success

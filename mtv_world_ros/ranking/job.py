@@ -25,7 +25,7 @@ DEFAULT_POLICIES = (
     'expert-wrong-0.5',
     'expert-stop-0.5',
 )
-DEFAULT_TASKS = ('place_block_a2b_left', 'place_block_a2b_right', 'stack_blocks_two')
+DEFAULT_TASKS = ('place_block_a2b_left', 'place_bread_plate', 'stack_blocks_two')
 #: scenes drawn until the expert reaches everything in one
 _MAX_ATTEMPTS = 25
 

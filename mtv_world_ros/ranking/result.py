@@ -30,8 +30,11 @@ class Judged:
     reasons: tuple[str, ...]
 
     @classmethod
-    def of(cls, estimate: SuccessEstimate) -> Judged:
-        """Returns an estimate in plain values."""
+    def of(cls, estimate: SuccessEstimate | None) -> Judged:
+        """Returns an estimate in plain values; None = the policy gave no answer to judge."""
+        if estimate is None:
+            reasons = ('abstains: the policy gave no answer',)
+            return cls(probability=nan, interval=(nan, nan), jaccard=(), reasons=reasons)
         return cls(
             probability=float(estimate.probability),
             interval=estimate.interval,

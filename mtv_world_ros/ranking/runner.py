@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import time
 
-import numpy as np
-
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.policies.policy import Policy
@@ -29,7 +27,7 @@ class RolloutConfig:
     """How episodes are lived.
 
     Attributes:
-        num_inference_steps: denoising steps a chunk.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         max_chunks: answers of the policy at most.
     """
 
@@ -37,10 +35,10 @@ class RolloutConfig:
     max_chunks: int = 8
 
     def __post_init__(self) -> None:
-        if min(self.num_inference_steps, self.max_chunks) < 1:
+        if self.num_inference_steps < 0 or self.max_chunks < 1:
             raise ConfigError(
-                f'{self.num_inference_steps} denoising steps and {self.max_chunks} chunks: both '
-                'must be at least 1 (--steps, --max-chunks)'
+                f'{self.num_inference_steps} denoising steps and {self.max_chunks} chunks: steps '
+                'must be 0 or more, chunks 1 or more (--steps, --max-chunks)'
             )
 
 
@@ -72,13 +70,7 @@ class RolloutRunner:
         real = self._live(policy, world, world, job)
         ever, final = world.outcome()
         begun = time.perf_counter()
-        seen = judge(
-            self.pipeline,
-            world.last_start,
-            world.last_frames,
-            world.last_positions,
-            world.instruction,
-        )
+        seen = judge(self.pipeline, world.chunks, world.instruction)
         judging_s = time.perf_counter() - begun
         imagined, life, imagining_s = self._imagine(policy, world, job)
         return Result(
@@ -115,14 +107,6 @@ class RolloutRunner:
         begun = time.perf_counter()
         life = self._live(policy, world, simulated, job)
         seconds = time.perf_counter() - begun
-        if world.success is None:
-            nothing = Judged(
-                probability=np.nan,
-                interval=(np.nan, np.nan),
-                jaccard=(),
-                reasons=('abstains: the policy gave no answer',),
-            )
-            return nothing, life, seconds
         return Judged.of(world.success), life, seconds
 
     def _live(self, policy: Policy, world: World, simulated: SimulatedWorld, job: Job) -> Life:

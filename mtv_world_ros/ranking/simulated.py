@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil
 import time
 
@@ -17,14 +18,27 @@ from mtv_world_ros.sim.record import START_NS
 _LOOK_S = 0.1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenChunk:
+    """What was seen while an answer was executed.
+
+    Attributes:
+        start: before it.
+        frames: (V, T, H, W, 3) uint8 RGB at the model's rate.
+        positions: (1 + T, J) commanded, row 0 where the robot stood [rad or m].
+    """
+
+    start: Observation
+    frames: ByteArray
+    positions: FloatArray
+
+
 class SimulatedWorld:
     """One episode of the simulator.
 
     Attributes:
         start: first observation.
-        last_start: what was seen where the last answer began.
-        last_frames: (V, T, H, W, 3) uint8 RGB frames after it, at the model's rate.
-        last_positions: (J,) commanded at the end [rad or m].
+        chunks: what was seen, one an answer.
         physics_s: time that the physics took [s].
         rendering_s: time that pictures took, and building the scene [s].
 
@@ -40,8 +54,8 @@ class SimulatedWorld:
         self._sim, self._fps = sim, fps
         self.start = self._observation(sim.reset(seed, task))
         self.rendering_s, self.physics_s = time.perf_counter() - begun, 0.0
-        self.last_start, self.last_positions = self.start, np.array(sim.home)
-        self.last_frames: ByteArray = self.start.frames[:, None]
+        self.chunks: list[SeenChunk] = []
+        self._target = np.array(sim.home)
 
     @property
     def instruction(self) -> str:
@@ -55,12 +69,18 @@ class SimulatedWorld:
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
         times = CONTROL_PERIOD_S * np.arange(1, num + 1)
         # from where the arms were sent last, as a controller would
-        commands = resample(matched, self.last_positions, times)
-        frame_at = {round(k / self._fps / CONTROL_PERIOD_S) for k in range(1, num_frames + 1)}
-        seen = [self._advance(row, k, k in frame_at) for k, row in enumerate(commands, 1)]
+        commands = resample(matched, self._target, times)
+        rows = [round(k / self._fps / CONTROL_PERIOD_S) - 1 for k in range(1, num_frames + 1)]
+        seen = [self._advance(row, k, k in rows) for k, row in enumerate(commands)]
         shown = [self._observation(found) for found in seen if found is not None]
-        self.last_start, self.last_positions = observation, commands[-1]
-        self.last_frames = np.stack([found.frames for found in shown], axis=1)
+        self.chunks.append(
+            SeenChunk(
+                start=observation,
+                frames=np.stack([found.frames for found in shown], axis=1),
+                positions=np.concatenate([observation.positions[None], commands[rows]]),
+            )
+        )
+        self._target = commands[-1]
         return shown[-1]
 
     def outcome(self) -> tuple[bool, bool]:
@@ -71,7 +91,7 @@ class SimulatedWorld:
         """One control period; what is seen after it, if a picture is due."""
         begun = time.perf_counter()
         self._sim.advance(targets)
-        if number % round(_LOOK_S / CONTROL_PERIOD_S) == 0 and not is_frame:
+        if (number + 1) % round(_LOOK_S / CONTROL_PERIOD_S) == 0 and not is_frame:
             self._sim.observe(rendering=False)
         self.physics_s += time.perf_counter() - begun
         if not is_frame:
