@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import ceil
-import time
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -27,7 +26,7 @@ from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.history import fit_history, History
-from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.prediction import Prediction, StageClock
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
@@ -181,6 +180,7 @@ class Pipeline:
                 stamp_ns=observation.stamp_ns,
                 chunk=chunk,
                 num_chunks=num_chunks,
+                horizon=self.horizon,
                 segmenter=self.segmenter.name,
                 num_inference_steps=num_steps,
             )
@@ -199,7 +199,7 @@ class Pipeline:
         past: tuple[RolloutMemory | None, History],
     ) -> dict[str, Any]:
         """What is made of one chunk: fields of `Prediction`."""
-        clock, (memory, history) = _Clock(), past
+        clock, (memory, history) = StageClock(), past
         start_masks = self.segmenter.segment(start.frames[:, None], request.names)
         clock.lap('start masks')
         control = self.draw(start.cameras, positions, times, start_masks)
@@ -266,19 +266,6 @@ class _Request(NamedTuple):
     instruction: str
     num_inference_steps: int
     should_stop: Callable[[], bool]
-
-
-class _Clock:
-    """Time per stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = now - self._last
-        self._last = now
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:

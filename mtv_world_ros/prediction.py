@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import nan
+import time
 from types import MappingProxyType
 
 from mtv_world_ros.data_types import (
@@ -16,6 +18,21 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.history import History
 from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.success.trusted_horizon import HorizonCurve
+
+
+class StageClock:
+    """Time per stage of a chunk: `seconds` by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Ends a stage, which began where the one before it ended."""
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +51,7 @@ class Prediction:
         num_chunks: chunks of the rollout.
         memory: what the estimate remembers of the rollout, for what is chained onto this chunk.
         end_history: what comes before `end_observation`, for chaining the next chunk onto it.
+        horizon: how J falls with the horizon, where that was measured.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
         seconds: time spent by stage [s].
@@ -50,9 +68,25 @@ class Prediction:
     num_chunks: int
     memory: RolloutMemory
     end_history: History
+    horizon: HorizonCurve | None = None
     segmenter: str = ''
     num_inference_steps: int = 0
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def imagined_seconds(self) -> float:
+        """How far the last frame is from the last real one [s], over all that was chained."""
+        times = self.trajectory_video.times
+        return self.memory.num_frames * float(times[1] - times[0])
+
+    def trusted_seconds(self, level: float) -> float:
+        """Returns up to which time after the last real frame J is expected to be `level` [s].
+
+        NaN = not measured for this checkpoint and segmenter.
+        """
+        if self.horizon is None or self.horizon.segmenter != self.segmenter:
+            return nan
+        return self.horizon.trusted_seconds(level)
 
     @property
     def end_observation(self) -> Observation:

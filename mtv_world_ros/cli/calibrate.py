@@ -9,7 +9,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, add_serving
+from mtv_world_ros.cli.options import (
+    add_dtype,
+    add_model_options,
+    add_seeds,
+    add_segmenter,
+    add_serving,
+)
 from mtv_world_ros.cli.provenance import provenance
 
 if TYPE_CHECKING:
@@ -18,8 +24,6 @@ if TYPE_CHECKING:
     from mtv_world_ros.evaluation.summary import Summary
     from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
-#: seeds of one episode lie so far apart that their chunks' seeds never meet
-SEED_STEP = 1_000_003
 _EPILOG = """\
 Every episode is imagined as a whole from its first frame with its own commands; what the success
 estimate then sees is fitted to what really happened. The checkpoint gets success_calibration.json
@@ -44,7 +48,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episodes', type=int, help='use only so many')
     parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
-    parser.add_argument('--seeds', type=_count, default=1, help='rollouts of each episode')
+    add_seeds(parser)
     parser.add_argument('--l2', type=float, default=1.0, help='penalty on the weights')
     parser.add_argument(
         '--no-store',
@@ -57,13 +61,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_serving(parser)
     add_segmenter(parser)
     parser.set_defaults(handler=_calibrate)
-
-
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more')
-    return number
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
@@ -96,6 +93,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.ensemble import SEED_STEP
     from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 
     load = partial(

@@ -9,7 +9,13 @@ from pathlib import Path
 import re
 from typing import NamedTuple, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype, add_model_options, add_segmenter, add_serving
+from mtv_world_ros.cli.options import (
+    add_dtype,
+    add_model_options,
+    add_seeds,
+    add_segmenter,
+    add_serving,
+)
 from mtv_world_ros.cli.provenance import provenance
 from mtv_world_ros.errors import ConfigError
 
@@ -78,6 +84,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_dtype(parser)
     add_model_options(parser)
     add_serving(parser)
+    add_seeds(parser)
     add_segmenter(parser)
     parser.set_defaults(handler=_evaluate)
 
@@ -206,6 +213,7 @@ def _score(
         describer=arguments.describer and assemble_describer(arguments.describer),
         mode=arguments.mode,
         seed=arguments.seed,
+        num_seeds=arguments.seeds,
         num_inference_steps=arguments.steps,
         actions=arguments.actions,
         ceiling=arguments.ceiling,

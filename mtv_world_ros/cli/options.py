@@ -40,6 +40,20 @@ def _num_steps(text: str) -> int:
     return number
 
 
+def add_seeds(parser: argparse.ArgumentParser) -> None:
+    """Adds `--seeds`."""
+    parser.add_argument(
+        '--seeds', type=_count, default=1, help='rollouts of each, for the success estimate'
+    )
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more')
+    return number
+
+
 def add_segmenter(parser: argparse.ArgumentParser) -> None:
     """Adds `--segmenter`."""
     parser.add_argument(

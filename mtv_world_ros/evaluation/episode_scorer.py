@@ -182,7 +182,9 @@ class EpisodeScorer:
         found: _Found,
     ) -> list[Prediction]:
         """Imagines and scores one stretch; returns its chunks."""
-        chunks = self._imagine(recording, stretch, recording, names, found)
+        chunks = self._imagine(
+            recording, stretch, recording, names, found, num_seeds=self.config.num_seeds
+        )
         found.chunk_seconds += [sum(chunk.seconds.values()) for chunk in chunks]
         frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
         with found.timed('segmenting'):
@@ -222,6 +224,7 @@ class EpisodeScorer:
         actions: Recording,
         names: tuple[str, ...],
         found: _Found,
+        num_seeds: int = 1,
     ) -> list[Prediction]:
         with found.timed('imagining'):
             chunks = imagine_stretch(
@@ -231,6 +234,7 @@ class EpisodeScorer:
                 actions=actions,
                 seed=self.config.seed + 1000 * stretch.index,
                 num_inference_steps=self.config.num_inference_steps,
+                num_seeds=num_seeds,
             )
         masks = sum(
             chunk.seconds.get(s, 0.0) for chunk in chunks for s in ('start masks', 'masks')

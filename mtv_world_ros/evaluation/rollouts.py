@@ -14,6 +14,7 @@ from mtv_world_ros.data_types import (
     Observation,
     WorldModelSpec,
 )
+from mtv_world_ros.ensemble import imagine_seeds
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
@@ -103,6 +104,7 @@ def imagine_stretch(
     actions: Recording,
     seed: int,
     num_inference_steps: int,
+    num_seeds: int = 1,
 ) -> list[Prediction]:
     """Imagines a stretch from its recorded first frame; returns its chunks.
 
@@ -113,6 +115,7 @@ def imagine_stretch(
         actions: the episode whose commands are executed: the same one, or another for a control.
         seed: of the noise.
         num_inference_steps: denoising steps.
+        num_seeds: rollouts whose mean the success estimate is.
     """
     spec = pipeline.spec
     times = np.arange(stretch.num_frames + 1) / spec.fps
@@ -128,9 +131,11 @@ def imagine_stretch(
         stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
     )
     return list(
-        pipeline.imagine(
+        imagine_seeds(
+            pipeline,
             observation,
             trajectory,
+            num_seeds=num_seeds,
             instruction=recording.instruction,
             seed=seed,
             num_inference_steps=num_inference_steps,

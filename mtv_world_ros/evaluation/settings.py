@@ -19,6 +19,7 @@ class EvaluationConfig:
         mode: `observe`: every chunk from the real frames at its start; `imagine`: chunks chained
             from the episode's first frame.
         seed: of the noise, of the choice of shuffled actions, of the bootstrap.
+        num_seeds: rollouts whose mean the success estimate is; J is of the first one's frames.
         num_inference_steps: denoising steps; 0 = those the model is made for.
         actions: of `controls.ACTIONS`: everything is imagined once with each.
         ceiling: score the recorded frames too, as they are and through the autoencoder.
@@ -32,6 +33,7 @@ class EvaluationConfig:
 
     mode: str = 'observe'
     seed: int = 0
+    num_seeds: int = 1
     num_inference_steps: int = 0
     actions: tuple[str, ...] = ('true', 'shuffled')
     ceiling: bool = True
@@ -44,6 +46,8 @@ class EvaluationConfig:
     def __post_init__(self) -> None:
         check_mode(self.mode)
         check_actions(self.actions)
+        if self.num_seeds < 1:
+            raise ConfigError(f'num_seeds is {self.num_seeds}; it must be at least 1')
         if self.num_resamples < 1:
             raise ConfigError(f'num_resamples is {self.num_resamples}; it must be at least 1')
 

@@ -109,6 +109,18 @@ TABLE: tuple[Entry, ...] = (
     ),
     Entry('seed', 0, 'Seed of the noise; chunk k uses seed + k.', bounds=(0, 2**31 - 1)),
     Entry(
+        'num_seeds',
+        1,
+        'Rollouts of a plan whose mean the success estimate is; each takes as long as one.',
+        bounds=(1, 64),
+    ),
+    Entry(
+        'trusted_jaccard',
+        0.7,
+        'Reports say up to which time J is expected to be at least this.',
+        bounds=(0.0, 1.0),
+    ),
+    Entry(
         'num_inference_steps',
         0,
         'Denoising steps a chunk; 0 = those the checkpoint is made for, else 4.',
@@ -175,6 +187,8 @@ class Settings:
     instruction: str
     objects: tuple[str, ...]
     seed: int
+    num_seeds: int
+    trusted_jaccard: float
     num_inference_steps: int
     max_image_age_s: float
     max_joint_state_age_s: float

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isnan
+
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.rejection import Rejection
@@ -35,7 +37,7 @@ def chunk_values(chunk: Chunk, sent: Sent, settings: Settings) -> dict[str, obje
     values['stage_s.publish'] = sent.publish_s
     # the request may leave it to the checkpoint
     values['num_inference_steps'] = prediction.num_inference_steps
-    return values | _estimate_values(chunk)
+    return values | _estimate_values(chunk) | _trust_values(chunk, settings.trusted_jaccard)
 
 
 def frame_s(chunk: Chunk) -> float:
@@ -81,6 +83,9 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
         'success': success.probability,
         'success_low': success.interval[0],
         'success_high': success.interval[1],
+        'success_spread': success.spread,
+        'success_num_seeds': success.num_seeds,
+        'success_calibrated': success.is_calibrated,
         'success_reasons': '; '.join(success.reasons),
         'objects': masks.names,
         'segmenter': prediction.segmenter,
@@ -90,6 +95,19 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
             values[f'jaccard.{view}.{_key(name)}'] = float(success.jaccard[row, column])
             values[f'mask_status.{view}.{_key(name)}'] = masks.status[row][column]
     return values
+
+
+def _trust_values(chunk: Chunk, level: float) -> dict[str, object]:
+    """How far the chunk's end is from the last real frame, and how far J is to be trusted [s]."""
+    trusted_s = chunk.prediction.trusted_seconds(level)
+    end_s = chunk.prediction.imagined_seconds
+    known = 'yes' if end_s <= trusted_s + 1e-6 else 'no'
+    return {
+        'imagined_s': end_s,
+        'trusted_s': trusted_s,
+        'trusted_jaccard': level,
+        'trusted': 'not measured' if isnan(trusted_s) else known,
+    }
 
 
 def _key(name: str) -> str:

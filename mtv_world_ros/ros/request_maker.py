@@ -78,6 +78,7 @@ class RequestMaker:
             instruction=settings.instruction if self.instruction is None else self.instruction,
             objects=settings.objects,
             seed=settings.seed,
+            num_seeds=settings.num_seeds,
             num_inference_steps=settings.num_inference_steps,
             limits=limits,
             received_s=received_s,

@@ -10,6 +10,7 @@ import time
 import traceback
 
 from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.ensemble import imagine_seeds
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
@@ -34,6 +35,7 @@ class Request:
         objects: names of the objects; empty = those the instruction names.
         seed: of the noise of the first chunk after a reset; in imagine mode every further chunk
             counts one up, over requests too.
+        num_seeds: rollouts that the estimate is the mean of; the first one's frames are shown.
         num_inference_steps: denoising steps a chunk.
         limits: what is too old or too long.
         received_s: when it came in [s], of `time.monotonic`.
@@ -52,6 +54,7 @@ class Request:
     limits: TimeLimits
     received_s: float
     limit_tolerance: float = 1e-3
+    num_seeds: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,10 +222,12 @@ class RolloutWorker:
             objects=request.objects or self._pipeline.objects,
             limit_tolerance=request.limit_tolerance,
         )
-        predictions = pipeline.imagine(
+        predictions = imagine_seeds(
+            pipeline,
             scene.observation,
             trajectory,
             instruction=request.instruction,
+            num_seeds=request.num_seeds,
             seed=request.seed + num_before,
             num_inference_steps=request.num_inference_steps,
             should_stop=self._should_stop,
