@@ -58,6 +58,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--dtype', default='auto')
     parser.add_argument('--threads', type=int, default=1)
+    parser.add_argument('--data-workers', type=int, default=0)
     parser.add_argument('--repeats', type=int, default=10, help='steps of each median')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--machine', default='cpu2', help='name of the machine on the page')
@@ -95,6 +96,7 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
         batch_size=config.optimizer.batch_size,
         seed=options.seed,
         actions=actions,
+        workers=options.data_workers,
     )
     return trainer, source
 
@@ -184,8 +186,8 @@ def main() -> None:
     size = trainer.config.optimizer.batch_size
     body = (
         f'Preset `{options.preset}`, batch {size}, {dtype}, device {options.device}, '
-        f'{options.threads} threads, {options.episodes} episodes.\n\n'
-        + table(['what', 'median'], rows)
+        f'{options.threads} threads, {options.data_workers} data processes, '
+        f'{options.episodes} episodes.\n\n' + table(['what', 'median'], rows)
     )
     command = shlex.join(['python', *sys.argv])
     versions = f'torch {torch.__version__}, accelerate {accelerate.__version__}'

@@ -59,6 +59,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
     parser.add_argument(
+        '--data-workers',
+        type=int,
+        default=0,
+        metavar='N',
+        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log has '
+        'the share of time waited for them',
+    )
+    parser.add_argument(
         '--peak-tflops',
         type=float,
         default=0.0,
@@ -110,6 +118,7 @@ def _train(arguments: argparse.Namespace) -> int:
         initial=arguments.init and checkpoint_path(arguments.init),
         cache=arguments.cache,
         held_out=held_out(arguments, paths, dtype),
+        data_workers=arguments.data_workers,
         peak_flops=arguments.peak_tflops * 1e12,
     )
     print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')

@@ -27,6 +27,7 @@ from mtv_world_ros.training.config import AugmentConfig, HistoryConfig, SelfRoll
 from mtv_world_ros.training.controls import ControlMaker
 from mtv_world_ros.training.history import draw_past, history_before, history_of_lead, Past
 from mtv_world_ros.training.leads import Lead, lead_before
+from mtv_world_ros.training.workers import ClipWorkers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +102,7 @@ class BatchSource:
         self_rollout: which clips start from the model's own prediction.
         history: what clips are shown of what came before them.
         numbers: the clips of a step that this process makes; None: all.
+        workers: processes that make them; 0 = a thread of this one.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class BatchSource:
         self_rollout: SelfRolloutConfig | None = None,
         history: HistoryConfig | None = None,
         numbers: Sequence[int] | None = None,
+        workers: int = 0,
     ) -> None:
         self._numbers = range(batch_size) if numbers is None else numbers
         self._starts = [(r, clip_starts(r, spec)) for r in recordings]
@@ -141,6 +144,7 @@ class BatchSource:
         self._history = history or HistoryConfig()
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
+        self._workers = ClipWorkers(self._clip, workers) if workers else None
         self._ahead: tuple[int, Future[Batch]] | None = None
 
     @property
@@ -160,10 +164,14 @@ class BatchSource:
     def close(self) -> None:
         """Stops preparing."""
         self._pool.shutdown(cancel_futures=True)
+        if self._workers is not None:
+            self._workers.close()
 
     def _make(self, step: int) -> Batch:
-        seeds = [(self._seed, step, number) for number in self._numbers]
-        samples = [self._sample(np.random.default_rng(seed), step) for seed in seeds]
+        if self._workers is None:
+            samples = [self._clip(step, number) for number in self._numbers]
+        else:
+            samples = self._workers.clips(step, self._numbers)
         encoded = [s.actions for s in samples if s.actions is not None]
         return Batch(
             step=step,
@@ -176,6 +184,9 @@ class BatchSource:
             leads=tuple(s.lead for s in samples),
             **_pasts([s.past for s in samples]),
         )
+
+    def _clip(self, step: int, number: int) -> _Sample:
+        return self._sample(np.random.default_rng((self._seed, step, number)), step)
 
     def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
         recording, starts = self._choose(rng)

@@ -106,6 +106,7 @@ def train(
     make_trainer: Callable[..., Trainer] = Trainer,
     held_out: HeldOut | None = None,
     peak_flops: float | None = None,
+    data_workers: int = 0,
 ) -> Path:
     """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
 
@@ -129,6 +130,7 @@ def train(
         held_out: judges checkpoints now and then, and keeps the best.
         peak_flops: operations a second that a process's device can do at best, 0 = measure them;
             the log then has the share that the model's arithmetic makes of them. None = not.
+        data_workers: processes that prepare clips; 0 = a thread of this one.
 
     Raises:
         TrainingError: no usable episode, the loss is not finite, or another process is gone.
@@ -173,6 +175,7 @@ def train(
         self_rollout=config.self_rollout,
         history=config.history,
         numbers=trainer.clips,
+        workers=data_workers,
     )
     trained_on['clips'] = source.num_clips
     with processes.main_first():

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import json
+import multiprocessing
+import os
 from pathlib import Path
 import resource
+import signal
 
 import numpy as np
 import pytest
@@ -14,13 +17,14 @@ import torch
 from mtv_world_ros.data import messages
 from mtv_world_ros.data.bag_reader import BagMessage, iter_messages
 from mtv_world_ros.data.bag_writer import BagWriter
+from mtv_world_ros.data.clips import Recording
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.run import train
+from mtv_world_ros.training.run import spec_of, train
 from mtv_world_ros.training.state import DiskError
 from mtv_world_ros.training.trainer import Trainer
 
@@ -110,3 +114,31 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
     resumed = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
     assert resumed.load_state() and resumed.step == 1
     assert load_checkpoint(tmp_path / 'checkpoint').card['trained_on']['steps'] == 1
+
+
+def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
+    recording: Recording, tiny: TrainingConfig, robot: RobotModel, source: BatchSource
+) -> None:
+    workers = BatchSource(
+        [recording],
+        spec=spec_of(tiny),
+        robot=robot,
+        segmenter=ColourSegmenter(),
+        rendering=tiny.rendering,
+        object_mask=True,
+        augment=tiny.augment,
+        batch_size=1,
+        seed=0,
+        workers=2,
+    )
+    for step in range(3):
+        expected, found = source.batch(step), workers.batch(step)
+        assert torch.equal(found.start_frame, expected.start_frame)
+        assert torch.equal(found.trajectory, expected.trajectory)
+    (first, *_) = multiprocessing.active_children()
+    os.kill(first.pid, signal.SIGKILL)
+    first.join(10)
+    with pytest.raises(TrainingError, match='killed at step .*the last saved state is whole'):
+        for step in range(3, 6):  # one batch was prepared before
+            workers.batch(step)
+    workers.close()
