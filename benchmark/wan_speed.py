@@ -1,174 +1,51 @@
-"""How fast is a Wan preset on this machine, and how much of the machine does it use?
+r"""How fast is a Wan preset on this machine, and how much of the machine does it use?
 
-    python benchmark/wan_speed.py --preset wan-1.3b --device cuda --compile --out benchmark/results
+    python benchmark/wan_speed.py --preset wan-1.3b --device cuda --out benchmark/results \
+        --serving "compile=true cuda_graphs=true"
 
 Random weights: speed does not depend on them. A chunk is all views of the preset; umT5 and CLIP
 tokens are at hand, as in serving. The stock pipeline is diffusers' `WanImageToVideoPipeline` on
 the same transformer blocks and autoencoder, all views side by side in one image; it has no control
-video and no reference tokens, so it has a little less to do. Aims on an H200: 60 % of the matrix
-rate, 120 view-frames/s at 4 steps, 3 times the stock pipeline.
+video, no reference tokens and no history, so it has a little less to do. Aims on an H200: 60 % of
+the matrix rate, 120 view-frames/s at 4 steps, 3 times the stock pipeline.
 
 On a CPU, to see that it works: --device cpu --steps 1 --repeats 1 --set transformer.num_layers=1
 video.num_frames=4 video.width=32 video.height=32 autoencoder.base_dim=16
+--compare offload=true context_parallel=2
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 import statistics
 import sys
 import time
-from typing import Any
 
-from diffusers import WanImageToVideoPipeline, WanTransformer3DModel
 from page import publish, table
 import torch
-from torch import nn, Tensor
 from torch.utils.flop_counter import FlopCounterMode
+from wan_bench import Bench
 import yaml
 
-from mtv_world_ros.model.conditioning import condition, Conditioning, decode_frames
-from mtv_world_ros.model.context import NUM_TEXT_TOKENS
-from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
-from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.conditioning import Conditioning
+from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 
-_IMAGE_TOKENS = 257
-#: of a stock Wan image-to-video transformer: noisy 16, mask 4, image 16
-_STOCK_CHANNELS = 36
-
-
-class Bench:
-    """The parts of a preset with random weights, and inputs for a chunk."""
-
-    def __init__(self, config: TrainingConfig, options: argparse.Namespace) -> None:
-        self.config, self.options = config, options
-        self.device, self.dtype = torch.device(options.device), getattr(torch, options.dtype)
-        with torch.device('meta'):
-            transformer = MultiViewWanTransformer(**config.transformer)
-            autoencoder: Any = build_autoencoder(config.autoencoder)
-        self.transformer = self._random(transformer)
-        self.autoencoder = self._random(autoencoder)
-        self.scheduler = build_scheduler(config.scheduler)
-        video = config.video
-        shape = (1, len(video.views), 1 + video.num_frames, video.height, video.width, 3)
-        self.frames = torch.randint(0, 256, shape, dtype=torch.uint8, device=self.device)
-
-    def _random(self, module: Any) -> Any:
-        """Random weights that keep activations finite, made where they are used."""
-        rope = getattr(module, 'rope', None)  # computed; `to_empty` would lose it
-        module = module.to_empty(device=self.device)
-        if rope is not None:
-            arguments = self.config.transformer
-            module.rope = type(rope)(
-                arguments['attention_head_dim'],
-                arguments['patch_size'],
-                arguments['rope_max_seq_len'],
-                arguments['view_offset'],
-            )
-        place(module, self.device, self.dtype)
-        torch.manual_seed(self.options.seed)
-        for name, parameter in module.named_parameters():
-            if parameter.ndim > 1:
-                nn.init.normal_(parameter, std=0.02)
-            else:
-                nn.init.constant_(parameter, 0.0 if name.endswith('bias') else 1.0)
-        return module.eval().requires_grad_(False)
-
-    def encode(self) -> Conditioning:
-        """Start images and trajectory videos to latents; text and image tokens at hand."""
-        latents = condition(self.autoencoder, self.frames[:, :, 0], self.frames)
-        views, arguments = self.frames.shape[1], self.config.transformer
-        text = self._tokens(NUM_TEXT_TOKENS, arguments['text_dim'])
-        image = self._tokens(views * _IMAGE_TOKENS, arguments['image_dim'])
-        return replace(latents, text=text, image=image)
-
-    def _tokens(self, count: int, width: int) -> Tensor:
-        return torch.zeros(1, count, width, device=self.device, dtype=self.dtype)
-
-    def step(self, given: Conditioning) -> Tensor:
-        """One pass of the transformer."""
-        return self.transformer(
-            torch.zeros_like(given.control),
-            torch.full((1,), 500.0, device=self.device),
-            control=given.control,
-            start=given.start,
-            reference=given.reference,
-            encoder_hidden_states=given.text,
-            encoder_hidden_states_image=given.image,
-        )
-
-    def chunk(self, steps: int) -> Tensor:
-        """The whole way from frames to frames."""
-        given = self.encode()
-        latents = sample_latents(
-            self.transformer,
-            self.scheduler,
-            given,
-            seeds=[0],
-            num_inference_steps=steps,
-            should_stop=lambda: False,
-        )
-        return decode_frames(self.autoencoder, latents.to(self.dtype))
-
-    def stock(self) -> Callable[[int], object]:
-        """The pipeline of diffusers itself on the same blocks and autoencoder; takes the steps."""
-        own = ('latent_channels', 'num_views', 'stem', 'context', 'view_offset', 'prediction')
-        arguments = {k: v for k, v in self.config.transformer.items() if k not in own}
-        with torch.device('meta'):
-            stock: Any = WanTransformer3DModel(**{**arguments, 'in_channels': _STOCK_CHANNELS})
-        stock = self._stock_like(stock)
-        pipe: Any = WanImageToVideoPipeline(
-            None,  # type: ignore[arg-type]
-            None,  # type: ignore[arg-type]
-            self.autoencoder.vae,
-            build_scheduler(self.config.scheduler),  # type: ignore[arg-type]
-            transformer=stock,
-        )
-        pipe.set_progress_bar_config(disable=True)
-        pipe.encode_image = lambda *_: self._tokens(_IMAGE_TOKENS, arguments['image_dim'])
-        video, views = self.config.video, self.frames.shape[1]
-        shape = (1, 3, video.height, views * video.width)
-        image = torch.rand(shape, device=self.device, dtype=torch.float32)
-
-        def run(steps: int) -> object:
-            return pipe(
-                image=image,
-                height=video.height,
-                width=views * video.width,
-                num_frames=1 + video.num_frames,
-                num_inference_steps=steps,
-                guidance_scale=1.0,
-                prompt_embeds=self._tokens(NUM_TEXT_TOKENS, arguments['text_dim']),
-                output_type='pt',
-            )
-
-        return run
-
-    def _stock_like(self, stock: Any) -> Any:
-        """The stock class around this transformer's own tensors, but for the way in."""
-        shallow: Any = WanTransformer3DModel.from_config({**stock.config, 'num_layers': 0})
-        stock.patch_embedding = nn.Conv3d(
-            _STOCK_CHANNELS, stock.patch_embedding.out_channels, (1, 2, 2), (1, 2, 2)
-        )
-        tensors = {
-            k.replace('_orig_mod.', ''): v for k, v in self.transformer.state_dict().items()
-        }
-        tensors = {k: v for k, v in tensors.items() if not k.startswith('patch_embedding.')}
-        tensors |= {
-            f'patch_embedding.{k}': v.to(self.device, self.dtype)
-            for k, v in stock.patch_embedding.state_dict().items()
-        }
-        for name in ('ref_conv.weight', 'ref_conv.bias', 'view_embedding'):
-            tensors.pop(name)
-        stock.load_state_dict(tensors, assign=True)
-        stock.rope = shallow.rope.to(self.device)
-        return stock.eval().requires_grad_(False)
+_COMPARED = (
+    'compile=true',
+    'cuda_graphs=true',
+    'compile=true cuda_graphs=true',
+    'attention=_native_cudnn',
+    'compile=true weights=float8',
+    'compile=true tiny_decoder=random',
+    'compile=true tiny_decoder=random tiny_encoder=true',
+    'compile=true cuda_graphs=true weights=float8 tiny_decoder=random tiny_encoder=true',
+    'offload=true',
+    'context_parallel=2',
+)
 
 
 def main() -> None:
@@ -181,7 +58,16 @@ def main() -> None:
     parser.add_argument('--device', default='cuda')
     parser.add_argument('--dtype', default='bfloat16', choices=('bfloat16', 'float32'))
     parser.add_argument('--steps', type=int, nargs='+', default=[4, 8, 50])
-    parser.add_argument('--compile', action='store_true', help='compile the repeated blocks')
+    parser.add_argument(
+        '--serving', default='', help="of the first tables, as the node's parameter `serving`"
+    )
+    parser.add_argument(
+        '--compare',
+        nargs='*',
+        default=_COMPARED,
+        metavar='SERVING',
+        help='a row for each; tiny_decoder takes any value, its weights are random',
+    )
     parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--machine', default='')
@@ -192,9 +78,8 @@ def main() -> None:
         key: yaml.safe_load(value) for key, _, value in (s.partition('=') for s in options.set)
     }
     config = load_training_config(options.preset, overrides)
-    bench = Bench(config, options)
     with torch.inference_mode():
-        body = measure(bench)
+        body = measure(config, options)
     publish(
         options.preset.replace('-', '_').replace('.', '_'),
         f'Speed of {options.preset}',
@@ -205,46 +90,114 @@ def main() -> None:
     )
 
 
-def measure(bench: Bench) -> str:
+def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
     """The page's tables."""
-    options, config = bench.options, bench.config
-    given = bench.encode()
+    plain = Bench(config, options, ServingOptions())
+    given = plain.encode()
     with FlopCounterMode(display=False) as counter:
-        bench.step(given)
-    flop = counter.get_total_flops()
-    if options.compile:
-        bench.transformer.compile_repeated_blocks(fullgraph=True, dynamic=False)
-    matrix = matrix_rate(bench)
-    step = seconds(bench, lambda: bench.step(given))
-    rows = [
-        ['encode (start images, trajectory videos)', _ms(seconds(bench, bench.encode))],
-        ['one step of the transformer', _ms(step)],
-        ['decode', _ms(seconds(bench, lambda: decode_frames(bench.autoencoder, given.control)))],
-    ]
-    stock = bench.stock()
-    view_frames = len(config.video.views) * config.video.num_frames
-    totals = []
-    for steps in options.steps:
-        ours = seconds(bench, lambda n=steps: bench.chunk(n))
-        theirs = seconds(bench, lambda n=steps: stock(n))
-        rate = f'{view_frames / ours:.1f}'
-        totals.append([str(steps), _ms(ours), rate, _ms(theirs), f'{theirs / ours:.2f}'])
-    tokens = _tokens(given)
+        plain.step(given)
+    matrix = matrix_rate(plain)
+    work = Work(
+        flop=counter.get_total_flops(),
+        matrix=matrix,
+        view_frames=len(config.video.views) * config.video.num_frames,
+    )
+    parameters = sum(p.numel() for p in plain.transformer.parameters())
+    stock = _stock(plain)
+    plain.close()
     video = config.video
-    parameters = sum(p.numel() for p in bench.transformer.parameters())
     chunk = (
         f'A chunk: {len(video.views)} views of 1 + {video.num_frames} frames, '
-        f'{video.width}x{video.height}, {tokens} tokens; {parameters / 1e6:.1f} M parameters, '
-        f'{options.dtype}, blocks {"" if options.compile else "not "}compiled, no guidance.'
+        f'{video.width}x{video.height}, {_tokens(given)} tokens; '
+        f'{parameters / 1e6:.1f} M parameters, {options.dtype}, no guidance. A step is '
+        f'{work.flop / 1e12:.3f} TFLOP; a large {options.dtype} matrix product reaches '
+        f'{matrix / 1e12:.2f} TFLOP/s here.'
     )
-    share = (
-        f'The transformer: {flop / 1e12:.3f} TFLOP a step, {flop / step / 1e12:.2f} TFLOP/s, '
-        f'{100 * flop / step / matrix:.0f} % of the {matrix / 1e12:.2f} TFLOP/s that a large '
-        f'{options.dtype} matrix product reaches here.'
+    return '\n\n'.join(
+        [
+            chunk,
+            *_whole(config, options, work, stock),
+            'All options, one after the other:',
+            _compared(config, options, work),
+        ]
     )
-    stages = table(['stage', 'median [ms]'], rows)
+
+
+def _stock(bench: Bench) -> dict[int, float]:
+    """Seconds of diffusers' own pipeline by number of steps."""
+    pipeline = bench.stock()
+    return {n: seconds(bench, lambda n=n: pipeline(n)) for n in bench.options.steps}
+
+
+@dataclass(frozen=True)
+class Work:
+    """Of a chunk: operations of a step, the machine's in a second, frames of all views."""
+
+    flop: int
+    matrix: float
+    view_frames: int
+
+    def share(self, step: float) -> str:
+        """What a step of so many seconds makes of the machine."""
+        rate = self.flop / step
+        return f'{rate / 1e12:.2f} TFLOP/s, {100 * rate / self.matrix:.0f} %'
+
+
+def _whole(
+    config: TrainingConfig, options: argparse.Namespace, work: Work, stock: dict[int, float]
+) -> list[str]:
+    """Stages and totals under `--serving`, beside the stock pipeline."""
+    bench = Bench(config, options, ServingOptions.parse(options.serving))
+    given = bench.encode()
+    step = seconds(bench, lambda: bench.step(given))
+    rows = [
+        ['encode (start images, trajectory videos, history)', _ms(seconds(bench, bench.encode))],
+        ['one step of the transformer', _ms(step)],
+        ['decode', _ms(seconds(bench, lambda: bench.decode(given.control)))],
+    ]
+    totals = []
+    for steps, theirs in stock.items():
+        ours = seconds(bench, lambda n=steps: bench.chunk(n))
+        rate = f'{work.view_frames / ours:.1f}'
+        totals.append([str(steps), _ms(ours), rate, _ms(theirs), f'{theirs / ours:.2f}'])
     header = ['steps', 'chunk [ms]', 'view-frames/s', 'stock pipeline [ms]', 'ratio']
-    return '\n\n'.join([chunk, stages, share, table(header, totals), *_memory(bench.device)])
+    memory = _memory(bench.device)
+    bench.close()
+    return [
+        f'Served with `{options.serving}`:' if options.serving else 'Served plainly:',
+        table(['stage', 'median [ms]'], rows),
+        f'The transformer: {work.share(step)} of that. Most memory held: {memory}.',
+        table(header, totals),
+    ]
+
+
+def _compared(config: TrainingConfig, options: argparse.Namespace, work: Work) -> str:
+    rows = []
+    for text in ['', *options.compare]:
+        try:
+            rows.append([text or 'plain', *_row(config, options, work, text)])
+        except Exception as error:  # one that does not run must not cost the others' numbers
+            told = (str(error).splitlines() or [''])[0].replace('|', '/')
+            rows.append([text, *['-'] * 5, f'{type(error).__name__}: {told}'])
+    header = ['serving', 'step [ms]', 'of the matrix rate', 'decode [ms]']
+    header += [f'chunk, {options.steps[0]} steps [ms]', 'view-frames/s', 'memory held']
+    return table(header, rows)
+
+
+def _row(
+    config: TrainingConfig, options: argparse.Namespace, work: Work, serving: str
+) -> list[str]:
+    bench = Bench(config, options, ServingOptions.parse(serving))
+    try:
+        given = bench.encode()
+        step = seconds(bench, lambda: bench.step(given))
+        decode = seconds(bench, lambda: bench.decode(given.control))
+        chunk = seconds(bench, lambda: bench.chunk(options.steps[0]))
+        rate = f'{work.view_frames / chunk:.1f}'
+        times = [_ms(step), work.share(step), _ms(decode), _ms(chunk), rate]
+        return [*times, _memory(bench.device)]
+    finally:
+        bench.close()
 
 
 def matrix_rate(bench: Bench) -> float:
@@ -276,15 +229,16 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _memory(device: torch.device) -> list[str]:
+def _memory(device: torch.device) -> str:
     if device.type != 'cuda':
-        return []
-    return [f'Most memory held: {torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB.']
+        return 'not counted'
+    return f'{torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB'
 
 
 def _tokens(given: Conditioning) -> int:
     _, views, _, frames, height, width = given.control.shape
-    return views * (1 + frames) * (height // 2) * (width // 2)
+    before = 0 if given.history is None else given.history.shape[3]
+    return views * (1 + before + frames) * (height // 2) * (width // 2)
 
 
 def _ms(value: float) -> str:

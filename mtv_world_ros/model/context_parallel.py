@@ -102,7 +102,9 @@ def describe(tensors: Mapping[str, Tensor]) -> Described:
 def send(tensors: Mapping[str, Tensor]) -> None:
     """Sends tensors from the first process to the others, which `receive` them."""
     for tensor in tensors.values():
-        distributed.broadcast(_bytes(tensor.contiguous()), src=0)
+        # laid out anew: an expanded tensor of one number calls itself contiguous and is not
+        plain = torch.empty(tensor.shape, dtype=tensor.dtype, device=tensor.device)
+        distributed.broadcast(_bytes(plain.copy_(tensor)), src=0)
 
 
 def receive(described: Described, device: torch.device) -> dict[str, Tensor]:

@@ -190,6 +190,7 @@ class DiffusionWorldModel:
 
         The other arguments and the errors are those of `predict`.
         """
+        self._check_size(trajectory_frames)
         try:
             with torch.inference_mode():
                 conditioning = self._condition(start_frame, trajectory_frames, positions)
@@ -215,6 +216,16 @@ class DiffusionWorldModel:
             if "can't allocate memory" not in str(error):
                 raise
             raise self._out_of_memory(trajectory_frames, error) from error
+
+    def _check_size(self, frames: ByteArray) -> None:
+        spec = self.spec
+        views, count = len(frames), frames.shape[1] - 1
+        if views > len(spec.views) or count > spec.num_frames:
+            raise CheckpointError(
+                f'{views} views of {count} frames given, the model was trained on '
+                f'{len(spec.views)} views of {spec.num_frames}; give no more, or train with '
+                'video.views and video.num_frames set to what you need'
+            )
 
     def _condition(
         self, start_frame: ByteArray, trajectory_frames: ByteArray, positions: FloatArray

@@ -27,7 +27,7 @@ def inputs(views: int, batch: int = 1, frames: int = 3, size: int = 8) -> dict[s
 
     return {
         'hidden_states': random(frames, size, size),
-        'timestep': torch.tensor([250.0, 900.0])[:batch],
+        'timestep': torch.tensor(250.0).expand(batch),  # as the sampler gives it
         'control': random(frames, size, size),
         'start': random(frames, size, size),
         'reference': random(size, size),
@@ -81,6 +81,21 @@ def test_changed_weights_reach_the_other_process(pair) -> None:
     after = shared(**inputs(2))
     assert not torch.allclose(before, after, atol=1e-2)
     torch.testing.assert_close(after, alone(**inputs(2)), rtol=0, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_a_history_with_its_own_noise_level_is_split_alike(pair) -> None:
+    alone, shared, _ = pair
+    torch.manual_seed(0)
+    before = {
+        'history': torch.randn(1, 2, 16, 1, 8, 8),
+        'history_timestep': torch.tensor([50.0]),
+        'anchor': torch.randn(1, 2, 16, 8, 8),
+    }
+    out = shared(**inputs(2), **before)
+    torch.testing.assert_close(out, alone(**inputs(2), **before), rtol=0, atol=1e-5)
+    later = {**before, 'history_timestep': torch.tensor([900.0])}
+    assert not torch.allclose(out, shared(**inputs(2), **later), atol=1e-2)
 
 
 def test_a_second_group_is_refused(pair) -> None:

@@ -47,6 +47,20 @@ def test_predicts_exactly_the_cards_frames_and_seeds_do_not_meet(folder: Path) -
     assert np.abs(together[0].astype(int) - together[1]).max() > 10
 
 
+@pytest.mark.parametrize(('views', 'count'), [(VIEWS + 1, T), (VIEWS, 2 * T)])
+def test_more_views_or_frames_than_trained_are_refused(
+    folder: Path, views: int, count: int
+) -> None:
+    told = rf'{views} views of {count} frames given, .* 2 views of 4; .*video\.num_frames'
+    more = {
+        'start_frame': frames(views),
+        'trajectory_frames': frames(views, 1 + count),
+        'positions': np.zeros((1 + count, 14)),
+    }
+    with pytest.raises(CheckpointError, match=told):
+        predict(load(folder), [0], **more)
+
+
 def test_bfloat16_keeps_angles_and_times_in_float32(folder: Path) -> None:
     exact, coarse = load(folder), load(folder, dtype=torch.bfloat16)
     angles = exact.transformer.rope.get_buffer('freqs_cos')
