@@ -72,6 +72,8 @@ setup(
         'import': ['pyarrow>=17'],
         # Clients of policy servers: LeRobot's (grpcio), openpi's.
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
+        # `mtv-world rank --ray`: rollouts on a Ray cluster; pulls no torch.
+        'rank': ['ray>=2.60,<3'],
         # The simulator; it also needs an OpenGL library, see README.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
