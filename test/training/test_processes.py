@@ -25,10 +25,10 @@ SCRIPT = Path(__file__).with_name('train_recorded.py')
 ROOT = Path(__file__).parents[2]
 
 
-def preset(config: TrainingConfig, folder: Path) -> Path:
+def preset(config: TrainingConfig, folder: Path, steps: int = 3) -> Path:
     """Three clips a step, two processes: one gets two of them."""
     values = json.loads(json.dumps(asdict(config)))
-    values['optimizer'] |= {'batch_size': 3, 'steps': 3, 'max_grad_norm': 1e9}
+    values['optimizer'] |= {'batch_size': 3, 'steps': steps, 'max_grad_norm': 1e9}
     file = folder / 'preset.yaml'
     file.write_text(yaml.safe_dump(values))
     return file
@@ -116,3 +116,24 @@ def test_fewer_clips_than_processes_are_refused(tiny: TrainingConfig, tmp_path: 
             trained_on={},
             processes=processes,
         )
+
+
+def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(
+    tiny: TrainingConfig, episode: Path, tmp_path: Path
+) -> None:
+    file = preset(tiny, tmp_path, steps=10**6)
+    arguments = [str(tmp_path), str(episode.parent), str(file)]
+    ended = subprocess.run(
+        [sys.executable, str(SCRIPT.with_name('train_lost.py')), *arguments],
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'CUDA_VISIBLE_DEVICES': ''},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert ended.returncode == 0, ended.stderr
+    said = (tmp_path / 'said').read_text()
+    assert said.startswith('TrainingError: process 0 of 2 lost another one')
+    assert 'run the same command again' in said
+    state = json.loads((tmp_path / 'state' / 'state.json').read_text())
+    assert state['step'] > 0 and state['step'] % 5 == 0
+    assert load_file(tmp_path / 'state' / 'state.safetensors')
