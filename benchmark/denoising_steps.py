@@ -14,6 +14,7 @@ many-step samples scores as one step does, and samples are sharper and further a
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 import shlex
 import sys
@@ -35,7 +36,7 @@ STEPS = (1, 2, 4, 8, 16)
 _CHANGE = 24
 
 
-def chosen(paths: list[Path], options: argparse.Namespace, pipeline: Pipeline) -> list:
+def chosen(paths: Sequence[Path], options: argparse.Namespace, pipeline: Pipeline) -> list:
     """(recording, start) of clips, spread over episodes and, in each, at random."""
     rng = np.random.default_rng(options.seed)
     found = []
@@ -49,8 +50,8 @@ def chosen(paths: list[Path], options: argparse.Namespace, pipeline: Pipeline) -
 
 def imagine(
     pipeline: Pipeline, recording: Recording, start: int, steps: int, num_seeds: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(K, V, T, H, W, 3) samples, the recording's frames and its identities."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K, V, T, H, W, 3) samples and the (V, 1 + T, H, W, 3) frames of the recording."""
     clip = cut_clip(recording, start, pipeline.spec)
     segmented = pipeline.segmenter.segment(clip.frames[:, :1], clip.objects)
     control = pipeline.draw(clip.cameras, clip.positions, clip.times, segmented)
@@ -62,7 +63,7 @@ def imagine(
         num_inference_steps=steps,
         should_stop=lambda: False,
     )
-    return samples, clip.frames, clip.object_ids
+    return samples, clip.frames
 
 
 def jaccard_moving(
@@ -110,7 +111,7 @@ def measure_clip(
     pipeline: Pipeline, recording: Recording, start: int, steps: int, num_seeds: int
 ) -> dict[str, float | list[float]]:
     """The row's numbers of one clip."""
-    samples, recorded, _ = imagine(pipeline, recording, start, steps, num_seeds)
+    samples, recorded = imagine(pipeline, recording, start, steps, num_seeds)
     future = recorded[:, 1:]
     changed = np.abs(future.astype(int) - recorded[:, :1]).max(-1) > _CHANGE
     if not changed.any():
@@ -123,7 +124,7 @@ def measure_clip(
     return {
         'error': float(np.mean(errors)),
         'error of mean': _rms(mean, future, changed),
-        'spread': float(samples.astype(np.float32).std(0, ddof=1)[:, :, :, :][changed].mean()),
+        'spread': float(samples.astype(np.float32).std(0, ddof=1)[changed].mean()),
         'sharpness': float(
             np.mean([_sharpness(s, changed) for s in samples]) / _sharpness(future, changed)
         ),

@@ -80,9 +80,7 @@ class DistillTrainer(Trainer):
         super().__init__(*args, **options)
         self.parts, self.distill = teacher, distill
         if teacher.adapter is not None:
-            adapters = Adapters(teacher.transformer)
-            adapters.use(teacher.adapter)
-            adapters.merge()
+            Adapters(teacher.transformer, fuse=True).use(teacher.adapter)
         # before it takes the number format of forward and backward
         self._first = {n: t.clone() for n, t in teacher.transformer.state_dict().items()}
         dtype = self.weights.worker.dtype
@@ -96,7 +94,7 @@ class DistillTrainer(Trainer):
 
     def _encoders(self, teacher: Checkpoint) -> Encoders:
         if teacher.image_encoder is not None:
-            teacher.image_encoder.to(self.device)
+            teacher.image_encoder.to(self.device, self.weights.worker.dtype)
         return Encoders(
             autoencoder=self.autoencoder,
             text=self._text('prompt'),
@@ -107,7 +105,10 @@ class DistillTrainer(Trainer):
     def _text(self, key: str) -> Tensor | None:
         """Tokens of a text of the card, in models with text."""
         encoder = self.parts.text_encoder
-        return encoder and encoder.encode(self.parts.card.get(key, ''), self.device)
+        if encoder is None:
+            return None
+        # a copy: what encoding gives takes no part in gradients
+        return encoder.encode(self.parts.card.get(key, ''), self.device).clone()
 
     def start_from(self, folder: Path) -> None:
         """Takes the teacher's weights, its adapter merged."""
