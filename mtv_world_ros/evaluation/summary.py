@@ -175,7 +175,7 @@ class Summary:
         """J against the number of the chunk; empty where no rollout has two."""
         if self.num_chunks < 2:
             return ''
-        curves = {view: self._by_chunk(view) for view in (*self.spec.views, None)}
+        curves = {view: self.chunk_curve(view) for view in (*self.spec.views, None)}
         head = ['J of objects that move, chunk', *(view or 'all views' for view in curves)]
         return tables.grid(head, [
             [str(k + 1), *(tables.point(c.values, c.band, k) for c in curves.values())]
@@ -223,7 +223,7 @@ class Summary:
             key = f'{name.removesuffix("_frames")}_moving_by_frame'
             found[key], found[f'{key}_interval'] = drawn.values, drawn.band
         if self.num_chunks > 1:
-            drawn = self._by_chunk(view, group)
+            drawn = self.chunk_curve(view, group)
             found |= {'j_moving_by_chunk': drawn.values, 'j_moving_by_chunk_interval': drawn.band}
         return found
 
@@ -233,8 +233,8 @@ class Summary:
         frames = [row.num_frames for result in self.results for row in result.rows]
         return -(-max(frames, default=0) // self.spec.num_frames)
 
-    def _by_chunk(self, view: str | None, group: Group = ALL) -> Curve:
-        """J of moving objects by chunk, with intervals."""
+    def chunk_curve(self, view: str | None, group: Group = ALL) -> Curve:
+        """Returns J of moving objects by chunk of a view (None = all), with intervals."""
         episodes = [result.rows for result in self.chosen(group)]
         return by_chunk(
             episodes,
