@@ -20,7 +20,9 @@ def pack(value: Any) -> bytes:
     """Returns the bytes of nested mappings and lists of arrays, numbers and text."""
     import msgpack
 
-    return msgpack.packb(value, default=_encode)
+    packed = msgpack.packb(value, default=_encode)
+    assert packed is not None
+    return packed
 
 
 def unpack(data: bytes) -> Any:

@@ -241,6 +241,8 @@ class EpisodeRunner(Node):
         if time.monotonic() > self._next_status_s:
             self._next_status_s = time.monotonic() + _PERIOD_S
             self._status.publish_diagnostics({'episodes': len(self._results)})
+            if self._live is not None:
+                self._live.refresh()
 
     @staticmethod
     def _name(node: str) -> str:

@@ -134,6 +134,11 @@ class LiveCameras:
             for kind, topic, handle in wanted
         ]
 
+    def refresh(self) -> None:
+        """Looks at the publishers again; to be called now and then."""
+        for subscription in self._subscriptions:
+            subscription.refresh()
+
     def clear(self) -> None:
         """Forgets images and joints: those that come next are new."""
         self._images.clear()

@@ -401,6 +401,14 @@ def ros():
     return sys.modules[__name__]
 
 
+#: parameters and names of nodes that start from what the episode runner shows them
+FROZEN = (
+    'camera_topics.low:=start/low',
+    'camera_topics.high:=start/high',
+    'max_image_age_s:=3600.0',
+    'max_joint_state_age_s:=3600.0',
+)
+JOINT_STATES = ('joint_states:=start/joint_states',)
 COMPRESSED = CompressedImage
 IMAGE = Image
 INFO = CameraInfo

@@ -45,11 +45,6 @@ def write_episode(folder, task, ros):
     return folder / task
 
 
-STARTS = ('camera_topics.low:=start/low', 'camera_topics.high:=start/high')
-JOINT_STATES = ('joint_states:=start/joint_states',)
-NO_AGE = ('max_image_age_s:=3600.0', 'max_joint_state_age_s:=3600.0')
-
-
 class Stack:
     """World model, policy and runner as processes, and a client that interferes."""
 
@@ -58,10 +53,10 @@ class Stack:
         ros.make_checkpoint(folder / 'checkpoint')
         self.world = ros.start_node(
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001',
-            *NO_AGE, *STARTS, remaps=JOINT_STATES,
+            *ros.FROZEN, remaps=ros.JOINT_STATES,
         )  # fmt: skip
         self.policy = ros.start_policy(
-            folder, 'answer_timeout_s:=1.5', *NO_AGE, *STARTS, remaps=JOINT_STATES
+            folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
         )
         episodes = [write_episode(folder, task, ros) for task in TASKS]
         arguments = [folder / 'out', '--views', 'low', 'high', '--seed', SEED, '--episodes']
