@@ -17,9 +17,10 @@ from trajectory_msgs.msg import JointTrajectory
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.adapter import AdapterSwitch
+from mtv_world_ros.ros.fidelity import LiveFidelity
 from mtv_world_ros.ros.inputs import Inputs
 from mtv_world_ros.ros.loading import load_cameras, load_named_pipeline, reload_cameras
-from mtv_world_ros.ros.observation_buffer import FreshnessLimits, ObservationBuffer
+from mtv_world_ros.ros.observation_buffer import ObservationBuffer
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.rejection import Rejection
@@ -56,12 +57,14 @@ class WorldModelNode(Node):
             joint_names=self._robot.joint_names,
             width=self._spec.width,
             height=self._spec.height,
-            limits=self._freshness,
+            limits=lambda: parameters.freshness(self._settings),
+            on_image=lambda view, message: self._fidelity.see(view, message),
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, self.settings, lambda: self._worker.last_scene
         )
         self._reporter = Reporter(self, self._robot.name, self.settings, self._state)
+        self._fidelity = LiveFidelity(self, pipeline, self._reporter.scored, self._reporter.crash)
         self._publisher = PredictionPublisher(
             self,
             self._spec,
@@ -105,6 +108,7 @@ class WorldModelNode(Node):
     def close(self) -> None:
         """Ends the worker and the node."""
         self._worker.close()
+        self._fidelity.close()
         self.destroy_node()
 
     def _on_instruction(self, message: String) -> None:
@@ -124,12 +128,14 @@ class WorldModelNode(Node):
         self._reporter.count('trajectories_received')
         now_ns = self.get_clock().now().nanoseconds
         try:
-            self._worker.submit(self._maker.make(message, now_ns, received_s))
+            request = self._maker.make(message, now_ns, received_s)
+            self._worker.submit(self._fidelity.replan(request))
         except Rejection as error:
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
 
     def _publish_results(self) -> None:
         for result in self._worker.take():
+            self._fidelity.expect(result)
             self._publisher.add(result)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -155,8 +161,8 @@ class WorldModelNode(Node):
         return response
 
     def _give_up(self) -> None:
-        self._worker.reset()
-        self._publisher.reset()
+        for part in (self._worker, self._fidelity, self._publisher):
+            part.reset()
 
     def _on_jump(self, _: object) -> None:
         """The clock went back, as when a bag starts over: what is stored lies in the future."""
@@ -171,13 +177,6 @@ class WorldModelNode(Node):
         self._inputs.refresh()
         self._reporter.publish_diagnostics()
 
-    def _freshness(self) -> FreshnessLimits:
-        return FreshnessLimits(
-            image_age=self._settings.max_image_age_s,
-            joint_state_age=self._settings.max_joint_state_age_s,
-            view_skew=self._settings.max_view_skew_s,
-        )
-
     def _state(self) -> Mapping[str, object]:
         return {
             'mode': 'imagine' if self._maker.imagine else 'observe',
@@ -185,6 +184,7 @@ class WorldModelNode(Node):
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            **self._fidelity.values(),
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
             **self._buffer.ages(self.get_clock().now().nanoseconds),

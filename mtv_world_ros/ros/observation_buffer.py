@@ -64,6 +64,7 @@ class ObservationBuffer:
         width: width of the model's frames [px].
         height: height of the model's frames [px].
         limits: asked at every observation, so that they may change.
+        on_image: also gets every image that is stored.
     """
 
     def __init__(
@@ -74,10 +75,11 @@ class ObservationBuffer:
         width: int,
         height: int,
         limits: Callable[[], FreshnessLimits],
+        on_image: Callable[[str, Image | CompressedImage], None] | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras)
         self._size = (width, height)
-        self._limits = limits
+        self._limits, self._on_image = limits, on_image
         self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
             camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
         }
@@ -98,6 +100,8 @@ class ObservationBuffer:
         """
         image_conversions.check(message)
         self._images[view].append((to_ns(message.header.stamp), message))
+        if self._on_image is not None:
+            self._on_image(view, message)
 
     def add_camera_info(self, view: str, message: CameraInfo) -> None:
         """Stores the first CameraInfo of a view and watches the later ones.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import isnan
 
+from mtv_world_ros.ros.fidelity import Scored
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.rejection import Rejection
@@ -94,6 +95,22 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
         for column, name in enumerate(masks.names):
             values[f'jaccard.{view}.{_key(name)}'] = float(success.jaccard[row, column])
             values[f'mask_status.{view}.{_key(name)}'] = masks.status[row][column]
+    return values
+
+
+def fidelity_values(scored: Scored) -> dict[str, object]:
+    """Keys and values of a chunk whose real frames came."""
+    prediction, found = scored.chunk.prediction, scored.fidelity
+    values: dict[str, object] = {
+        **request_values(scored.chunk.request),
+        'chunk': prediction.chunk,
+        'frames_compared': found.num_frames,
+        'fidelity_jaccard': found.mean,
+    }
+    for row, view in enumerate(prediction.rollout.video.views):
+        for column, name in enumerate(found.names):
+            values[f'fidelity.{view}.{_key(name)}'] = float(found.jaccard[row, column])
+            values[f'fidelity_copy.{view}.{_key(name)}'] = float(found.copy[row, column])
     return values
 
 

@@ -14,6 +14,7 @@ from rclpy.publisher import Publisher
 from mtv_world_ros.ros import report
 from mtv_world_ros.ros.conversions import to_diagnostics, to_status
 from mtv_world_ros.ros.diagnostics import Tally
+from mtv_world_ros.ros.fidelity import Scored
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.prediction_publisher import Sent
 from mtv_world_ros.ros.rejection import Reason, Rejection
@@ -106,6 +107,10 @@ class Reporter:
         )
         values['frames_published_total'] = counts['frames_published']
         self._publish_report('chunk', values)
+
+    def scored(self, scored: Scored) -> None:
+        """Reports how a chunk compares with the real frames that came for it."""
+        self._publish_report('fidelity', report.fidelity_values(scored))
 
     def ended(self, ended: Ended) -> None:
         """Counts and reports the end of a rollout."""
