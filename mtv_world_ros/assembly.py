@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -72,6 +73,7 @@ def load_pipeline(
     segmenter: str = 'auto',
     serving: str = '',
     calibrated: bool = True,
+    adapter: Path | None = None,
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -87,6 +89,7 @@ def load_pipeline(
         serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
             `ServingOptions`.
         calibrated: use the checkpoint's calibration of the success estimate, where it has one.
+        adapter: LoRA adapter to use in place of the checkpoint's own.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
@@ -100,6 +103,8 @@ def load_pipeline(
     set_num_threads(num_threads)
     number_format = choose_dtype(dtype, device)
     loaded = load_checkpoint(checkpoint_path(checkpoint), dtype=number_format)
+    if adapter is not None:
+        loaded = replace(loaded, adapter=adapter)
     world_model = DiffusionWorldModel(
         loaded,
         device=device,

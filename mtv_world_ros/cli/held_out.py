@@ -58,7 +58,9 @@ def held_out(
             f"'{min(both)}' and {len(both) - 1} more would be trained on and held out; give "
             '--held-out another folder, or --split train'
         )
-    judge = make_judge(paths, arguments.out / 'held_out', arguments.device, dtype)
+    judge = make_judge(
+        paths, arguments.out / 'held_out', arguments.device, dtype, base=arguments.init
+    )
     return HeldOut(judge, arguments.sample_every)
 
 
@@ -78,7 +80,9 @@ def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
     return selection.paths
 
 
-def make_judge(paths: Sequence[Path], out: Path, device: str, dtype: torch.dtype) -> Judge:
+def make_judge(
+    paths: Sequence[Path], out: Path, device: str, dtype: torch.dtype, base: str | None = None
+) -> Judge:
     """Returns what scores checkpoints as `mtv-world evaluate` does, J of moving objects first.
 
     Args:
@@ -86,18 +90,22 @@ def make_judge(paths: Sequence[Path], out: Path, device: str, dtype: torch.dtype
         out: gets a folder a step: `metrics.json` and an MP4 an episode.
         device: where to imagine.
         dtype: of the model.
+        base: checkpoint that adapters are used on.
     """
     import torch
 
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.evaluation.evaluate import evaluate
     from mtv_world_ros.evaluation.rollout_store import load_rollout, rollout_path
+    from mtv_world_ros.model.lora import ADAPTER
     from mtv_world_ros.training.held_out import Judged
 
     def judge(checkpoint: Path, step: int) -> Judged:
         folder = out / f'{step:07d}'
+        is_adapter = (checkpoint / ADAPTER).is_file()
         pipeline = load_pipeline(
-            checkpoint,
+            base if is_adapter and base else checkpoint,
+            adapter=checkpoint if is_adapter else None,
             device=device,
             dtype=str(dtype).removeprefix('torch.'),
             num_threads=torch.get_num_threads(),  # the training's stay as they are

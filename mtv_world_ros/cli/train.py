@@ -51,6 +51,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--cache', type=Path, metavar='DIR', help='what was read of episodes; runs may share it'
     )
+    parser.add_argument(
+        '--latent-cache',
+        type=Path,
+        metavar='DIR',
+        help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
+        'share it',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
@@ -120,8 +127,12 @@ def _train(arguments: argparse.Namespace) -> int:
         held_out=held_out(arguments, paths, dtype),
         data_workers=arguments.data_workers,
         peak_flops=arguments.peak_tflops * 1e12,
+        latent_cache=arguments.latent_cache,
     )
-    print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
+    if config.lora.rank:
+        print(f'adapter for {arguments.init}: {folder}')
+    else:
+        print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
     return 0
 
 

@@ -24,9 +24,11 @@ _CARD_KEYS = {
     'rendering': dict,
     'trained_on': dict,
 }
+#: what an adapter and the checkpoint that it is used on have in common
+SHARED_KEYS = tuple(key for key in _CARD_KEYS if key not in ('rendering', 'trained_on'))
 #: what only models with text need: the instruction, what to keep away from and how strongly; the
 #: denoising steps that a distilled model is made for; and `history.HistorySettings`
-_OPTIONAL_KEYS = {
+OPTIONAL_KEYS = {
     'prompt': str,
     'negative_prompt': str,
     'guidance_scale': (int, float),
@@ -53,6 +55,28 @@ def read_card(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
     check_card(card, path)
     return card
+
+
+def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
+    """Checks that an adapter was trained for what a checkpoint takes and gives.
+
+    Args:
+        card: of the checkpoint.
+        adapter: its folder; one without a card of its own is not checked.
+
+    Raises:
+        CheckpointError: it was not.
+    """
+    if not (adapter / CARD).is_file():
+        return
+    theirs = read_card(adapter)
+    for key in SHARED_KEYS:
+        mine, other = card[key], theirs[key]
+        if mine != other:
+            raise CheckpointError(
+                f"adapter '{adapter}' was trained with '{key}' {other}, this checkpoint's is "
+                f'{mine}; use the checkpoint that it was trained on'
+            )
 
 
 def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
@@ -88,13 +112,13 @@ def check_card(card: Mapping[str, Any], path: Path) -> None:
 
 
 def _check_keys(card: Mapping[str, Any], path: Path) -> None:
-    known = {**_CARD_KEYS, **_OPTIONAL_KEYS}
+    known = {**_CARD_KEYS, **OPTIONAL_KEYS}
     for key in card:
         if key not in known:
             raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, known)}")
     for key, kind in known.items():
         if key not in card:
-            if key in _OPTIONAL_KEYS:
+            if key in OPTIONAL_KEYS:
                 continue
             raise CheckpointError(f"'{path}': key '{key}' is missing")
         if not isinstance(card[key], kind):

@@ -58,9 +58,16 @@ class Conditioning:
 
     def repeated(self, count: int) -> Conditioning:
         """Returns the same for `count` samples, where it is for one."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        held = {name: value for name, value in values.items() if value is not None}
+        held = self._held()
         return replace(self, **{n: v.expand(count, *v.shape[1:]) for n, v in held.items()})
+
+    def part(self, samples: slice) -> Conditioning:
+        """Returns that of some samples."""
+        return replace(self, **{n: v[samples] for n, v in self._held().items()})
+
+    def _held(self) -> dict[str, Tensor]:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
         """Returns the same with latents and tokens in a number format; actions stay."""
@@ -119,16 +126,21 @@ def condition(
 def _start(
     autoencoder: Autoencoder, start_frame: Tensor, num_latent_frames: int
 ) -> tuple[Tensor, Tensor]:
-    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot.
+    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot."""
+    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
+    return reference, start_slot(reference, num_latent_frames, autoencoder.includes_start)
+
+
+def start_slot(reference: Tensor, num_latent_frames: int, includes_start: bool) -> Tensor:
+    """Returns the (B, V, C, F, h, w) start-image slot of (B, V, C, h, w) reference latents.
 
     Where the video begins with the start image, the slot holds it there and is zero behind, as
     Wan2.1-Fun-Control was trained; else it holds it in every frame.
     """
-    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
     slot = reference.unsqueeze(3).expand(-1, -1, -1, num_latent_frames, -1, -1)
-    if autoencoder.includes_start:
+    if includes_start:
         slot = torch.cat([slot[:, :, :, :1], torch.zeros_like(slot[:, :, :, 1:])], dim=3)
-    return reference, slot
+    return slot
 
 
 def condition_on_actions(

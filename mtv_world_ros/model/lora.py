@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.model.card import CARD
 from mtv_world_ros.model.lora_keys import Factors, METADATA, read_lora
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
@@ -56,10 +57,22 @@ def beside(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
     return {n: p for n, p in transformer.named_parameters() if n.startswith(BESIDE)}
 
 
-def save_adapter(transformer: MultiViewWanTransformer, folder: Path) -> None:
+def save_adapter(
+    transformer: MultiViewWanTransformer,
+    folder: Path,
+    *,
+    weights: Mapping[str, Tensor] | None = None,
+    card: Mapping[str, Any] | None = None,
+) -> None:
     """Writes the adapter's folder; it appears under its name only when it is whole.
 
     The adapter itself is in diffusers' layout.
+
+    Args:
+        transformer: has the adapter.
+        folder: to write.
+        weights: in place of the transformer's, by name; such as averaged ones.
+        card: what it was trained for and on, as in a checkpoint.
     """
     from peft.utils import get_peft_model_state_dict
 
@@ -67,9 +80,13 @@ def save_adapter(transformer: MultiViewWanTransformer, folder: Path) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     config = json.dumps(transformer.peft_config[_NAME].to_dict(), default=list, sort_keys=True)
-    _save(get_peft_model_state_dict(transformer, adapter_name=_NAME), partial / ADAPTER, config)
-    _save(beside(transformer), partial / BESIDE_FILE)
+    tensors = {**transformer.state_dict(), **(weights or {})}
+    factors = get_peft_model_state_dict(transformer, tensors, adapter_name=_NAME)
+    _save(factors, partial / ADAPTER, config)
+    _save({name: tensors[name] for name in beside(transformer)}, partial / BESIDE_FILE)
     (partial / BASE_FILE).write_text(json.dumps(_base(transformer), indent=2) + '\n')
+    if card is not None:
+        (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
 

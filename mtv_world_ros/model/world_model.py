@@ -14,7 +14,7 @@ from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.model.card import spec_of
+from mtv_world_ros.model.card import check_same_model, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
     condition,
@@ -76,6 +76,7 @@ class DiffusionWorldModel:
             )
         self.actions, self.robot = checkpoint.actions, robot
         self.device = torch.device(device)
+        self.card = checkpoint.card
         self._serving = serving
         check_memory(checkpoint, serving, self.device, dtype)
         home = torch.device('cpu') if serving.offload else self.device
@@ -83,6 +84,8 @@ class DiffusionWorldModel:
         self._adapters = Adapters(self.transformer, fuse=serving.fuse_lora)
         #: of the checkpoint; None = it has none
         self.own_adapter = checkpoint.adapter
+        if checkpoint.adapter is not None:
+            check_same_model(self.card, checkpoint.adapter)
         self._adapters.use(checkpoint.adapter)
         self._followers = None
         if serving.context_parallel > 1:
@@ -91,7 +94,6 @@ class DiffusionWorldModel:
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self._decoder = decoder_of(self.autoencoder, serving, dtype)
         self.scheduler = checkpoint.scheduler
-        self.card = checkpoint.card
         self.spec = spec_of(checkpoint.card)
         check_video(self.autoencoder, self.transformer.config, self.spec)
         if serving.tiny_encoder:
@@ -129,6 +131,14 @@ class DiffusionWorldModel:
             CheckpointError: it cannot be read or is for another model.
             ConfigError: peft is not installed.
         """
+        if path is not None:
+            if self._serving.weights != 'same':
+                raise ConfigError(
+                    f'weights={self._serving.weights} keeps no weights that an adapter could be '
+                    'added to; start with that adapter in the checkpoint, or with weights=same in '
+                    "'serving'"
+                )
+            check_same_model(self.card, path)
         return self._adapters.read(path)
 
     def use_adapter(self, adapter: Adapter | Path | None) -> None:
@@ -137,16 +147,13 @@ class DiffusionWorldModel:
         Raises:
             CheckpointError: it cannot be read or is for another model; the one before stays.
         """
-        if adapter != self._adapters.current:
-            if self._serving.weights != 'same':
-                raise ConfigError(
-                    f'weights={self._serving.weights} keeps no weights that an adapter could be '
-                    'added to; start with that adapter in the checkpoint, or with weights=same in '
-                    "'serving'"
-                )
-            self._adapters.use(adapter)
-            if self._followers is not None:
-                self._followers.send_weights()
+        if not isinstance(adapter, Adapter):
+            if adapter == self._adapters.current:
+                return
+            adapter = self.read_adapter(adapter)
+        self._adapters.use(adapter)
+        if self._followers is not None:
+            self._followers.send_weights()
 
     def close(self) -> None:
         """Ends the processes that it started, if any; it is not to be used any more."""

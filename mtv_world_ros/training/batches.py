@@ -103,6 +103,7 @@ class BatchSource:
         history: what clips are shown of what came before them.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
+        clip_stride_s: time between the starts of clips [s]; 0 = one from every frame.
     """
 
     def __init__(
@@ -122,10 +123,11 @@ class BatchSource:
         history: HistoryConfig | None = None,
         numbers: Sequence[int] | None = None,
         workers: int = 0,
+        clip_stride_s: float = 0.0,
     ) -> None:
         self._numbers = range(batch_size) if numbers is None else numbers
-        self._starts = [(r, clip_starts(r, spec)) for r in recordings]
-        self._starts = [(r, starts) for r, starts in self._starts if len(starts)]
+        whole = [(r, _spaced(r, clip_starts(r, spec), clip_stride_s)) for r in recordings]
+        self._starts = [(r, starts) for r, starts in whole if len(starts)]
         if not self._starts:
             raise TrainingError(
                 f'none of {len(recordings)} episodes is long enough for a clip of '
@@ -146,6 +148,11 @@ class BatchSource:
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None
         self._ahead: tuple[int, Future[Batch]] | None = None
+
+    @property
+    def starts(self) -> list[tuple[Recording, np.ndarray]]:
+        """The recordings that clips are cut from, with the frames that they start from."""
+        return self._starts
 
     @property
     def num_clips(self) -> int:
@@ -182,7 +189,7 @@ class BatchSource:
             object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
             actions=torch.from_numpy(collate(encoded)) if encoded else None,
             leads=tuple(s.lead for s in samples),
-            **_pasts([s.past for s in samples]),
+            **pasts([s.past for s in samples]),
         )
 
     def _clip(self, step: int, number: int) -> _Sample:
@@ -233,9 +240,9 @@ class BatchSource:
         return pool[rng.integers(len(pool))]
 
 
-def _pasts(pasts: Sequence[Past | None]) -> dict[str, Tensor]:
-    """Fields of a batch."""
-    known = [past for past in pasts if past is not None]
+def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
+    """Returns fields of a batch: what its clips are shown of what came before them."""
+    known = [past for past in given if past is not None]
     if not known:
         return {}
     return {
@@ -243,6 +250,15 @@ def _pasts(pasts: Sequence[Past | None]) -> dict[str, Tensor]:
         'history': torch.from_numpy(np.stack([past.frames for past in known])),
         'history_sigmas': torch.tensor([past.sigma for past in known]),
     }
+
+
+def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
+    """Those of the starts that are at least a stride [s] apart."""
+    kept: list[int] = []
+    for start in starts:
+        if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
+            kept.append(int(start))
+    return np.array(kept, dtype=int)
 
 
 def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
+from mtv_world_ros.training.optimizer_config import LoraSettings, OptimizerConfig
 
 _SIGMA_WEIGHTINGS = ('uniform', 'middle')
 _PROBABILITIES = (
@@ -33,6 +35,7 @@ class VideoConfig:
     Attributes:
         control: how the actions enter, of `action_features.CONTROLS`.
         object_mask: whether the trajectory video carries the objects' masks.
+        clip_stride_s: time between the starts of training clips [s]; 0 = one from every frame.
     """
 
     views: tuple[str, ...] = ('low', 'high')
@@ -43,6 +46,7 @@ class VideoConfig:
     robot: str = 'yam_bimanual'
     control: str = TRAJECTORY_VIDEO
     object_mask: bool = True
+    clip_stride_s: float = 0.0
 
     def __post_init__(self) -> None:
         check_control(self.control)
@@ -171,42 +175,6 @@ class SelfRolloutConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OptimizerConfig:
-    """AdamW with warm-up, a constant stretch and a linear decay to zero.
-
-    Attributes:
-        learning_rate: the highest.
-        weight_decay: AdamW's.
-        warmup_steps: until the rate is the highest.
-        decay_share: of the steps, at the end.
-        max_grad_norm: longer gradients are shortened to it.
-        ema_decay: of the averaged weights, which the checkpoint holds.
-        batch_size: clips of a step, over all processes and accumulated parts.
-        accumulation: parts that a process computes one after the other; more take less memory.
-        gradient_checkpointing: computes blocks again in the backward pass instead of keeping them.
-        steps: of the whole training.
-    """
-
-    learning_rate: float = 6e-4
-    weight_decay: float = 0.01
-    warmup_steps: int = 200
-    decay_share: float = 0.35
-    max_grad_norm: float = 1.0
-    ema_decay: float = 0.999
-    batch_size: int = 4
-    accumulation: int = 1
-    gradient_checkpointing: bool = False
-    steps: int = 5000
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.accumulation <= self.batch_size:
-            raise ConfigError(
-                f'optimizer.accumulation is {self.accumulation}, must be 1 to '
-                f'optimizer.batch_size, {self.batch_size}'
-            )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig:
     """A whole preset.
 
@@ -220,6 +188,7 @@ class TrainingConfig:
         augment: disturbances.
         history: what clips are shown of what came before them; off by default.
         self_rollout: clips that start from the model's own predictions.
+        lora: what is trained in place of all weights.
         optimizer: steps and rates.
     """
 
@@ -232,7 +201,16 @@ class TrainingConfig:
     augment: AugmentConfig = AugmentConfig()
     history: HistoryConfig = HistoryConfig()
     self_rollout: SelfRolloutConfig = SelfRolloutConfig()
+    lora: LoraSettings = LoraSettings()
     optimizer: OptimizerConfig = OptimizerConfig()
+
+    def with_steps(self, num_clips: int) -> TrainingConfig:
+        """Returns the same with the steps that its epochs come to, where it counts in epochs."""
+        optimizer = self.optimizer
+        if optimizer.epochs is None:
+            return self
+        steps = max(1, ceil(optimizer.epochs * num_clips / optimizer.batch_size))
+        return replace(self, optimizer=replace(optimizer, steps=steps))
 
     def as_dict(self) -> dict[str, Any]:
         """The configuration as plain values, for the checkpoint's card."""

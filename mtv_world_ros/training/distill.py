@@ -23,7 +23,7 @@ from mtv_world_ros.model.sampler import denoise, flow_of
 from mtv_world_ros.model.transformer import copy_of
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.training.batches import Batch
-from mtv_world_ros.training.config import TrainingConfig, VideoConfig
+from mtv_world_ros.training.config import LoraSettings, TrainingConfig, VideoConfig
 from mtv_world_ros.training.distill_objective import (
     as_predicted,
     follow,
@@ -242,6 +242,7 @@ def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfi
         ),
         rendering=TrajectoryVideoConfig(**card['rendering']),
         history=replace(config.history, **asdict(history_settings(card))),
+        lora=LoraSettings(),  # all of the student is trained
     )
 
 

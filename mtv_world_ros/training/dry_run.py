@@ -14,11 +14,12 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, 
 
 from mtv_world_ros.model.action_features import EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
 from mtv_world_ros.model.context import NUM_TEXT_TOKENS
+from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import TrainingConfig
 
-#: bytes of a float32 number: master weights, averaged weights, gradients, Adam's two moments
+#: bytes of a float32 number: trained weights, their averages, gradients, Adam's two moments
 _FLOAT = 4
 #: CLIP tokens of an image
 _IMAGE_TOKENS = 257
@@ -34,8 +35,9 @@ class StepCost:
         trainable: of them trained.
         forward_flop: floating-point operations of a forward pass of one batch.
         step_flop: of forward and backward.
-        weight_bytes: weights, in float32 and in the number format of forward and backward.
-        training_bytes: averaged weights, gradients and Adam's moments.
+        weight_bytes: weights in the number format of forward and backward, and in float32 what is
+            trained of them.
+        training_bytes: averaged weights, gradients and Adam's moments of what is trained.
         activation_bytes: what the forward pass keeps for the backward pass.
     """
 
@@ -83,9 +85,14 @@ def step_cost(
         arguments |= {'control': config.video.control, 'action_dim': action_dim}
     # fake tensors have shapes and no numbers; said to be on the CPU, they take the attention that
     # keeps no attention matrix, as a GPU does (on `meta` they would take the one that does)
-    with FakeTensorMode() if fake else nullcontext():
+    with torch.device('meta' if fake else 'cpu'):
         transformer = MultiViewWanTransformer(**arguments)
-        _cast(transformer, dtype)
+    if config.lora.rank:
+        add_adapter(transformer, rank=config.lora.rank, alpha=config.lora.alpha)
+    if config.optimizer.gradient_checkpointing:
+        transformer.enable_gradient_checkpointing()
+    with FakeTensorMode() if fake else nullcontext():
+        _fill(transformer, dtype)
         inputs = _inputs(config, transformer, action_dim, dtype)
         parameters = list(transformer.parameters())
         with FlopCounterMode(display=False, custom_mapping=_attention()) as counter:
@@ -100,7 +107,7 @@ def step_cost(
         trainable=trained,
         forward_flop=forward,
         step_flop=counter.get_total_flops(),
-        weight_bytes=whole * (_FLOAT + dtype.itemsize),
+        weight_bytes=whole * dtype.itemsize + trained * _FLOAT,
         training_bytes=trained * (4 * _FLOAT + dtype.itemsize),
         activation_bytes=sum(sizes.values()),
     )
@@ -116,14 +123,15 @@ def _attention() -> dict[Any, Any]:
     }
 
 
-def _cast(module: nn.Module, dtype: torch.dtype) -> None:
-    """What `Module.to` does, which fake tensors do not let do."""
+def _fill(module: nn.Module, dtype: torch.dtype) -> None:
+    """Puts zeros of a number format in the place of weights, which `meta` ones lack."""
     for part in module.modules():
         for name, parameter in list(part.named_parameters(recurse=False)):
             trained = parameter.requires_grad
-            setattr(part, name, nn.Parameter(parameter.detach().to(dtype), requires_grad=trained))
+            value = torch.zeros(parameter.shape, dtype=dtype)
+            setattr(part, name, nn.Parameter(value, requires_grad=trained))
         for name, buffer in list(part.named_buffers(recurse=False)):
-            setattr(part, name, buffer.to(dtype))
+            setattr(part, name, torch.zeros(buffer.shape, dtype=dtype))
 
 
 @contextmanager

@@ -5,6 +5,7 @@ Shape letters: B batch, V views, C latent channels, F latent frames, h w latent 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -53,14 +54,27 @@ class EncodedBatch:
         clean: (B, V, C, F, h, w) what denoising shall give.
         conditioning: what it is denoised under.
         weights: in the shape of `clean`, at least 1: how much each latent counts.
+        step, numbers: see `Batch`.
     """
 
     clean: Tensor
     conditioning: Conditioning
     weights: Tensor
+    step: int = 0
+    numbers: Sequence[int] = ()
 
-    def __len__(self) -> int:
-        return len(self.clean)
+    def parts(self, count: int) -> Iterator[EncodedBatch]:
+        """Yields its clips in so many batches, as even as can be."""
+        size = len(self.numbers)
+        for index in range(count):
+            chosen = slice(size * index // count, size * (index + 1) // count)
+            yield replace(
+                self,
+                clean=self.clean[chosen],
+                conditioning=self.conditioning.part(chosen),
+                weights=self.weights[chosen],
+                numbers=self.numbers[chosen],
+            )
 
 
 @torch.no_grad()
@@ -69,7 +83,7 @@ def encode_batch(
 ) -> EncodedBatch:
     """Returns a batch of clips in latents, on a device."""
     frames = batch.frames.to(device)
-    clean = encode_chunk(encoders.autoencoder, frames)
+    clean = encode_chunk(encoders.autoencoder, frames).float()
     ids = None if batch.object_ids is None else batch.object_ids.to(device)
     return EncodedBatch(
         clean=clean,

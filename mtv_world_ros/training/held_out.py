@@ -49,17 +49,20 @@ class HeldOut:
         self._judge, self._every = judge, every
 
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
-        """Judges the averaged weights if it is time; the best go to `checkpoint-best/`."""
+        """Judges the averaged weights if it is time; the best go to `checkpoint-best/`.
+
+        Or to `adapter-best/`, where an adapter is trained.
+        """
         if step % self._every and step != trainer.config.optimizer.steps:
             return
         folder = trainer.folder
-        trainer.export(folder / 'checkpoint')
-        judged = self._judge(folder / 'checkpoint', step)
+        trainer.export(trainer.result)
+        judged = self._judge(trainer.result, step)
         log.write(step, dict(judged.numbers))
         best = folder / _BEST
         known = json.loads(best.read_text())['score'] if best.is_file() else -math.inf
         if judged.score > known:
-            trainer.export(folder / 'checkpoint-best')
+            trainer.export(folder / f'{trainer.result.name}-best')
             partial = best.with_name(f'{_BEST}.partial')
             partial.write_text(json.dumps({'step': step, 'score': judged.score}))
             partial.rename(best)

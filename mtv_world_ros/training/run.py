@@ -15,11 +15,15 @@ from mtv_world_ros.data.recording_cache import cached_recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.card import CARD
 from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.training.actions import kept_actions
+from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.cached_batches import CachedSource
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.held_out import HeldOut
+from mtv_world_ros.training.latent_run import cached
 from mtv_world_ros.training.left_out import check_clips, counted, num_dropped
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
@@ -107,8 +111,11 @@ def train(
     held_out: HeldOut | None = None,
     peak_flops: float | None = None,
     data_workers: int = 0,
+    latent_cache: Path | None = None,
 ) -> Path:
-    """Trains, resuming from `out` where it was left, and returns the checkpoint's folder.
+    """Trains, resuming from `out` where it was left, and returns the folder of the result.
+
+    That is a checkpoint, or an adapter for the checkpoint `initial` where the preset trains one.
 
     Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
     clips, and the main one alone writes; `out` and `cache` must be the same for all.
@@ -124,13 +131,15 @@ def train(
         dtype: of forward and backward.
         save_every: steps between saved states.
         num_episodes: use only so many, spread evenly over all.
-        initial: checkpoint whose weights a new run starts from; a resumed one has its own.
+        initial: checkpoint whose weights a new run starts from; a resumed one has its own. What
+            trains an adapter, or has text, takes its other parts too, also when resumed.
         cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
         make_trainer: what trains, with the arguments of `Trainer`.
         held_out: judges checkpoints now and then, and keeps the best.
         peak_flops: operations a second that a process's device can do at best, 0 = measure them;
             the log then has the share that the model's arithmetic makes of them. None = not.
         data_workers: processes that prepare clips; 0 = a thread of this one.
+        latent_cache: keeps what the encoders make of the clips; None = encode in every step.
 
     Raises:
         TrainingError: no usable episode, the loss is not finite, or another process is gone.
@@ -146,22 +155,7 @@ def train(
         actions = kept_actions(
             out, config.video.control, recordings, spec_of(config), robot, initial=initial
         )
-    trained_on: dict[str, object] = {
-        'episodes': len(recordings),
-        'skipped': len(skipped),
-        'tasks': sorted({recording.task for recording in recordings}),
-    }
-    trainer = make_trainer(
-        config,
-        out,
-        seed=seed,
-        device=device,
-        dtype=dtype,
-        trained_on=trained_on,
-        actions=actions,
-        processes=processes,
-    )
-    source = BatchSource(
+    source: BatchSource | CachedSource = BatchSource(
         recordings,
         spec=spec_of(config),
         robot=robot,
@@ -174,16 +168,40 @@ def train(
         actions=actions,
         self_rollout=config.self_rollout,
         history=config.history,
-        numbers=trainer.clips,
         workers=data_workers,
+        numbers=processes.share(config.optimizer.batch_size),
+        clip_stride_s=config.video.clip_stride_s,
     )
-    trained_on['clips'] = source.num_clips
+    base = None
+    if make_trainer is Trainer and needs_base(config):  # another one brings its own
+        base = load_base(config, initial, processes.device, dtype, seed=seed)
+    if latent_cache is not None:
+        with processes.main_first():
+            source = cached(
+                source, latent_cache, config, base, seed=seed, dtype=dtype, processes=processes
+            )
+    trainer = make_trainer(
+        config.with_steps(source.num_clips),
+        out,
+        seed=seed,
+        device=device,
+        dtype=dtype,
+        trained_on={
+            'episodes': len(recordings),
+            'skipped': len(skipped),
+            'tasks': sorted({recording.task for recording in recordings}),
+            'clips': source.num_clips,
+        },
+        actions=actions,
+        processes=processes,
+        base=base,
+    )
     with processes.main_first():
         resumed = trainer.load_state()
-    if initial is not None and not resumed:
+    if initial is not None and base is None and not resumed:
         trainer.start_from(initial)
-    if resumed and processes.is_main and _steps_of(out / 'checkpoint') != trainer.step:
-        trainer.export(out / 'checkpoint')  # killed after the state was saved
+    if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
+        trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
         (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
         tqdm.write(
@@ -203,18 +221,18 @@ def train(
             _loop(trainer, source, save_every, held_out, ideal)
     finally:
         source.close()
-    return out / 'checkpoint'
+    return trainer.result
 
 
-def _steps_of(checkpoint: Path) -> int | None:
-    """Steps that a checkpoint was trained for; None where there is none."""
-    card = checkpoint / 'world_model.json'
+def _steps_of(result: Path) -> int | None:
+    """Steps that a checkpoint or adapter was trained for; None where there is none."""
+    card = result / CARD
     return json.loads(card.read_text())['trained_on']['steps'] if card.is_file() else None
 
 
 def _loop(
     trainer: Trainer,
-    source: BatchSource,
+    source: BatchSource | CachedSource,
     save_every: int,
     held_out: HeldOut | None,
     ideal: float | None,
@@ -230,7 +248,7 @@ def _loop(
         reports = trainer.run(
             source,
             save_every=save_every,
-            on_save=lambda _: trainer.export(folder / 'checkpoint'),
+            on_save=lambda _: trainer.export(trainer.result),
         )
         for report in reports:
             log.add(report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import time
 
 import torch
@@ -43,4 +44,6 @@ def ideal_seconds(
     model's arithmetic.
     """
     dim = 0 if actions is None else actions.dim
+    optimizer = replace(config.optimizer, gradient_checkpointing=False)
+    config = replace(config, optimizer=optimizer)
     return step_cost(config, action_dim=dim, dtype=dtype).step_flop / flops

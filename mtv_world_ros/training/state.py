@@ -79,6 +79,32 @@ def read_card(folder: Path) -> dict[str, Any] | None:
     return json.loads(file.read_text()) if file.is_file() else None
 
 
+def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Checks that a saved state belongs to this run.
+
+    Args:
+        folder: of the training.
+        card: of the state.
+        mine: `seed`, `control` and `base` (a digest, or None) of this run.
+
+    Raises:
+        TrainingError: it does not.
+    """
+    trained = {'control': 'trajectory_video', 'base': None, **card}
+    state = folder / STATE
+    for name in ('seed', 'control'):
+        if trained[name] != mine[name]:
+            raise TrainingError(
+                f"'{state}' was trained with {name} {trained[name]}, this run has {mine[name]}; "
+                f'give --{name} the same, or another --out'
+            )
+    if trained['base'] != mine['base']:
+        raise TrainingError(
+            f"'{state}' was trained on top of other weights than those of --init; give the "
+            'same, or another --out'
+        )
+
+
 def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer) -> None:
     """Puts the saved state's numbers in place.
 

@@ -8,26 +8,30 @@ from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 import time
+from typing import Any
 
 import torch
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.history import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.actions import transformer_arguments
+from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.batches import Batch, BatchSource
+from mtv_world_ros.training.cached_batches import CachedSource
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.training.draws import Draws
-from mtv_world_ros.training.encoding import Encoders
+from mtv_world_ros.training.encoding import EncodedBatch, Encoders
+from mtv_world_ros.training.export import export_adapter, export_checkpoint
 from mtv_world_ros.training.loss import batch_loss
 from mtv_world_ros.training.objective import Loss
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.self_rollout import SelfRollout
-from mtv_world_ros.training.state import load_state, read_card, save_state, STATE
+from mtv_world_ros.training.state import check_card, load_state, read_card, save_state, STATE
 from mtv_world_ros.training.weights import Weights
 
 #: losses averaged for the progress bar and the log
@@ -80,6 +84,7 @@ class Trainer:
         trained_on: what stands in the checkpoint's card.
         actions: how positions become actions, where the preset's control does not draw them.
         processes: that train together; None: those that the launcher started.
+        base: checkpoint that is trained on top of; None: all weights start anew.
 
     Raises:
         TrainingError: fewer clips a step than processes times accumulated parts.
@@ -96,6 +101,7 @@ class Trainer:
         trained_on: dict[str, object],
         actions: ActionEncoding | None = None,
         processes: Processes | None = None,
+        base: Base | None = None,
     ) -> None:
         torch.manual_seed(seed)
         settings = config.optimizer
@@ -103,12 +109,14 @@ class Trainer:
         self.clips = self._clips(settings)
         self.config, self.folder, self.seed = config, Path(folder), seed
         self.device = self.processes.device
-        self.trained_on, self.actions = trained_on, actions
-        autoencoder = build_autoencoder(config.autoencoder)
-        self.autoencoder = place(autoencoder, self.device, torch.float32)
-        self.encoders = Encoders(autoencoder=self.autoencoder, history=config.history)
-        transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
-        check_history(config.history, self.autoencoder, transformer.config)
+        self.trained_on, self.actions, self.base = trained_on, actions, base
+        if base is None:
+            autoencoder = place(build_autoencoder(config.autoencoder), self.device, torch.float32)
+            self.encoders = Encoders(autoencoder=autoencoder, history=config.history)
+            transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
+        else:
+            self.encoders, transformer = base.encoders, base.checkpoint.transformer
+        check_history(config.history, self.encoders.autoencoder, transformer.config)
         if settings.gradient_checkpointing:
             transformer.enable_gradient_checkpointing()
         self.weights = Weights(transformer, self.device, dtype, settings.ema_decay)
@@ -149,7 +157,11 @@ class Trainer:
         self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
 
     def run(
-        self, source: BatchSource, *, save_every: int, on_save: Callable[[int], None]
+        self,
+        source: BatchSource | CachedSource,
+        *,
+        save_every: int,
+        on_save: Callable[[int], None],
     ) -> Iterator[StepReport]:
         """Trains to `config.optimizer.steps`, yielding a report a step.
 
@@ -174,7 +186,7 @@ class Trainer:
             started = time.perf_counter()
             batch = source.batch(self.step)
             waited = time.perf_counter() - started
-            if any(batch.leads):
+            if isinstance(batch, Batch) and any(batch.leads):
                 with self.weights.lent() as transformer:
                     batch = rollout.apply(batch, self.step, transformer)
             report = self.train_step(batch)
@@ -185,13 +197,13 @@ class Trainer:
                 self.save_state()
                 on_save(self.step)
 
-    def loss(self, batch: Batch) -> Loss:
+    def loss(self, batch: Batch | EncodedBatch) -> Loss:
         """The loss of a batch, or of a part of one."""
         draws = Draws(self.seed, batch.step, batch.numbers)
         worker = self.weights.worker
         return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
 
-    def gradients(self, batch: Batch) -> float:
+    def gradients(self, batch: Batch | EncodedBatch) -> float:
         """Leaves the gradients of a step in the float32 weights and returns the step's loss.
 
         Args:
@@ -219,7 +231,7 @@ class Trainer:
         torch._foreach_div_(found, weight)
         return total / weight
 
-    def train_step(self, batch: Batch) -> StepReport:
+    def train_step(self, batch: Batch | EncodedBatch) -> StepReport:
         """Makes a step with this process's part of its clips."""
         loss = self.gradients(batch)
         settings, parameters = self.config.optimizer, self.weights.parameters
@@ -241,48 +253,41 @@ class Trainer:
 
     def save_state(self) -> None:
         """Writes everything a resumed run needs, whole or not at all."""
-        card = {
-            'step': self.step,
+        card = {'step': self.step, 'recent': list(self._recent), **self._identity()}
+        save_state(self.folder, self.weights, self.optimizer, card)
+
+    def _identity(self) -> dict[str, Any]:
+        """What must be the same in a resumed run."""
+        return {
             'seed': self.seed,
             'control': self.config.video.control,
-            'recent': list(self._recent),
+            'base': self.base and self.base.digest,
         }
-        save_state(self.folder, self.weights, self.optimizer, card)
 
     def load_state(self) -> bool:
         """Continues from the saved state; returns whether there was one.
 
         Raises:
-            TrainingError: it is damaged, or of another model, seed or control.
+            TrainingError: it is damaged, or of another model, seed, control or base.
         """
         card = read_card(self.folder)
         if card is None:
             return False
-        folder = self.folder / STATE
-        if card['seed'] != self.seed:
-            raise TrainingError(
-                f"'{folder}' was trained with seed {card['seed']}, this run has {self.seed}; "
-                'give --seed the same, or another --out'
-            )
-        trained, control = card.get('control', 'trajectory_video'), self.config.video.control
-        if trained != control:
-            raise TrainingError(
-                f"'{folder}' was trained with control '{trained}', this run has '{control}'; "
-                'give --control the same, or another --out'
-            )
+        check_card(self.folder, card, self._identity())
         load_state(self.folder, self.weights, self.optimizer)
         self._recent.extend(card.get('recent', []))
         self.step = card['step']
         return True
 
+    @property
+    def result(self) -> Path:
+        """Where the averaged weights go: as a checkpoint, or as an adapter for the base."""
+        return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
+
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
-        """Writes the averaged weights as a checkpoint."""
+        """Writes the averaged weights, see `export.py`."""
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
-        parts = Checkpoint(
-            transformer=self.weights.averaged(),
-            autoencoder=self.autoencoder,
-            scheduler=build_scheduler(self.config.scheduler),
-            card=card,
-            actions=self.actions,
-        )
-        save_checkpoint(parts, folder, dtype=dtype)
+        if self.config.lora.rank:
+            return export_adapter(folder, self.weights, card, self.base)
+        parts = (self.config, self.encoders, self.actions)
+        export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)

@@ -83,6 +83,10 @@ class Weights:
         finally:
             self.share()
 
+    def averages(self) -> dict[str, Tensor]:
+        """Returns the averaged float32 weights by name."""
+        return dict(zip(self.master, self.ema.shadow_params, strict=True))
+
     def averaged(self) -> MultiViewWanTransformer:
         """Returns a float32 transformer with the averaged weights."""
         whole = copy_of(self.worker)

@@ -40,7 +40,8 @@ def _tiny(control: str) -> TrainingConfig:
     )
 
 
-def test_operations_are_those_of_the_products() -> None:
+@pytest.mark.parametrize('rank', [0, 8])
+def test_operations_are_those_of_the_products(rank: int) -> None:
     """Of a patch model: every product of matrices in the published block, counted by hand."""
     config = load_training_config(
         'wan-1.3b',
@@ -49,6 +50,9 @@ def test_operations_are_those_of_the_products() -> None:
             'video.width': 64,
             'video.height': 32,
             'video.num_frames': 8,
+            'optimizer.batch_size': 1,
+            'optimizer.gradient_checkpointing': False,
+            'lora.rank': rank,
         },
     )
     cost = step_cost(config, action_dim=14, dtype=torch.bfloat16)
@@ -65,8 +69,17 @@ def test_operations_are_those_of_the_products() -> None:
     text_embedder = text * (4096 * dim + dim * dim)
     image_embedder = image * (1280 * 1280 + 1280 * dim)
     time = 2 * (256 * dim + dim * dim + dim * 6 * dim)  # of the video and of the history
-    expected = 2 * (block + embedded + text_embedder + image_embedder + time)
+    # an adapter's factors: to `rank` numbers and back, of tokens and of the text
+    factors = tokens * rank * (6 * 2 * dim + 2 * (dim + ffn)) + 2 * text * rank * 2 * dim
+    expected = 2 * (block + embedded + text_embedder + image_embedder + time + factors)
     assert cost.forward_flop == expected
+    if rank:
+        trained = 8 * rank * 2 * dim + 2 * rank * (dim + ffn)
+        trained += dim * (4 * 16 + 1) + dim * (4 * 48 + 1) + 2 * dim  # phi, patches, views
+        assert cost.trainable == trained
+        # bfloat16 weights and gradients; float32 ones, averages and Adam's moments of the trained
+        assert cost.weight_bytes == 2 * cost.parameters + 4 * trained
+        assert cost.training_bytes == (4 * 4 + 2) * trained
 
 
 def test_the_command_prints_it_and_trains_nothing(capsys: pytest.CaptureFixture) -> None:
