@@ -27,6 +27,7 @@ same command again goes on where it was stopped.
 _EPILOG = """\
 A policy is `expert`, followed by faults with their sizes: noise (rad), miss (probability), shift
 and place (m), wrong (probability), late (s), stop (share of the plan), e.g. expert-noise-0.03.
+By default one denoising step.
 """
 
 
