@@ -166,7 +166,6 @@ def main() -> None:
     trainer.step = steps
     reports = trainer.run(source, save_every=10**9, on_save=lambda _: None)
     whole = [next(reports) for _ in range(steps)][_WARM_UP:]
-    reports.close()
     source.close()
     waited = sum(report.waited for report in whole) / sum(report.seconds for report in whole)
     running = statistics.median(report.seconds for report in whole)

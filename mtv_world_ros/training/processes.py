@@ -34,7 +34,8 @@ class Processes:
         self._state = PartialState(cpu=chosen.type == 'cpu')
         self.number: int = self._state.process_index
         self.count: int = self._state.num_processes
-        self.device: torch.device = chosen if self.count == 1 else self._state.device
+        # several processes have a device each; accelerate knows which
+        self.device = chosen if self.count == 1 else torch.device(self._state.device or chosen)
 
     @property
     def is_main(self) -> bool:
