@@ -187,7 +187,8 @@ class Adapters:
     def _fuse(self, factors: Mapping[str, Factors]) -> None:
         """Adds factors into the weights, in place, and takes out what was fused before."""
         for name in self._under.keys() - factors.keys():
-            self._transformer.get_submodule(name).weight.copy_(self._under.pop(name))
+            restored: Any = self._transformer.get_submodule(name)
+            restored.weight.copy_(self._under.pop(name))
         for name, (a, b) in factors.items():
             weight: Any = self._transformer.get_submodule(name).weight
             if name not in self._under:

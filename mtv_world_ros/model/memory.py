@@ -113,9 +113,8 @@ def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: tor
         if serving.tiny_decoder:
             decoder: Any = TinyAutoencoder()
         else:
-            decoder = build_autoencoder(
-                {'_class_name': _class_name(checkpoint), **checkpoint.autoencoder.config}
-            )
+            own: Any = checkpoint.autoencoder.config
+            decoder = build_autoencoder({'_class_name': _class_name(checkpoint), **own})
         frames = decoder.num_latent_frames(spec.num_frames)
         latents = torch.empty(1, views, shape[0], frames, *shape[1:])
         image = torch.empty(1, views, *shape)

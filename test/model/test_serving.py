@@ -7,6 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,7 +85,7 @@ def test_an_option_predicts_the_same(folder: Path, serving: str) -> None:
 def test_offloaded_blocks_come_and_go_one_by_one(folder: Path) -> None:
     from diffusers.hooks.group_offloading import GroupOffloadingHook
 
-    transformer = load(folder, 'offload=true').transformer
+    transformer: Any = load(folder, 'offload=true').transformer
     groups = [
         hook.group
         for block in transformer.blocks
@@ -147,7 +148,7 @@ def test_float8_keeps_three_bits_and_a_scale_of_each_row() -> None:
     linear = nn.Linear(64, 48)
     with torch.no_grad():
         linear.weight[3] *= 1000  # a row of its own must not coarsen the others
-    kept = Float8Linear(linear)
+    kept: Any = Float8Linear(linear)
     assert kept.weight.dtype == torch.float8_e4m3fn
     back = kept.weight.float() * kept.scale
     error = (back - linear.weight).abs()
@@ -163,7 +164,7 @@ def test_float8_halves_the_blocks_and_stays_within_six_percent() -> None:
     linear = sum(m.weight.numel() for m in model.blocks.modules() if isinstance(m, nn.Linear))
     convert(model)
     assert not any(isinstance(m, nn.Linear) for m in model.blocks.modules())
-    kept = [m.weight for m in model.blocks.modules() if isinstance(m, Float8Linear)]
+    kept: Any = [m.weight for m in model.blocks.modules() if isinstance(m, Float8Linear)]
     assert sum(w.numel() * w.element_size() for w in kept) == linear
     error = (model(**values(model)) - plain).square().mean().sqrt() / plain.square().mean().sqrt()
     assert 0 < error < 0.06
@@ -335,7 +336,7 @@ def test_encoders_leave_the_gpu_when_blocks_are_offloaded(folder: Path) -> None:
 @pytest.mark.gpu
 def test_products_in_float8_on_a_gpu_are_those_of_the_cpu() -> None:
     torch.manual_seed(0)
-    kept = Float8Linear(nn.Linear(256, 512)).to('cuda')
+    kept: Any = Float8Linear(nn.Linear(256, 512)).to('cuda')
     kept.bias.data = kept.bias.data.bfloat16()
     x = torch.randn(2, 100, 256, device='cuda', dtype=torch.bfloat16)
     expected = F.linear(x.float(), kept.weight.float() * kept.scale, kept.bias.float())
