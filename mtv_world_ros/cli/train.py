@@ -22,8 +22,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='train a world model on a folder of episodes',
         description='Several processes, GPUs or machines train together when a launcher starts '
         'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
-        'accelerate launch with the same -m. optimizer.batch_size is that of all of them '
-        'together: they see the same clips as one would.',
+        'accelerate launch --multi_gpu with the same -m. optimizer.batch_size is that of all of '
+        'them together: they see the same clips as one would.',
     )
     parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
     parser.add_argument('--out', type=Path, help='resumes what is there')
