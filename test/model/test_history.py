@@ -70,6 +70,23 @@ def test_history_reaches_the_video_only_through_self_attention(kind: str) -> Non
         torch.testing.assert_close(model(**values, **other), deaf, rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize('k', [0, 3])
+def test_control_frame_k_drives_predicted_frame_k_behind_a_history(kind: str, k: int) -> None:
+    """Without attention among tokens, it reaches its own token's frames and no others."""
+    model, values = given(kind)
+    with torch.no_grad():
+        for block in model.blocks:
+            block.attn1.to_out[0].weight.zero_()
+            block.attn1.to_out[0].bias.zero_()
+    behind = {**past(), 'anchor': past(seed=3)['history'][:, :, :, 0]}
+    changed = {**values, 'control': values['control'].clone()}
+    changed['control'][:, :, :, k] += 1.0
+    apart = (model(**changed, **behind) - model(**values, **behind)).abs()
+    reached = (apart.amax(dim=(0, 1, 2, 4, 5)) > 1e-6).nonzero().flatten().tolist()
+    merged = {'conv': 2, 'patch': 1}[kind]  # frames of a token
+    assert reached == [*range(k - k % merged, k - k % merged + merged)]
+
+
 def test_the_historys_noise_level_is_its_own(kind: str) -> None:
     """Block 0 modulates tokens of the history by its level, all others by the video's."""
     model, values = given(kind)

@@ -33,6 +33,7 @@ class FakeWorldModel:
         width=WIDTH,
         height=HEIGHT,
         robot='yam_bimanual',
+        num_history=3,
     )
 
     def predict(
@@ -58,6 +59,11 @@ class FakeWorldModel:
         frames = np.stack([np.roll(start_frame, k + 1, axis=2) for k in range(NUM_FRAMES)], axis=1)
         frames[:, :, 0, 0, 0] = seed % 256
         frames[:, :, 0, 0, 1] = np.arange(NUM_FRAMES)
+        # the history: how many frames, which one of its chunk the last is, what the anchor shows
+        count = history.frames.shape[1]
+        frames[:, :, 0, 1, 0] = count
+        frames[:, :, 0, 1, 1] = history.frames[:, -1:, 0, 0, 1] if count else 255
+        frames[:, :, 0, 2] = history.anchor[:, None, HEIGHT // 2, WIDTH // 2]
         return frames
 
 

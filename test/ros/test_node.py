@@ -238,6 +238,27 @@ def test_imagine_mode_goes_on_without_gap_or_overlap(client):
     assert len({c['observation_stamp_ns'] for c in chunks}) == 3
 
 
+def test_history_and_anchor_go_on_over_requests_until_reset(client):
+    def shown(message):  # what the fake writes into each frame of its history
+        pixels = to_rgb(message)[0]
+        return *pixels[1, :2].tolist(), *pixels[2].tolist()
+
+    client.imagine(True)
+    client.imagine_one(seconds=CHUNK_S)
+    client.imagine_one(scene='none', seconds=2 * CHUNK_S)
+    wait_for_frames(client, 3 * NUM_FRAMES)
+    first, second, third = map(shown, client.received[PREDICTED['low']][::NUM_FRAMES])
+    assert first[:2] == (0, 255)
+    # the last frame starts a chunk; its history ends with the one before, the third of its chunk
+    assert second[:2] == third[:2] == (3, NUM_FRAMES - 2)
+    assert first[2:] == second[2:] == third[2:]
+    assert client.reset().success
+    client.received[PREDICTED['low']].clear()
+    client.imagine_one(seconds=CHUNK_S)
+    wait_for_frames(client, NUM_FRAMES)
+    assert shown(client.received[PREDICTED['low']][0])[:2] == (0, 255)
+
+
 def test_imagine_mode_needs_no_cameras_after_the_first_chunk(client):
     client.imagine(True)
     assert client.imagine_one()['state'] == 'done'
