@@ -67,7 +67,7 @@ class SimulatedWorld:
         matched = match_joints(answer, self._sim.robot, observation.positions)
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
-        times = CONTROL_PERIOD_S * np.arange(1, num + 1)
+        times = np.linspace(CONTROL_PERIOD_S, num * CONTROL_PERIOD_S, num)
         # from where the arms were sent last, as a controller would
         commands = resample(matched, self._target, times)
         rows = [round(k / self._fps / CONTROL_PERIOD_S) - 1 for k in range(1, num_frames + 1)]

@@ -119,7 +119,7 @@ class ScriptedPolicy:
         if elapsed >= self.seconds - 1e-6:
             return None
         num = round(config.chunk_s / config.point_period_s)
-        times = config.point_period_s * np.arange(1, num + 1)
+        times = np.linspace(config.point_period_s, num * config.point_period_s, num)
         return JointTrajectory(
             joint_names=plan.joint_names,
             times=times,

@@ -68,6 +68,7 @@ def test_an_answer_is_cut_with_a_point_at_the_cut():
     whole = _ramp(velocities=np.full((6, 1), 2.0))
     at_a_point = first_part(whole, np.zeros(1), 1.5)
     np.testing.assert_allclose(at_a_point.times, [0.5, 1.0, 1.5])
+    assert at_a_point.velocities is not None
     np.testing.assert_allclose(at_a_point.velocities, 2.0)
     assert first_part(whole, np.zeros(1), 3.0) is whole
     with pytest.raises(ConfigError, match='must be positive'):
