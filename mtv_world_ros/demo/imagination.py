@@ -106,9 +106,9 @@ def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:
         if dead and not (logs.parent / 'episodes.json').is_file():
             said = (logs / f'{dead[0]}.log').read_text(errors='replace').strip().splitlines()
             text = said[-1] if said else 'silently'
-            # it may die in the first episode: then the runner closes the record and ends itself
-            with suppress(subprocess.TimeoutExpired):
-                runner.wait(60.0)
+            if any(logs.parent.glob('.episode_*')):  # the runner notices, and closes the record
+                with suppress(subprocess.TimeoutExpired):
+                    runner.wait(60.0)
             raise EpisodeError(f"'{dead[0]}' ended: {text} (logs are in '{logs}')")
 
 
