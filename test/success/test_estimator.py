@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, NAMES, path, POSES, RED, STACK
 import numpy as np
 import pytest
@@ -5,6 +7,7 @@ import pytest
 from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.resources import share_path
+from mtv_world_ros.success.calibration import Calibration
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 
 
@@ -157,3 +160,49 @@ def test_given_task_takes_the_objects_in_their_order():
 def test_unknown_task_names_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'stack_blocks_two'"):
         SuccessEstimator(load_tasks(share_path('config', 'tasks')), task='stack_block_two')
+
+
+CALIBRATION = Calibration(
+    features=('margin',),
+    means=(1.0,),
+    scales=(2.0,),
+    weights=(0.0,),
+    bias=0.0,
+    segmenter='colour',
+    tasks=('place_block_a2b_left',),
+    num_episodes=40,
+)
+
+
+@pytest.mark.parametrize(
+    ('segmenter', 'task', 'words'),
+    [
+        ('colour', 'place_block_a2b_left', 'calibrated: fitted on 40 episodes of 1 tasks'),
+        ('sam2', 'place_block_a2b_left', "uncalibrated for the segmenter 'sam2'"),
+        ('colour', 'stack_blocks_two', "uncalibrated for the task 'place_block_a2b_left'"),
+    ],
+)
+def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, words):
+    estimator = SuccessEstimator(
+        load_tasks(share_path('config', 'tasks')),
+        calibration=replace(CALIBRATION, tasks=(task,)),
+        segmenter=segmenter,
+    )
+    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
+    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    found = estimator.estimate(shown, LEFT).estimate
+    assert found.reasons[-1].startswith(words)
+    assert 'given the world model' in found.reasons[-1]
+    assert found.is_calibrated == words.startswith('calibrated')
+    # weights of zero say one half, whatever is seen; the stated ones do not
+    assert (found.probability == 0.5) == found.is_calibrated
+
+
+@pytest.mark.parametrize(
+    ('views', 'word'), [(('low',), 'not used by the task'), (('top',), 'top')]
+)
+def test_views_that_a_task_leaves_out_do_not_count(views, word):
+    tasks = [replace(t, views=views) for t in load_tasks(share_path('config', 'tasks'))]
+    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
+    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    assert_abstains(SuccessEstimator(tasks).estimate(shown, LEFT).estimate, word)
