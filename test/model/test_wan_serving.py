@@ -17,6 +17,7 @@ from wan_files import CARD, clip_weights, umt5_weights, vae_model
 from wan_predictions import frames, imported, predict, T, VIEWS
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.history import History
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
 from mtv_world_ros.model.image_encoder import ImageEncoder
@@ -229,3 +230,20 @@ def test_a_checkpoint_without_its_tokenizer_is_refused(folder: Path, tmp_path: P
     (tmp_path / 'text_encoder').mkdir()
     with pytest.raises(CheckpointError, match="has no folder 'tokenizer/'"):
         TextEncoder(tmp_path)
+
+
+def test_five_frames_of_history_are_encoded_anew_as_two_latents(folder: Path) -> None:
+    settings = {'num_frames': 5, 'noise_level': 0.05, 'reference': 'first_frame'}
+    model = load(folder, history=settings)
+    shapes: list[torch.Size] = []
+    model.transformer.register_forward_pre_hook(
+        lambda _, __, given: shapes.append(given['history'].shape), with_kwargs=True
+    )
+    begun = predict(model, [0], steps=1)
+    past = History(anchor=frames(VIEWS), frames=frames(VIEWS, 5, seed=6))
+    later = predict(model, [0], steps=1, history=past)
+    assert begun.shape == later.shape == (1, VIEWS, T, 32, 32, 3)
+    assert set(shapes) == {(1, VIEWS, 16, 2, 4, 4)}
+    assert np.abs(begun.astype(int) - later).max() > 1
+    with pytest.raises(CheckpointError, match='num_frames to one more than a multiple of 4'):
+        load(folder, history={**settings, 'num_frames': 4})
