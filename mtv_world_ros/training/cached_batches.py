@@ -112,8 +112,7 @@ class CachedSource:
         return None if text is None else text.to(self._device).expand(count, -1, -1)
 
     def _weights(self, shares: Tensor, shape: Sequence[int]) -> Tensor:
-        factors = [getattr(self._objective, name) for name in WEIGHTS]
-        weights = 1 + sum(
-            factor * shares[:, index].float() / 255 for index, factor in enumerate(factors)
-        )
+        weights = torch.ones_like(shares[:, 0], dtype=torch.float32)
+        for index, name in enumerate(WEIGHTS):
+            weights += getattr(self._objective, name) * shares[:, index].float() / 255
         return weights.unsqueeze(2).expand(*shape)

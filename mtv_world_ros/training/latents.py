@@ -6,7 +6,7 @@ Shape letters: B batch, V views, C latent channels, F latent frames, h w latent 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 import shutil
 import time
@@ -36,7 +36,7 @@ from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 _VERSION = 1
 #: what pixels weigh more for, in the order of a cache's `shares`
 WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
-_NO_WEIGHTS = dict.fromkeys(WEIGHTS, 0.0)
+_NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +141,7 @@ def read_clip(
         trajectory=drawn,
         object_ids=ids,
         actions=None if actions is None else torch.from_numpy(collate([actions])),
-        **pasts([past]),
+        **pasts([past]),  # type: ignore[arg-type]
     )
 
 
@@ -224,7 +224,7 @@ def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
     """(B, 3, V, F, h, w) uint8: how much of a latent changes, shows an object, or loses one."""
     parts = []
     for name in WEIGHTS:
-        one = ObjectiveConfig(**{**_NO_WEIGHTS, name: 1.0})
+        one = replace(_NO_WEIGHTS, **{name: 1.0})
         weights = pixel_weights(batch.frames, batch.object_ids, one)
         parts.append(pooled_weights(weights, shape)[:, :, 0] - 1)
     return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)
