@@ -97,7 +97,9 @@ def load_calibration(folder: Path) -> Calibration | None:
     try:
         values = json.loads(path.read_text(encoding='utf-8'))
         _check_keys(values)
-        read = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        read: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+        }
         found = Calibration(**read)
         _check_numbers(found)
     except (OSError, ValueError, TypeError) as error:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 import json
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 from mtv_world_ros.errors import CheckpointError
 
@@ -77,9 +78,10 @@ def load_horizon(folder: Path) -> HorizonCurve | None:
         return None
     try:
         values = json.loads(path.read_text(encoding='utf-8'))
-        found = HorizonCurve(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        )
+        read: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+        }
+        found = HorizonCurve(**read)
         if not found.period_s > 0 or len(found.values) != len(found.lower):
             raise ValueError('the period is not positive, or the curves differ in length')
     except (OSError, ValueError, TypeError) as error:
