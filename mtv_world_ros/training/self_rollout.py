@@ -15,10 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mtv_world_ros.data.clips import chunk_of
 from mtv_world_ros.data_types import ByteArray
@@ -112,7 +112,7 @@ class SelfRollout:
             **self._shown(pasts),
         )
 
-    def _shown(self, pasts: Sequence[History]) -> dict[str, Tensor]:
+    def _shown(self, pasts: Sequence[History]) -> dict[str, Any]:
         """The fields of a batch that show the past, at serving's noise level."""
         settings = self._encoders.history
         if not settings.on:
