@@ -39,7 +39,8 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
     probability = np.array([item.probability for item in judged])
     real = np.array([item.outcome == 'success' for item in judged], bool)
     called = probability > 0.5
-    rates = [_mean(called[real]), _mean(~called[~real])]
+    hit, avoided = _mean(called[real]), _mean(~called[~real])
+    balanced = None if hit is None or avoided is None else (hit + avoided) / 2
     return {
         'num_outcomes_known': len(known),
         'num_abstained': len(known) - len(judged),
@@ -47,7 +48,7 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
         'real_success_rate': _mean(np.array([item.outcome == 'success' for item in known])),
         'estimated_success_rate': _mean(probability),
         'accuracy': _mean(called == real),
-        'balanced_accuracy': None if None in rates else sum(map(float, rates)) / 2,
+        'balanced_accuracy': balanced,
         'brier': _mean((probability - real) ** 2),
         'ece': expected_calibration_error(probability, real) if len(judged) else None,
         'auroc': area_under_roc(probability, real),
