@@ -1,14 +1,12 @@
-"""Frozen data passed between stages: V views, T frames, J joints, A arms, O objects, H W pixels.
+"""Frozen data passed between stages; arrays are checked and read-only, units SI, images RGB.
 
-Arrays are copied to the stated dtype only where needed, checked on construction and set
-read-only. `T_a_b` maps b-coordinates into a: `p_a = T_a_b @ p_b`. Units are SI, images are RGB.
+V views, T frames, J joints, A arms, O objects, H W pixels; `p_a = T_a_b @ p_b`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import nan
 from types import MappingProxyType
 from typing import Any
 
@@ -264,7 +262,7 @@ class SuccessEstimate:
     features: Mapping[str, float] = field(default_factory=dict)
     is_calibrated: bool = False
     num_seeds: int = 1
-    spread: float = nan
+    spread: float = np.nan
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'reasons', tuple(self.reasons))

@@ -49,7 +49,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, help='use only so many')
     parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
     add_seeds(parser)
-    parser.add_argument('--l2', type=float, default=1.0, help='penalty on the weights')
+    parser.add_argument('--l2', type=float, default=1.0, help='pull towards the stated weights')
     parser.add_argument(
         '--no-store',
         dest='store',

@@ -14,8 +14,8 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.logistic import fit_logistic
 from mtv_world_ros.evaluation.outcomes import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.success.calibration import Calibration
-from mtv_world_ros.success.estimator import capped
+from mtv_world_ros.success.calibration import Calibration, weighed
+from mtv_world_ros.success.estimator import capped, EstimatorConfig
 from mtv_world_ros.success.evidence import FEATURES
 
 #: fewer episodes of known outcome than this say nothing
@@ -148,7 +148,10 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
         spread = np.sqrt((np.where(known, rows - means, 0.0) ** 2).sum(0) / counts)
     scales = np.where(spread > 1e-6, spread, 1.0)
     standard = np.where(known, (rows - means) / scales, 0.0)
-    logistic = fit_logistic(standard, labels, l2=l2)
+    # imagination rarely shows what failed, as an object left behind: there, what was stated holds
+    stated = EstimatorConfig().weights
+    prior = scales * [stated.get(name, 0.0) for name in FEATURES]
+    logistic = fit_logistic(standard, labels, l2=l2, prior=prior)
     return {
         'features': FEATURES,
         'means': tuple(means.tolist()),
@@ -166,7 +169,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
 def _design(samples: Sequence[Sample]) -> tuple[FloatArray, BoolArray]:
     """(N, F) features, NaN where one says nothing, and (N,) outcomes; abstentions are left out."""
     pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
-    rows = [[features.get(name, nan) for name in FEATURES] for features, _ in pairs]
+    rows = [[weighed(features, name) for name in FEATURES] for features, _ in pairs]
     return np.array(rows, np.float64), np.array([success for _, success in pairs], np.bool_)
 
 

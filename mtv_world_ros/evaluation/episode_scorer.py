@@ -59,8 +59,7 @@ class Job:
         name: of its results, unique in the evaluation.
         donor: the episode that lends its actions, if there is one.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
-        objects: names of its objects; empty = the pipeline's, the recorded ones, or those that
-            the instruction names, in this order.
+        objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
     """
 
     path: Path
@@ -236,9 +235,8 @@ class EpisodeScorer:
                 num_inference_steps=self.config.num_inference_steps,
                 num_seeds=num_seeds,
             )
-        masks = sum(
-            chunk.seconds.get(s, 0.0) for chunk in chunks for s in ('start masks', 'masks')
-        )
+        stages = ('start masks', 'masks')
+        masks = sum(chunk.seconds.get(stage, 0.0) for chunk in chunks for stage in stages)
         found.seconds['imagining'] -= masks
         found.seconds['segmenting'] += masks
         return chunks
@@ -284,8 +282,8 @@ class EpisodeScorer:
         measure = self.instruments.quality
         if measure is None:
             return {}
-        views = self.pipeline.spec.views
-        return {view: measure(frames[v], real[v]) for v, view in enumerate(views)}
+        each = enumerate(self.pipeline.spec.views)
+        return {view: measure(frames[v], real[v]) for v, view in each}
 
 
 def _mean_quality(
@@ -293,11 +291,10 @@ def _mean_quality(
 ) -> dict[str, dict[str, float]]:
     """Means over the stretches of an episode by view; frames weigh equally."""
     total = sum(count for count, _ in stretches)
-    _, first = stretches[0]
     return {
         view: {
             name: sum(count * found[view][name] for count, found in stretches) / total
             for name in names
         }
-        for view, names in first.items()
+        for view, names in stretches[0][1].items()
     }

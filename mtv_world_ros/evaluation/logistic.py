@@ -28,14 +28,20 @@ class Logistic:
 
 
 def fit_logistic(
-    features: FloatArray, labels: BoolArray, *, l2: float = 1.0, num_steps: int = 100
+    features: FloatArray,
+    labels: BoolArray,
+    *,
+    l2: float = 1.0,
+    prior: FloatArray | None = None,
+    num_steps: int = 100,
 ) -> Logistic:
-    """Minimises -log likelihood + l2 / 2 * |weights|^2 (scikit-learn's with C = 1 / l2).
+    """Minimises -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
 
     Args:
         features: (N, F).
         labels: (N,).
         l2: strength of the penalty; positive, so that there is one minimum.
+        prior: (F,) weights that hold where the rows say nothing; None = zero.
         num_steps: of Newton's method at most.
 
     Raises:
@@ -49,10 +55,13 @@ def fit_logistic(
     design = np.concatenate([features, np.ones((len(features), 1))], axis=1)
     penalty = np.full(design.shape[1], l2)
     penalty[-1] = 1e-9  # keeps the bias finite where all labels are equal
-    theta = np.zeros(design.shape[1])
+    centre = np.zeros(design.shape[1])
+    if prior is not None:
+        centre[:-1] = prior
+    theta = centre.copy()
     for _ in range(num_steps):
         said = _sigmoid(design @ theta)
-        gradient = design.T @ (said - labels) + penalty * theta
+        gradient = design.T @ (said - labels) + penalty * (theta - centre)
         curvature = (design * (said * (1 - said))[:, None]).T @ design + np.diag(penalty)
         step = np.linalg.solve(curvature, gradient)
         # far from the minimum a whole step may overshoot

@@ -48,15 +48,16 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
 
 def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
     """Message of a trajectory whose times count from the header's stamp; inverse of the above."""
-    message = JointTrajectoryMsg(header=header, joint_names=list(trajectory.joint_names))
+    points = []
     for row, seconds in enumerate(trajectory.times):
         point = JointTrajectoryPoint(positions=array('d', trajectory.positions[row].tolist()))
         if trajectory.velocities is not None:
             point.velocities = array('d', trajectory.velocities[row].tolist())
         after = point.time_from_start
         after.sec, after.nanosec = divmod(round(float(seconds) * NANO), NANO)
-        message.points.append(point)
-    return message
+        points.append(point)
+    names = list(trajectory.joint_names)
+    return JointTrajectoryMsg(header=header, joint_names=names, points=points)
 
 
 def _rows(message: JointTrajectoryMsg, field: str) -> FloatArray:

@@ -90,7 +90,6 @@ class LiveFidelity:
         self._publisher = create_publisher(node, Float32MultiArray, '~/fidelity', 10)
         self._done = node.create_guard_condition(self._publish)
         self._thread = Thread(target=self._run, name='fidelity')
-        self._thread.start()
 
     def replan(self, request: Request) -> Request:
         """Returns the request; what was imagined for later than its start is not executed."""
@@ -107,6 +106,9 @@ class LiveFidelity:
                 self._num_missed += len(self._expected) == MAX_CHUNKS
                 self._expected.append(Expected(result))
                 self._changed.notify_all()
+            # not before: a node that fails at its start would wait for the thread
+            if self._thread.ident is None:
+                self._thread.start()
 
     def see(self, view: str, message: Image | CompressedImage) -> None:
         """Takes a real image; it is looked at in the thread."""
@@ -127,7 +129,8 @@ class LiveFidelity:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
 
     def values(self) -> dict[str, object]:
         """What `/diagnostics` shows: chunks compared and not, mean J of those that are kept."""

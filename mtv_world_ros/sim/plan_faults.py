@@ -30,7 +30,7 @@ def with_faults(
         if tool.gripper_joint is not None
     ]
     positions = _late(np.array(plan.positions), grippers, round(variant.late / period))
-    times = period * np.arange(len(positions))
+    times = np.arange(len(positions), dtype=np.float64) * period
     if variant.noise:
         error = _slow_noise(times, len(robot.joint_names), variant.noise, rng)
         error[:, grippers] = 0.0

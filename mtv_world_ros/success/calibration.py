@@ -12,6 +12,15 @@ from typing import Any
 from mtv_world_ros.errors import CheckpointError, nearest
 
 CALIBRATION = 'success_calibration.json'
+#: features that only speak against success: how what moved was grasped and carried. An object
+#: that stays where it was is grasped by nobody and still not a success.
+DOUBTS = frozenset({'grasp', 'carry'})
+
+
+def weighed(features: Mapping[str, float], name: str) -> float:
+    """Returns a feature as it is weighed: of doubts only negative values; NaN = says nothing."""
+    value = features.get(name, nan)
+    return min(value, 0.0) if name in DOUBTS else value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +37,7 @@ class Calibration:
         tasks: that it was fitted on.
         num_episodes: that it was fitted on.
         num_seeds: rollouts of each.
-        l2: strength of the penalty on the weights.
+        l2: strength of the pull towards the stated weights (`EstimatorConfig`).
         scores: before and after, the latter on tasks that were left out of the fit.
         made: command, date, machine.
     """
@@ -52,7 +61,7 @@ class Calibration:
         for name, mean, scale, weight in zip(
             self.features, self.means, self.scales, self.weights, strict=True
         ):
-            value = features.get(name, nan)
+            value = weighed(features, name)
             logit += weight * (value - mean) / scale if isfinite(value) else 0.0
         return 1.0 / (1.0 + exp(-max(min(logit, 50.0), -50.0)))
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.success.calibration import Calibration
+from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, view_mean
 from mtv_world_ros.success.footage import Footage
-from mtv_world_ros.success.relations import CannotTell, Margin
 from mtv_world_ros.success.rollout_memory import remember, RolloutMemory
+from mtv_world_ros.success.situation import CannotTell, Margin
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.success.views import EvidenceConfig, Views
 
@@ -24,8 +24,9 @@ __all__ = ['EstimatorConfig', 'Judged', 'SuccessEstimator', 'load_tasks']
 
 #: a gripper at least this open has let go
 OPEN_GRIPPER = 0.8
-#: probability of a task that asks for open grippers while one is closed, at most
-CLOSED_PROBABILITY = 0.1
+#: probability at most, of a task that cannot be done yet: it asks for open grippers while one is
+#: closed, or something that has to move has not
+UNDONE_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,30 +34,28 @@ class EstimatorConfig:
     """The logistic's weights, which are stated, not calibrated, and when to abstain.
 
     Attributes:
-        weights: logit per unit of a feature; see `evidence.FEATURES`.
-        doubts: the same for features of which only negative values count.
+        weights: logit per unit of a feature; see `evidence.FEATURES` and `calibration.weighed`.
         evidence: when masks are not enough.
     """
 
     weights: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType({'margin': 1.5, 'goal': 1.0})
-    )
-    doubts: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType({'grasp': 8.0, 'carry': 0.5})
+        default_factory=lambda: MappingProxyType(
+            {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5}
+        )
     )
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
 
     def probability(self, features: Mapping[str, float]) -> float:
         """Returns the logistic of the features; those that are NaN do not count."""
-        terms = [weight * features.get(name, nan) for name, weight in self.weights.items()]
-        terms += [w * min(features.get(name, nan), 0.0) for name, w in self.doubts.items()]
+        terms = [weight * weighed(features, name) for name, weight in self.weights.items()]
         return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
 
 
 def capped(probability: float, features: Mapping[str, float]) -> float:
-    """Returns the probability, small where `released` says that a gripper is still closed."""
+    """Returns the probability, small where a gripper is still closed or nothing has moved."""
     closed = features.get('released', nan) == 0.0
-    return min(probability, CLOSED_PROBABILITY) if closed else probability
+    left = features.get('moved', nan) == 0.0 and features.get('margin', nan) < 0
+    return min(probability, UNDONE_PROBABILITY) if closed or left else probability
 
 
 class Judged(NamedTuple):

@@ -11,8 +11,9 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.success.jaccard import mean_of_known
 from mtv_world_ros.success.localise import block_size, Location
-from mtv_world_ros.success.relations import CannotTell, Inside, Margin, Within
+from mtv_world_ros.success.relations import Inside, Within
 from mtv_world_ros.success.rollout_memory import Grasp
+from mtv_world_ros.success.situation import CannotTell, Margin
 from mtv_world_ros.success.swings import count_reversals
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
@@ -37,7 +38,8 @@ class Evidence:
 
     Attributes:
         worst: the condition nearest to failing, or furthest from holding.
-        features: by `FEATURES`, larger = likelier; NaN = says nothing about this task.
+        features: by `FEATURES`, larger = likelier; NaN = says nothing about this task. And
+            `moved`, 0 where an object that has to move is where it was.
         sigma: standard error of the worst margin, in units of its softness.
         goal_jaccard: object -> (V,) J with its goal mask.
         notes: assumptions made on the way.
@@ -131,6 +133,7 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
         'contained': _contained(placed, task),
         'grasp': grasp,
         'carry': carry,
+        'moved': _moved(placed, task),
     }
     sigma = float(np.hypot.reduce(sorted(placed.sigmas.values())[-2:])) if placed.sigmas else 0.0
     return Evidence(
@@ -202,6 +205,17 @@ def _grasps(placed: Placed, task: TaskSpec) -> tuple[float, float]:
             text = 'is imagined to move, but no gripper closed where it could hold it'
             placed.notes[f"'{placed.bound[role]}' {text}"] = None
     return max(min(near), -MAX_MARGIN), max(min(along), -MAX_MARGIN)
+
+
+def _moved(placed: Placed, task: TaskSpec) -> float:
+    """0 where something that the task moves is known to be where it was, else 1."""
+    for role in task.movers:
+        trail = placed.views.memory.points[placed.item(role)]
+        known = np.isfinite(trail).all(1)
+        if known.sum() > 2 and known[0] and not _has_moved(placed, role):
+            placed.notes[f"'{placed.bound[role]}' has not moved"] = None
+            return 0.0
+    return 1.0
 
 
 def _nearest_grasp(placed: Placed, role: str, *, is_rim: bool) -> tuple[float, float]:

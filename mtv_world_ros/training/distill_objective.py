@@ -50,7 +50,7 @@ def path_sigmas(scheduler: Scheduler, num_steps: int, substeps: int) -> Tensor:
     """
     euler = straight_scheduler(scheduler)
     set_timesteps(euler, num_steps * substeps, torch.device('cpu'))
-    return euler.sigmas
+    return torch.as_tensor(euler.sigmas)
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from mtv_world_ros.evaluation.outcomes import (
     Judgement,
 )
 from mtv_world_ros.success.calibration import CALIBRATION, load_calibration, save_calibration
+from mtv_world_ros.success.estimator import capped
 from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon, save_horizon
 
 
@@ -208,6 +209,34 @@ def test_closed_gripper_is_small_whatever_was_fitted():
     held = replace(samples[0], features=({**samples[0].features[0], 'grasp': 3, 'released': 0.0},))
     found = calibrate([held, *samples[1:]], segmenter='colour')
     assert found.judgements[AFTER][0].probability <= 0.1
+
+
+def test_what_was_left_where_it_was_is_no_success_whatever_was_fitted():
+    samples = made_samples()
+    features = {**samples[0].features[0], 'grasp': 1.0, 'margin': -3.0, 'moved': 0.0}
+    found = calibrate(
+        [replace(samples[0], features=(features,)), *samples[1:]], segmenter='colour'
+    )
+    assert found.judgements[AFTER][0].probability <= 0.1
+    # where the relation holds without a move there is nothing to object
+    assert capped(0.9, {**features, 'margin': 0.5}) == 0.9
+
+
+def test_a_good_grasp_speaks_for_nothing():
+    calibration = calibrate(made_samples(), segmenter='colour').calibration
+    grasped = {'margin': 0.0, 'grasp': 1.0}
+    assert calibration.probability(grasped) == calibration.probability({**grasped, 'grasp': 0.0})
+    assert calibration.probability({**grasped, 'grasp': -1.0}) < calibration.probability(grasped)
+
+
+def test_weights_stay_as_stated_where_the_episodes_say_nothing():
+    rng = np.random.default_rng(0)
+    rows = np.stack([rng.normal(size=50), np.zeros(50)], axis=1)
+    prior = np.array([0.3, 2.0])
+    found = fit_logistic(rows, rows[:, 0] > 0, l2=1.0, prior=prior)
+    assert found.weights[1] == pytest.approx(2.0) and found.weights[0] > 1
+    strong = fit_logistic(rows, rows[:, 0] > 0, l2=1e6, prior=prior)
+    assert strong.weights == pytest.approx(prior, abs=1e-3)
 
 
 def test_calibration_is_read_back_as_it_was_stored(tmp_path):

@@ -110,13 +110,13 @@ def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path: Path) -> None:
     trained(tmp_path / 'adapter')
     model = torch.nn.Module.to(build(), torch.bfloat16)
     name = 'blocks.1.attn1.to_k'
-    before = model.get_submodule(name).weight.detach().float()
+    before = model.get_parameter(f'{name}.weight').detach().float()
     Adapters(model, fuse=True).use(tmp_path / 'adapter')
     stored = load_file(tmp_path / 'adapter' / ADAPTER)
     a, b = (stored[f'{name}.lora_{side}.weight'] for side in 'AB')
     expected = before + 8.0 / RANK * (b @ a)
     torch.testing.assert_close(
-        model.get_submodule(name).weight.detach(), expected.bfloat16(), rtol=0, atol=0
+        model.get_parameter(f'{name}.weight').detach(), expected.bfloat16(), rtol=0, atol=0
     )
 
 

@@ -45,6 +45,14 @@ def test_block_elsewhere_is_a_failure(end):
     assert estimate(end, LEFT).probability < 0.2
 
 
+def test_block_that_stays_has_not_moved_and_is_capped():
+    found = judge(footage(masks([RED] * 9, [BLUE] * 9), masks([RED], [BLUE])))
+    assert found.features['moved'] == 0.0 and found.probability <= 0.1
+    assert any('has not moved' in reason for reason in found.reasons)
+    there = estimate((BLUE[0] - 0.13, BLUE[1], 0.025), LEFT)
+    assert there.features['moved'] == 1.0
+
+
 def test_stacked_block_is_a_success_although_it_hides_the_lower_one():
     found = estimate((BLUE[0], BLUE[1], 0.065), STACK)
     assert found.probability > 0.7

@@ -52,7 +52,7 @@ class Student(nn.Module):
     def __init__(self, prediction: str, num_steps: int) -> None:
         super().__init__()
         self.prediction = prediction
-        self.register_buffer('levels', path_sigmas(build_scheduler(EULER), num_steps, 1)[:-1])
+        self.levels = path_sigmas(build_scheduler(EULER), num_steps, 1)[:-1]
         self.gain = nn.Parameter(torch.zeros(num_steps))
         self.offset = nn.Parameter(torch.zeros(num_steps))
 
