@@ -11,6 +11,7 @@ The simulator's episodes have the same policy, length and frame rate.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 import tempfile
 from threading import Event, Thread
@@ -149,11 +150,14 @@ def _check(bag: Path, num_chunks: int, spec: WorldModelSpec) -> dict[str, Any]:
 
 
 def _soundness(results: Any, checked: Any, num_chunks: int) -> str:
-    ends = sorted({str(result['how']) for result in results})
+    ends = Counter(
+        ': '.join(filter(None, (str(result['how']), str(result.get('text', '')))))
+        for result in results
+    )
     wanted = len(results) * num_chunks
     total = {key: sum(c[key] for c in checked) for key in ('frames', 'missing', 'off', 'doubled')}
     rows = [
-        ('episodes, how they ended', f'{len(results)}, {", ".join(ends)}'),
+        ('episodes, how they ended', '; '.join(f'{count} {how}' for how, count in ends.items())),
         ('chunks done of those wanted', f'{sum(len(c["loops"]) for c in checked)} of {wanted}'),
         ('messages recorded over the predicted streams', str(total['frames'])),
         ('stamps missing / not on the clock / twice',

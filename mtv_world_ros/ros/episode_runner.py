@@ -136,15 +136,18 @@ class EpisodeRunner(Node):
             },
         )
         self._call_trigger(f'{options.world_model}/reset')
+        # ahead of the images: nothing orders the topics, and an answer needs both
+        self._show(start, only='camera_info')
         self._ended = None
         self._awaited = self._call_trigger(f'{options.policy_node}/start').split()[-1]
         self._show(start)
         return self._wait_for_end()
 
-    def _show(self, start: EpisodeStart) -> None:
-        """Publishes the start once, as cameras and joints would."""
+    def _show(self, start: EpisodeStart, only: str = '') -> None:
+        """Publishes the start once, as cameras and joints would; `only` = the end of topics."""
         for topic, message in start.stamped(self.get_clock().now().nanoseconds):
-            self._outputs[topic].publish(message)
+            if topic.endswith(only):
+                self._outputs[topic].publish(message)
 
     def _wait_for_end(self) -> dict[str, str]:
         options = self._options
