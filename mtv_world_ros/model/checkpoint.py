@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import json
 from pathlib import Path
 import shutil
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -62,7 +62,7 @@ def save_checkpoint(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     check_card(checkpoint.card, partial)
-    stored: Any = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
+    stored = cast(Any, place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype))
     stored.save_pretrained(partial / 'transformer', safe_serialization=True)
     checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
     checkpoint.scheduler.save_pretrained(partial / 'scheduler')
