@@ -62,9 +62,11 @@ def save_checkpoint(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     check_card(checkpoint.card, partial)
-    stored = cast(Any, place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype))
+    stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
     stored.save_pretrained(partial / 'transformer', safe_serialization=True)
-    checkpoint.autoencoder.save_pretrained(partial / 'autoencoder', safe_serialization=True)
+    cast(Any, checkpoint.autoencoder).save_pretrained(
+        partial / 'autoencoder', safe_serialization=True
+    )
     checkpoint.scheduler.save_pretrained(partial / 'scheduler')
     if checkpoint.actions is not None:
         checkpoint.actions.save(partial)
