@@ -95,8 +95,8 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
     for name in ('seed', 'control'):
         if trained[name] != mine[name]:
             raise TrainingError(
-                f"'{state}' was trained with {name} '{trained[name]}', this run has "
-                f"'{mine[name]}'; "
+                f"'{state}' was trained with {name} {trained[name]!r}, this run has "
+                f'{mine[name]!r}; '
                 f'give --{name} the same, or another --out'
             )
     if trained['base'] != mine['base']:
