@@ -13,7 +13,7 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
-from mtv_world_ros.success.evidence import clipped, Evidence, gather, view_mean
+from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.footage import Footage
 from mtv_world_ros.success.rollout_memory import remember, RolloutMemory
 from mtv_world_ros.success.situation import CannotTell, Margin
@@ -54,7 +54,8 @@ class EstimatorConfig:
 def capped(probability: float, features: Mapping[str, float]) -> float:
     """Returns the probability, small where a gripper is still closed or nothing has moved."""
     closed = features.get('released', nan) == 0.0
-    left = features.get('moved', nan) == 0.0 and features.get('margin', nan) < 0
+    # a rollout may begin where the task is all but done: then the margin is small
+    left = features.get('moved', nan) == 0.0 and features.get('margin', nan) <= -MAX_MARGIN
     return min(probability, UNDONE_PROBABILITY) if closed or left else probability
 
 

@@ -220,6 +220,8 @@ def test_what_was_left_where_it_was_is_no_success_whatever_was_fitted():
     assert found.judgements[AFTER][0].probability <= 0.1
     # where the relation holds without a move there is nothing to object
     assert capped(0.9, {**features, 'margin': 0.5}) == 0.9
+    # nor where a rollout begins at the goal and the place is known to some millimetres
+    assert capped(0.9, {**features, 'margin': -0.6}) == 0.9
 
 
 def test_a_good_grasp_speaks_for_nothing():
