@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from functools import partial
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from mtv_world_ros.cli.options import (
     add_seeds,
     add_segmenter,
     add_serving,
+    threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
 
@@ -107,8 +107,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
         calibrated=False,
     )
     pipeline = load(num_threads=arguments.threads)
-    cores = len(os.sched_getaffinity(0))
-    threads = arguments.threads or max(cores // max(arguments.workers, 1), 1)
+    threads = threads_of_workers(arguments)
     return [
         evaluate(
             pipeline,

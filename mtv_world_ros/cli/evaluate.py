@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-import os
 from pathlib import Path
 import re
 from typing import NamedTuple, TYPE_CHECKING
@@ -15,6 +14,7 @@ from mtv_world_ros.cli.options import (
     add_seeds,
     add_segmenter,
     add_serving,
+    threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
 from mtv_world_ros.errors import ConfigError
@@ -193,7 +193,7 @@ def _score(
         serving=arguments.serving,
     )
     pipeline = load(num_threads=arguments.threads)
-    threads = arguments.threads or max(_usable_cores() // max(arguments.workers, 1), 1)
+    threads = threads_of_workers(arguments)
     return evaluate(
         pipeline,
         selection.paths,
@@ -222,7 +222,3 @@ def _score(
         fid_weights=arguments.fid_weights,
         fvd_weights=arguments.fvd_weights,
     )
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0))

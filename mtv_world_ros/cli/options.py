@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -71,6 +72,12 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
 def add_dtype(parser: argparse.ArgumentParser) -> None:
     """Adds `--dtype`."""
     parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
+
+
+def threads_of_workers(arguments: argparse.Namespace) -> int:
+    """Returns the CPU threads of each of `--workers` processes: as asked, else its share."""
+    cores = len(os.sched_getaffinity(0))
+    return arguments.threads or max(cores // max(arguments.workers, 1), 1)
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:

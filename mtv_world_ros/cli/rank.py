@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ from mtv_world_ros.cli.options import (
     add_dtype,
     add_model_options,
     add_segmenter,
+    threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
 
@@ -77,14 +77,13 @@ def _rank(arguments: argparse.Namespace) -> int:
 
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
-    cores = len(os.sched_getaffinity(0))
     make_pipeline = partial(
         load_pipeline,
         arguments.checkpoint,
         robot=arguments.robot,
         device=arguments.device,
         dtype=arguments.dtype,
-        num_threads=arguments.threads or max(cores // max(arguments.workers, 1), 1),
+        num_threads=threads_of_workers(arguments),
         segmenter=arguments.segmenter,
     )
     settings = _settings(arguments)

@@ -47,29 +47,28 @@ class Tally:
             self._seconds.setdefault(name, deque(maxlen=_WINDOW)).append(value)
 
     def level(self, now_s: float, num_policies: int = 1) -> tuple[bytes, str]:
-        """How bad it is, and why.
+        """How bad it is, and everything that is wrong.
 
         Args:
             now_s: now [s].
             num_policies: publishers of trajectories.
         """
+        level, texts = DiagnosticStatus.WARN, []
         if self._last is not None and now_s - self._last[0] < _WARN_S:
             _, reason, text = self._last
-            level = DiagnosticStatus.ERROR if reason in _ERRORS else DiagnosticStatus.WARN
-            return level, f'{reason}: {text}'
+            level = DiagnosticStatus.ERROR if reason in _ERRORS else level
+            texts.append(f'{reason}: {text}')
         if num_policies > 1:
-            text = (
+            texts.append(
                 f'{num_policies} publishers of joint trajectories: each pre-empts the rollouts of '
                 'the others; stop all but one'
             )
-            return DiagnosticStatus.WARN, text
         if self._fruitless >= _STARVED:
-            text = (
+            texts.append(
                 f'the last {self._fruitless} rollouts were pre-empted before their first chunk: '
                 'trajectories arrive faster than the model predicts'
             )
-            return DiagnosticStatus.WARN, text
-        return DiagnosticStatus.OK, 'ready'
+        return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, 'ready')
 
     def values(self, now_s: float) -> dict[str, object]:
         """Keys and values: counts, `rejected.<reason>`, the last rejection, latencies."""

@@ -34,6 +34,21 @@ def end_with_parent() -> None:
         sys.exit(1)
 
 
+class _Interrupt:
+    """What Python does on SIGINT, beside rclpy's own handler, which shuts ROS down.
+
+    It raises only while a node is made: that can take long, and asks nobody whether ROS is still
+    up. Afterwards the executor ends by itself, and an exception between any two lines of it
+    would leave objects half made, whose ends print tracebacks.
+    """
+
+    raises = True
+
+    def __call__(self, *_: object) -> None:
+        if self.raises:
+            raise KeyboardInterrupt
+
+
 def spin_forever(node: Node) -> None:
     """Handles callbacks one after the other until ROS shuts down."""
     executor = SingleThreadedExecutor()
@@ -60,10 +75,13 @@ def run(
         The exit status: 1 after a user error, whose text goes to stderr, else 0.
     """
     end_with_parent()
+    interrupt = _Interrupt()
+    signal.signal(signal.SIGINT, interrupt)
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
     try:
         node = make()
+        interrupt.raises = False
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

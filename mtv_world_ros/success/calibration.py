@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-import json
+from dataclasses import dataclass, field
 from math import exp, isfinite, nan
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.success.checkpoint_record import load_record, save_record
 
 CALIBRATION = 'success_calibration.json'
 #: features that only speak against success: how what moved was grasped and carried. An object
@@ -55,6 +54,14 @@ class Calibration:
     scores: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     made: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        lengths = {len(self.means), len(self.scales), len(self.weights), len(self.features)}
+        numbers = [*self.means, *self.scales, *self.weights, self.bias]
+        if len(lengths) != 1 or not self.features:
+            raise ValueError('features, means, scales and weights are not equally many')
+        if not all(isfinite(number) for number in numbers) or min(self.scales) <= 0:
+            raise ValueError('a number is not finite, or a scale is not positive')
+
     def probability(self, features: Mapping[str, float]) -> float:
         """Returns the probability of success; features that are NaN count as the mean."""
         logit = self.bias
@@ -75,22 +82,12 @@ class Calibration:
 
 
 def save_calibration(folder: Path, calibration: Calibration) -> Path:
-    """Writes it into a checkpoint, beside its name first.
+    """Writes it into a checkpoint.
 
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    path = Path(folder) / CALIBRATION
-    beside = path.with_name(f'.{path.name}.part')
-    try:
-        beside.write_text(json.dumps(asdict(calibration), indent=1) + '\n', encoding='utf-8')
-        beside.replace(path)
-    except OSError as error:
-        raise CheckpointError(
-            f"the calibration cannot be stored in the checkpoint '{folder}' ({error}); copy the "
-            'checkpoint to a folder of your own and calibrate that one'
-        ) from error
-    return path
+    return save_record(Path(folder) / CALIBRATION, calibration, 'calibration')
 
 
 def load_calibration(folder: Path) -> Calibration | None:
@@ -99,36 +96,4 @@ def load_calibration(folder: Path) -> Calibration | None:
     Raises:
         CheckpointError: the file is not what `mtv-world calibrate` writes.
     """
-    path = Path(folder) / CALIBRATION
-    if not path.is_file():
-        return None
-    hint = f"run 'mtv-world calibrate {folder} DATASET --out DIR' again, or delete the file"
-    try:
-        values = json.loads(path.read_text(encoding='utf-8'))
-        _check_keys(values)
-        read: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-        }
-        found = Calibration(**read)
-        _check_numbers(found)
-    except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"'{path}' cannot be used: {error}; {hint}") from error
-    return found
-
-
-def _check_keys(values: Any) -> None:
-    known = [item.name for item in fields(Calibration)]
-    if not isinstance(values, dict):
-        raise ValueError('expected keys and values')
-    for key in values:
-        if key not in known:
-            raise ValueError(f"unknown key '{key}'{nearest(key, known)}")
-
-
-def _check_numbers(found: Calibration) -> None:
-    lengths = {len(found.means), len(found.scales), len(found.weights), len(found.features)}
-    numbers = [*found.means, *found.scales, *found.weights, found.bias]
-    if len(lengths) != 1 or not found.features:
-        raise ValueError('features, means, scales and weights are not equally many')
-    if not all(isfinite(number) for number in numbers) or min(found.scales) <= 0:
-        raise ValueError('a number is not finite, or a scale is not positive')
+    return load_record(Path(folder) / CALIBRATION, Calibration)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-import json
+from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import Any
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.success.checkpoint_record import load_record, save_record
 
 HORIZON = 'horizon.json'
 
@@ -34,6 +32,10 @@ class HorizonCurve:
     num_episodes: int
     made: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not self.period_s > 0 or len(self.values) != len(self.lower):
+            raise ValueError('the period is not positive, or the curves differ in length')
+
     def trusted_seconds(self, level: float) -> float:
         """Returns up to which time J is expected to be at least `level` [s].
 
@@ -49,22 +51,12 @@ class HorizonCurve:
 
 
 def save_horizon(folder: Path, curve: HorizonCurve) -> Path:
-    """Writes it into a checkpoint, beside its name first.
+    """Writes it into a checkpoint.
 
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    path = Path(folder) / HORIZON
-    beside = path.with_name(f'.{path.name}.part')
-    try:
-        beside.write_text(json.dumps(asdict(curve), indent=1) + '\n', encoding='utf-8')
-        beside.replace(path)
-    except OSError as error:
-        raise CheckpointError(
-            f"the horizon cannot be stored in the checkpoint '{folder}' ({error}); copy the "
-            'checkpoint to a folder of your own and calibrate that one'
-        ) from error
-    return path
+    return save_record(Path(folder) / HORIZON, curve, 'horizon')
 
 
 def load_horizon(folder: Path) -> HorizonCurve | None:
@@ -73,20 +65,4 @@ def load_horizon(folder: Path) -> HorizonCurve | None:
     Raises:
         CheckpointError: the file is not what `mtv-world calibrate` writes.
     """
-    path = Path(folder) / HORIZON
-    if not path.is_file():
-        return None
-    try:
-        values = json.loads(path.read_text(encoding='utf-8'))
-        read: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-        }
-        found = HorizonCurve(**read)
-        if not found.period_s > 0 or len(found.values) != len(found.lower):
-            raise ValueError('the period is not positive, or the curves differ in length')
-    except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(
-            f"'{path}' cannot be used: {error}; run 'mtv-world calibrate {folder} DATASET --out "
-            "DIR' again, or delete the file"
-        ) from error
-    return found
+    return load_record(Path(folder) / HORIZON, HorizonCurve)

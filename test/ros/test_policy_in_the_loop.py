@@ -53,7 +53,7 @@ class Stack:
         ros.make_checkpoint(folder / 'checkpoint')
         self.world = ros.start_node(
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001',
-            *ros.FROZEN, remaps=ros.JOINT_STATES,
+            'diagnostics_period_s:=0.2', *ros.FROZEN, remaps=ros.JOINT_STATES,
         )  # fmt: skip
         self.policy = ros.start_policy(
             folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
