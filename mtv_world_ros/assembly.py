@@ -17,9 +17,10 @@ from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import content_digest, share_path
 from mtv_world_ros.success.calibration import CALIBRATION, Calibration, load_calibration
 from mtv_world_ros.success.describer import Describer, InstructionDescriber
-from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
+from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.success.segmenter_choice import choose_segmenter
+from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
 from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.success.vlm_describer import Chat
 
 BUNDLED = 'bundled'
+_YAML = ('.yaml', '.yml')
 #: makes a policy for the scene of a task and a seed (-1 = not known); most do not look at either
 PolicyMaker = Callable[[str, int], Policy]
 
@@ -36,15 +38,31 @@ def checkpoint_path(name: str | Path) -> Path:
     return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
 
 
-def fingerprint(checkpoint: str | Path, *, calibrated: bool = True) -> str:
+def fingerprint(
+    checkpoint: str | Path,
+    *,
+    calibrated: bool = True,
+    adapter: Path | None = None,
+    task: str | None = None,
+) -> str:
     """Returns the checkpoint's name and a hash of its files: other weights, other name.
 
     Args:
         checkpoint: folder, or `bundled`.
         calibrated: the calibration counts too.
+        adapter: LoRA adapter that is used with it.
+        task: name or file of the task that is judged.
     """
     without = () if calibrated else (CALIBRATION, HORIZON)
-    return f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})'
+    parts = [f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})']
+    files = [] if adapter is None else [('adapter', adapter)]
+    if task is not None and not task.endswith(_YAML):
+        parts.append(f'task {task}')
+    elif task is not None:
+        files += [('task', Path(task))]
+        files += [('picture', picture.path) for _, picture in load_task(Path(task)).pictures]
+    parts += [f'{what} {path} ({content_digest(path)[:8]})' for what, path in files]
+    return ', '.join(parts)
 
 
 def robot_path(name: str | Path) -> Path:
@@ -54,7 +72,7 @@ def robot_path(name: str | Path) -> Path:
         ConfigError: neither.
     """
     path = Path(name)
-    if path.suffix in ('.yaml', '.yml'):
+    if path.suffix in _YAML:
         if not path.is_file():
             raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
         return path
@@ -81,7 +99,7 @@ def load_pipeline(
         checkpoint: folder, or `bundled`.
         robot: YAML file or name of a bundled robot; default: the one of the checkpoint.
         objects: names of the objects; empty = those the instruction names.
-        task: name of the task to judge; default: the one the instruction matches.
+        task: the task to judge, by name or YAML file; default: the one the instruction matches.
         device: `cpu`, `cuda`, ...
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
         num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
@@ -146,16 +164,24 @@ def assemble(
         world_model=world_model,
         segmenter=segmenter,
         estimator=SuccessEstimator(
-            load_tasks(share_path('config', 'tasks')),
-            task=task,
+            *_tasks(task),
             calibration=calibration,
-            segmenter=segmenter.name,
+            segmenter=segmenter,
         ),
         rendering=TrajectoryVideoConfig(**card['rendering']),
         object_mask=card['object_mask'],
         objects=objects,
         horizon=horizon,
     )
+
+
+def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
+    """The known tasks, and the name of the one to judge; a file of the user's own is one more."""
+    known = load_tasks(share_path('config', 'tasks'))
+    if task is None or not task.endswith(_YAML):
+        return known, task
+    given = load_task(Path(task))
+    return (*(spec for spec in known if spec.name != given.name), given), given.name
 
 
 def _robot_of(card: Any, robot: str | Path | None) -> RobotModel:
@@ -183,7 +209,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     path = Path(name)
     if str(name).startswith('expert'):
         return _scripted(ScriptedPolicySettings(variant=str(name)), robot)
-    if path.suffix not in ('.yaml', '.yml'):
+    if path.suffix not in _YAML:
         path = share_path('config', 'policies', f'{name}.yaml')
     config = load_policy_config(path)
     if isinstance(config, ScriptedPolicySettings):

@@ -43,14 +43,15 @@ def share_path(*parts: str) -> Path:
 
 
 def content_digest(folder: Path, without: Collection[str] = ()) -> str:
-    """Returns the SHA-256 of a folder's files: other names or contents, another digest.
+    """Returns the SHA-256 of a folder's files, or of one: other names or contents, another digest.
 
     Args:
-        folder: is looked through with all folders in it.
+        folder: is looked through with all folders in it; or a file.
         without: names of files that do not count.
     """
     digest = hashlib.sha256()
-    files = (path for path in folder.rglob('*') if path.is_file() and path.name not in without)
+    paths = [folder] if folder.is_file() else folder.rglob('*')
+    files = (path for path in paths if path.is_file() and path.name not in without)
     for file in sorted(files):
         digest.update(file.relative_to(folder).as_posix().encode())
         with file.open('rb') as opened:

@@ -14,6 +14,8 @@ from mtv_world_ros.cli.options import (
     add_seeds,
     add_segmenter,
     add_serving,
+    add_task,
+    pipeline_choices,
     threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
@@ -60,6 +62,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_model_options(parser)
     add_serving(parser)
     add_segmenter(parser)
+    add_task(parser)
     parser.set_defaults(handler=_calibrate)
 
 
@@ -99,11 +102,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
     load = partial(
         load_pipeline,
         arguments.checkpoint,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        segmenter=arguments.segmenter,
-        serving=arguments.serving,
+        **pipeline_choices(arguments),
         calibrated=False,
     )
     pipeline = load(num_threads=arguments.threads)
@@ -113,7 +112,12 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
             pipeline,
             selection.paths,
             arguments.out / f'seed_{index}',
-            name=fingerprint(arguments.checkpoint, calibrated=False),
+            name=fingerprint(
+                arguments.checkpoint,
+                calibrated=False,
+                adapter=arguments.adapter,
+                task=arguments.task,
+            ),
             zero_shot=selection.zero_shot,
             provenance=provenance(arguments),
             parallel=Parallel(

@@ -14,6 +14,8 @@ from mtv_world_ros.cli.options import (
     add_seeds,
     add_segmenter,
     add_serving,
+    add_task,
+    pipeline_choices,
     threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
@@ -86,6 +88,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_serving(parser)
     add_seeds(parser)
     add_segmenter(parser)
+    add_task(parser)
     parser.set_defaults(handler=_evaluate)
 
 
@@ -186,11 +189,7 @@ def _score(
     load = partial(
         load_pipeline,
         entry.path,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        segmenter=arguments.segmenter,
-        serving=arguments.serving,
+        **pipeline_choices(arguments),
     )
     pipeline = load(num_threads=arguments.threads)
     threads = threads_of_workers(arguments)
@@ -198,7 +197,7 @@ def _score(
         pipeline,
         selection.paths,
         out,
-        name=fingerprint(entry.path),
+        name=fingerprint(entry.path, adapter=arguments.adapter, task=arguments.task),
         label=_row(entry, pipeline),
         zero_shot=selection.zero_shot,
         provenance={

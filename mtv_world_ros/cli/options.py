@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
+
+#: options that are arguments of `load_pipeline`
+_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter')
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -25,12 +29,23 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_serving(parser: argparse.ArgumentParser) -> None:
-    """Adds `--serving`."""
+    """Adds `--serving` and `--adapter`."""
     parser.add_argument(
         '--serving',
         default='',
         metavar='"NAME=VALUE ..."',
         help='what makes the model faster or smaller, e.g. "context_parallel=2"',
+    )
+    parser.add_argument(
+        '--adapter', type=Path, help="LoRA folder or file, in place of the checkpoint's own"
+    )
+
+
+def add_task(parser: argparse.ArgumentParser) -> None:
+    """Adds `--task`."""
+    parser.add_argument(
+        '--task',
+        help='task to judge: a name, or a YAML file; default: the one each instruction matches',
     )
 
 
@@ -85,11 +100,11 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     from mtv_world_ros.assembly import load_pipeline
 
     return load_pipeline(
-        arguments.checkpoint,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        num_threads=arguments.threads,
-        segmenter=arguments.segmenter,
-        serving=arguments.serving,
+        arguments.checkpoint, num_threads=arguments.threads, **pipeline_choices(arguments)
     )
+
+
+def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Returns what the options say of a pipeline beside its checkpoint and threads."""
+    given = vars(arguments)
+    return {name: given[name] for name in _CHOICES if name in given}

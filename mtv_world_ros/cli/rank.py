@@ -12,6 +12,8 @@ from mtv_world_ros.cli.options import (
     add_dtype,
     add_model_options,
     add_segmenter,
+    add_serving,
+    pipeline_choices,
     threads_of_workers,
 )
 from mtv_world_ros.cli.provenance import provenance
@@ -63,6 +65,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_dtype(parser)
     add_model_options(parser)
     add_segmenter(parser)
+    add_serving(parser)
     parser.set_defaults(handler=_rank, steps=1)
 
 
@@ -80,11 +83,8 @@ def _rank(arguments: argparse.Namespace) -> int:
     make_pipeline = partial(
         load_pipeline,
         arguments.checkpoint,
-        robot=arguments.robot,
-        device=arguments.device,
-        dtype=arguments.dtype,
         num_threads=threads_of_workers(arguments),
-        segmenter=arguments.segmenter,
+        **pipeline_choices(arguments),
     )
     settings = _settings(arguments)
     results, failed = run_jobs(

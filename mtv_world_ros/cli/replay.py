@@ -12,6 +12,7 @@ from mtv_world_ros.cli.options import (
     add_model_options,
     add_segmenter,
     add_serving,
+    add_task,
     pipeline_of,
 )
 
@@ -34,6 +35,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_model_options(parser)
     add_segmenter(parser)
     add_serving(parser)
+    add_task(parser)
     parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
 
 

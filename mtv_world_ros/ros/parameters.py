@@ -77,7 +77,7 @@ TABLE: tuple[Entry, ...] = (
         'serving', '', "What makes the model faster or smaller, e.g. 'compile=true'; see README."
     ),
     _at_start(
-        'task', '', 'Task to judge (config/tasks); empty = the one the instruction matches.'
+        'task', '', 'Task to judge: name or YAML file; empty = the one the instruction matches.'
     ),
     _at_start(
         'segmenter',

@@ -15,7 +15,9 @@ from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.footage import Footage
+from mtv_world_ros.success.pictures import PictureMasks
 from mtv_world_ros.success.rollout_memory import remember, RolloutMemory
+from mtv_world_ros.success.segmenter import Segmenter
 from mtv_world_ros.success.situation import CannotTell, Margin
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.success.views import EvidenceConfig, Views
@@ -75,7 +77,7 @@ class SuccessEstimator:
         task: str | None = None,
         config: EstimatorConfig | None = None,
         calibration: Calibration | None = None,
-        segmenter: str = '',
+        segmenter: Segmenter | None = None,
     ) -> None:
         """Sets what may be judged.
 
@@ -85,7 +87,7 @@ class SuccessEstimator:
                 instruction names no objects for it, they take the task's placeholders in order.
             config: weights and limits.
             calibration: fitted weights, used where they hold.
-            segmenter: what finds the masks.
+            segmenter: what finds the masks; finds objects in the pictures of tasks, too.
 
         Raises:
             ConfigError: `task` is not among `tasks`.
@@ -99,7 +101,9 @@ class SuccessEstimator:
         self.tasks = tuple(known for known in tasks if task in (None, known.name))
         self.is_given = task is not None
         self.config = config or EstimatorConfig()
-        self.calibration, self.segmenter = calibration, segmenter
+        self.calibration = calibration
+        self.segmenter = '' if segmenter is None else segmenter.name
+        self._picture_masks = PictureMasks(segmenter)
 
     def estimate(
         self, footage: Footage, instruction: str = '', memory: RolloutMemory | None = None
@@ -126,7 +130,7 @@ class SuccessEstimator:
             views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
         ]
         try:
-            evidence = gather(views, task, bound)
+            evidence = gather(views, task, bound, self._picture_masks)
         except CannotTell as reason:
             return Judged(_abstains(reason, views, subjects), memory)
         return Judged(self._judge(task, evidence, views), memory)
@@ -201,7 +205,8 @@ def _released(task: TaskSpec, openings: FloatArray | None) -> float:
 def _check_views(task: TaskSpec, footage: Footage) -> None:
     """Refuses a task that looks at views that there are not."""
     known = [camera.view for camera in footage.cameras]
-    missing = [view for view in task.views if view not in known]
+    wanted = dict.fromkeys([*task.views, *(view for view, _ in task.pictures)])
+    missing = [view for view in wanted if view not in known]
     if missing:
         raise CannotTell(f'task {task.name} looks at the views {missing}; there are {known}')
 
@@ -228,7 +233,7 @@ def _margin_text(margin: Margin, spread: float, task: TaskSpec) -> str:
     """The condition nearest to failing, in words; `spread` in units of its softness."""
     held = 'held' if margin.value >= 0 else 'missed'
     if margin.unit != 'm':
-        return f"'{margin.condition}' {held} by {abs(margin.value):g} {margin.unit}"
+        return f"'{margin.condition}' {held} by {abs(margin.value):.2g} {margin.unit}"
     known = 1000 * spread * (margin.soft or task.softness_m)
     away = 1000 * abs(margin.value)
     return f"'{margin.condition}' {held} by {away:.0f} mm, known to {known:.0f} mm"

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import isfinite, nan
 
 import numpy as np
 
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.success.jaccard import mean_of_known
-from mtv_world_ros.success.localise import block_size, Location
-from mtv_world_ros.success.relations import Inside, Within
+from mtv_world_ros.success.pictured import AsPictured, InRegion
+from mtv_world_ros.success.pictures import PictureMasks
+from mtv_world_ros.success.placed import Placed
+from mtv_world_ros.success.relations import Inside, Relation, Within
 from mtv_world_ros.success.rollout_memory import Grasp
-from mtv_world_ros.success.situation import CannotTell, Margin
-from mtv_world_ros.success.swings import count_reversals
+from mtv_world_ros.success.situation import Margin
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 
@@ -52,73 +53,21 @@ class Evidence:
     notes: tuple[str, ...]
 
 
-@dataclass(slots=True)
-class Placed:
-    """Where the bound objects are; a `Situation`. Each is located once, when it is asked for."""
-
-    views: Views
-    bound: Mapping[str, str]
-    notes: dict[str, None] = field(default_factory=dict)
-    sigmas: dict[str, float] = field(default_factory=dict)
-    _ends: dict[str, Location] = field(default_factory=dict)
-
-    def item(self, role: str) -> int:
-        """Returns the index of a placeholder's object."""
-        return self.views.index(self.bound[role])
-
-    def end(self, role: str) -> FloatArray:
-        """See `Situation`."""
-        if role not in self._ends:
-            found, hidden = self.views.end(self.item(role))
-            if hidden:
-                name = self.bound[role]
-                self.notes[f"'{name}' is partly hidden: taken to stand where it stood"] = None
-            self._ends[role], self.sigmas[role] = found, found.sigma_m
-        return self._ends[role].point
-
-    def start(self, role: str) -> FloatArray:
-        """See `Situation`."""
-        point = self.views.memory.start_point(self.item(role))
-        if not np.isfinite(point).all():
-            raise CannotTell(f"where '{self.bound[role]}' was at the start is not known")
-        return point
-
-    def stack_height(self, upper: str, lower: str) -> float:
-        """See `Situation`; both are taken as cubes, of the size that was last seen whole."""
-        memory, footage = self.views.memory, self.views.footage
-        edges = []
-        for role in (upper, lower):
-            item = self.item(role)
-            areas = memory.seen_masks[:, item].sum((-2, -1)).astype(np.float64)
-            point = memory.seen_points[item]
-            if not np.isfinite(point).all():
-                point = self.end(role)
-            edges.append(block_size(footage.cameras, tuple(footage.poses[:, -1]), areas, point))
-        return float(np.mean(edges))
-
-    def lift(self, role: str) -> float:
-        """See `Situation`."""
-        heights = self.views.memory.points[self.item(role), :, 2]
-        return float(np.nanmax(heights) - self.start(role)[2])
-
-    def swings(self, role: str, swing: float) -> int:
-        """See `Situation`; what the view tells that shows most of them."""
-        counts = []
-        for leans in self.views.memory.leans[:, self.item(role)]:
-            known = leans[np.isfinite(leans)]
-            if len(known):
-                reversals = count_reversals(np.unwrap(known, period=np.pi), swing)
-                counts.append(int(reversals[-1]))
-        return max(counts, default=0)
-
-
-def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
+def gather(
+    views: Views, task: TaskSpec, bound: Mapping[str, str], picture_masks: PictureMasks
+) -> Evidence:
     """Measures how far a task's relations hold at the end of a rollout.
+
+    Args:
+        views: the rollout.
+        task: what is asked.
+        bound: placeholder -> name of its object.
+        picture_masks: finds objects in the task's pictures.
 
     Raises:
         CannotTell: objects lost, rays that miss each other, views that disagree.
     """
-    placed = Placed(views, bound)
+    placed = Placed(views, bound, picture_masks)
     for role in task.movers:
         views.check_visible(placed.item(role))
     margins = [margin for relation in task.relations for margin in relation.margins(placed)]
@@ -159,18 +108,27 @@ def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float
     found: dict[int, FloatArray] = {}
     gains = []
     for relation in task.relations:
-        goal = relation.goal(placed)
-        if goal is None:
-            continue
-        item = placed.item(goal[0])
-        masks = placed.views.goal_masks(item, goal[1])
+        masks = _goal_masks(placed, relation)
         if masks is None:
-            placed.notes[f"no goal mask: '{placed.bound[goal[0]]}' has no known start"] = None
             continue
+        item = placed.item(relation.subject)
         found[item], before = placed.views.goal_jaccard(item, masks)
         gain = (found[item] - before) / np.maximum(1 - before, 0.05)
         gains.append(view_mean(np.clip(2 * gain - 1, -1, 1)))
     return found, float(mean_of_known(np.array(gains))) if gains else nan
+
+
+def _goal_masks(placed: Placed, relation: Relation) -> BoolArray | None:
+    """(V, H, W) masks of the subject where it should be, if that is one place."""
+    if isinstance(relation, AsPictured):
+        return placed.pictured(relation.subject, relation.pictures)
+    goal = relation.goal(placed)
+    if goal is None:
+        return None
+    masks = placed.views.goal_masks(placed.item(goal[0]), goal[1])
+    if masks is None:
+        placed.notes[f"no goal mask: '{placed.bound[goal[0]]}' has no known start"] = None
+    return masks
 
 
 def _contained(placed: Placed, task: TaskSpec) -> float:
@@ -179,6 +137,11 @@ def _contained(placed: Placed, task: TaskSpec) -> float:
         placed.views.containment(placed.item(relation.subject), placed.item(relation.target))
         for relation in task.relations
         if isinstance(relation, Within | Inside)
+    ]
+    shares += [
+        placed.share_inside(relation.subject, relation.regions)
+        for relation in task.relations
+        if isinstance(relation, InRegion)
     ]
     known = [share for share in shares if isfinite(share)]
     return 2 * min(known) - 1 if known else nan

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.success.situation import Margin, Situation
-
-Goal = tuple[str, FloatArray]
+from mtv_world_ros.success.pictured import AsPictured, InRegion
+from mtv_world_ros.success.situation import Goal, Margin, Situation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -272,7 +270,9 @@ class Shaken:
         ]
 
 
-Relation = Beside | OnTop | Within | Inside | Apart | Moved | Shifted | Shaken
+Relation = (
+    Beside | OnTop | Within | Inside | Apart | Moved | Shifted | Shaken | AsPictured | InRegion
+)
 KINDS: dict[str, type[Relation]] = {
     'left_of': Beside,
     'right_of': Beside,
@@ -283,6 +283,8 @@ KINDS: dict[str, type[Relation]] = {
     'moved': Moved,
     'shifted': Shifted,
     'shaken': Shaken,
+    'as_pictured': AsPictured,
+    'in_region': InRegion,
 }
 
 

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol, TYPE_CHECKING
 
 from mtv_world_ros.data_types import FloatArray
+
+if TYPE_CHECKING:
+    from mtv_world_ros.success.pictures import Picture
+
+#: a placeholder, and where the centre (3,) of its object should be [m]
+Goal = tuple[str, FloatArray]
 
 
 class CannotTell(Exception):
@@ -17,7 +24,7 @@ class Margin(NamedTuple):
     Attributes:
         condition: in words.
         value: negative = violated.
-        unit: of the value: `m`, or what is counted.
+        unit: of the value: `m`, or what is counted or measured.
         soft: value that counts as one; None = the task's softness [m].
     """
 
@@ -48,4 +55,12 @@ class Situation(Protocol):
 
     def swings(self, role: str, swing: float) -> int:
         """Returns how often the object turned back by more than `swing` [rad]."""
+        ...
+
+    def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
+        """Returns J of the object's mask at the end with its mask in pictures, by view; a mean."""
+        ...
+
+    def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
+        """Returns the share of the object's mask at the end in regions, by view; the least."""
         ...

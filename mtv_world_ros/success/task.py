@@ -8,13 +8,15 @@ from pathlib import Path
 import re
 from typing import Any
 
-import yaml
-
+from mtv_world_ros.config_values import check_keys, number, read_yaml
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.describer import ends_phrase
+from mtv_world_ros.success.pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.relations import KINDS, Relation, roles_of
 
 GRIPPERS = ('open', 'any')
+#: keys of relations whose values are picture files by view, and what reads them
+PICTURES = {'pictures': load_pictures, 'regions': load_regions}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +55,12 @@ class TaskSpec:
         """Placeholders of the objects that the robot is to move."""
         return tuple(dict.fromkeys(relation.subject for relation in self.relations))
 
+    @property
+    def pictures(self) -> tuple[tuple[str, Picture], ...]:
+        """Views and their pictures, of all relations."""
+        named = [getattr(relation, key, {}) for relation in self.relations for key in PICTURES]
+        return tuple(item for by_view in named for item in by_view.items())
+
     def bind(self, instruction: str) -> dict[str, str] | None:
         """Returns the placeholders' objects if the instruction fits the template, else None."""
         pattern = re.sub(
@@ -86,16 +94,14 @@ def load_task(path: Path) -> TaskSpec:
     Raises:
         ConfigError: the file is no YAML mapping, a key is unknown or missing, a value is wrong.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"task file '{path}' cannot be read: {error}") from error
+    data = read_yaml(path, 'task file', 'task')
     values = _checked(TaskSpec, data, str(path))
     given = values['relations']
     if not isinstance(given, list) or not given:
         raise ConfigError(f"{path}: 'relations' is {given!r}; expected a list of relations")
     values['relations'] = tuple(
-        _relation(item, f'{path}: relations[{index}]') for index, item in enumerate(given)
+        _relation(item, Path(path).parent, f'{path}: relations[{index}]')
+        for index, item in enumerate(given)
     )
     values = _numeric(values, str(path))
     values['nouns'] = _nouns(values.get('nouns', {}), str(path))
@@ -134,35 +140,32 @@ def _check(task: TaskSpec, path: Path) -> None:
         )
 
 
-def _relation(data: Any, where: str) -> Relation:
+def _relation(data: Any, folder: Path, where: str) -> Relation:
     kind = data.get('kind') if isinstance(data, Mapping) else None
     if kind not in KINDS:
         raise ConfigError(
             f"{where}: kind is '{kind}'{nearest(str(kind), KINDS)}; known are {sorted(KINDS)}"
         )
-    return KINDS[kind](**_numeric(_checked(KINDS[kind], data, where), where))
+    values = _numeric(_checked(KINDS[kind], data, where), where)
+    for key in values.keys() & PICTURES.keys():
+        values[key] = PICTURES[key](values[key], folder, f"{where}: '{key}'")
+    return KINDS[kind](**values)
 
 
 def _checked(kind: type, data: Any, where: str) -> dict[str, Any]:
     """The mapping's items, if its keys are the dataclass's."""
-    known = {item.name: item for item in fields(kind)}
-    if not isinstance(data, Mapping):
-        raise ConfigError(f'{where}: expected a mapping with the keys {sorted(known)}')
-    for key in data:
-        if key not in known:
-            raise ConfigError(f"{where}: unknown key '{key}'{nearest(str(key), known)}")
-    missing = [
-        key
-        for key, item in known.items()
-        if item.default is MISSING and item.default_factory is MISSING and key not in data
+    required = [
+        item.name
+        for item in fields(kind)
+        if item.default is MISSING and item.default_factory is MISSING
     ]
-    if missing:
-        raise ConfigError(f'{where}: missing {missing}')
-    return dict(data)
+    return dict(check_keys(data, [item.name for item in fields(kind)], required, where))
 
 
 #: numbers a key holds; a single number where it is not named
 _LENGTHS = {'distance_m': 2, 'max_offset_m': 3, 'half_size_m': 2, 'rise_m': 2, 'offset_m': 3}
+#: keys of shares, above 0 and at most 1
+_SHARES = ('min_jaccard', 'min_share')
 #: keys whose lengths may be negative
 _SIGNED = ('rise_m', 'offset_m')
 
@@ -176,6 +179,10 @@ def _numeric(values: dict[str, Any], where: str) -> dict[str, Any]:
                 raise ConfigError(f"{where}: '{key}' is {value!r}; expected a count of at least 1")
         elif key.endswith(('_m', '_rad')):
             checked[key] = _lengths(key, value, where)
+        elif key in _SHARES:
+            checked[key] = number(values, key, 0.0, where)
+            if not 0 < checked[key] <= 1:
+                raise ConfigError(f"{where}: '{key}' is {value!r}; it must be in (0, 1]")
     return checked
 
 

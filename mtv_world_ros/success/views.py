@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,10 +104,12 @@ class Views:
     def goal_jaccard(self, item: int, goals: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Returns (V,) J of the last masks, and of the start masks, with (V, H, W) goal masks.
 
+        NaN in a view whose goal mask is empty.
+
         Raises:
             CannotTell: the views disagree.
         """
-        scores = self._jaccard(item, goals)
+        scores = np.where(goals.any((-2, -1)), self._jaccard(item, goals), np.nan)
         known = scores[np.isfinite(scores)]
         if len(known) > 1 and np.ptp(known) > self.config.max_disagreement:
             raise CannotTell(
@@ -120,6 +123,17 @@ class Views:
         masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
         scores = np.median(jaccard(masks, reference[:, None]), axis=1)
         return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
+
+    def share_inside(self, item: int, regions: Mapping[str, BoolArray]) -> FloatArray:
+        """Returns (V,) shares of an object's mask in (H, W) regions by view; NaN = not known."""
+        shares = np.full(len(self.footage.cameras), np.nan)
+        known = self.end_ok(item)
+        for row, camera in enumerate(self.footage.cameras):
+            if camera.view in regions and known[row]:
+                masks = self.footage.masks.masks[row, item, -self.config.last_frames :]
+                inside = (masks & regions[camera.view]).sum((-2, -1))
+                shares[row] = np.median(inside / np.maximum(masks.sum((-2, -1)), 1))
+        return shares
 
     def containment(self, item: int, within: int) -> float:
         """Returns the share of an object's mask in another's last unhidden one; the least."""

@@ -9,6 +9,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.calibration import Calibration
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
+from mtv_world_ros.success.segmenter import ColourSegmenter
 
 
 def judge(shown, instruction=LEFT, task=None):
@@ -182,6 +183,14 @@ CALIBRATION = Calibration(
 )
 
 
+class Named(ColourSegmenter):
+    """One that goes by another name."""
+
+    def __init__(self, name):
+        super().__init__()
+        self.name = name
+
+
 @pytest.mark.parametrize(
     ('segmenter', 'task', 'words'),
     [
@@ -194,7 +203,7 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
     estimator = SuccessEstimator(
         load_tasks(share_path('config', 'tasks')),
         calibration=replace(CALIBRATION, tasks=(task,)),
-        segmenter=segmenter,
+        segmenter=Named(segmenter),
     )
     end = (BLUE[0] - 0.13, BLUE[1], 0.025)
     shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
