@@ -15,6 +15,7 @@ from mtv_world_ros.evaluation.outcomes import agreement
 from mtv_world_ros.evaluation.reliability import reliability_bins
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.trusted_horizon import HorizonCurve
+from mtv_world_ros.whole_files import write_whole
 
 _COLUMNS = {
     'num_abstained': 'abstained',
@@ -37,8 +38,8 @@ _ROWS = {
 def write_calibration_report(out: Path, found: Calibrated, horizon: HorizonCurve | None) -> str:
     """Writes `calibration.md`, `reliability.html` and `calibration.json`; returns the first."""
     text = markdown(found, horizon)
-    tables.write_text(out / 'calibration.md', text)
-    tables.write_text(out / 'reliability.html', reliability_page(found))
+    write_whole(out / 'calibration.md', text)
+    write_whole(out / 'reliability.html', reliability_page(found))
     tables.write_json(out / 'calibration.json', _values(found))
     return text
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.statistics import Estimate
 from mtv_world_ros.evaluation.summary import Group, SEEN, Summary
+from mtv_world_ros.whole_files import write_whole
 
 #: tasks beside each other in a table
 TASKS_PER_TABLE = 3
@@ -141,8 +142,8 @@ def write_comparison(summaries: Sequence[Summary], out: Path) -> str:
         The tables, as Markdown.
     """
     text = markdown(summaries)
-    tables.write_text(out / 'paper_tables.md', text)
-    tables.write_text(out / 'numbers.csv', as_csv(summaries))
+    write_whole(out / 'paper_tables.md', text)
+    write_whole(out / 'numbers.csv', as_csv(summaries))
     if len(summaries) > 1:
         methods = {summary.label or summary.name: summary.metrics() for summary in summaries}
         counts = {name: found['num_episodes'] for name, found in methods.items()}

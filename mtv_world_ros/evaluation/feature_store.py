@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 import zipfile
 
@@ -14,6 +15,7 @@ from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.features import ClipFeatures, FrameFeatures
 from mtv_world_ros.evaluation.frechet import frechet_distance, frechet_interval
 from mtv_world_ros.evaluation.statistics import Estimate
+from mtv_world_ros.whole_files import write_whole
 
 #: name of the distance -> what it is measured on
 DISTANCES = ('fid', 'fvd')
@@ -74,14 +76,12 @@ class EpisodeFeatures:
 
     def save(self, path: Path) -> None:
         """Writes them beside the name and renames."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f'.{path.name}.part')
         held = {
             key: np.concatenate(parts).astype(np.float32) for key, parts in self._found.items()
         }
-        with beside.open('wb') as file:
-            np.savez(file, **held)  # type: ignore[arg-type]
-        beside.replace(path)
+        archive = BytesIO()
+        np.savez(archive, **held)  # type: ignore[arg-type]
+        write_whole(path, archive.getvalue())
 
 
 def load_features(path: Path) -> dict[str, FloatArray]:

@@ -23,8 +23,8 @@ from mtv_world_ros.evaluation.report_numbers import (
     with_interval,
 )
 from mtv_world_ros.evaluation.report_tables import paper_tables, task_section
-from mtv_world_ros.evaluation.tables import write_text
 from mtv_world_ros.resources import share_path
+from mtv_world_ros.whole_files import write_whole
 
 #: of all embedded videos [bytes]; base64 adds a third
 VIDEO_BUDGET = 6_000_000
@@ -59,7 +59,7 @@ def write_report(folders: Sequence[Path], path: Path) -> Path:
     evaluations = [found for folder in folders for found in read_evaluations(folder)]
     if not evaluations:
         raise ConfigError('a report needs at least one evaluation; give the folders of them')
-    write_text(path, page(evaluations))
+    write_whole(path, page(evaluations))
     return path
 
 

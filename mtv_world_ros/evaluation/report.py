@@ -13,6 +13,7 @@ from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation.video_file import encode_video
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.whole_files import write_whole
 
 #: kinds of frames, in the order of rows and columns
 KINDS = ('real', 'trajectory', 'imagined')
@@ -166,7 +167,7 @@ def write_png(path: Path, image: ByteArray) -> None:
     """Writes an RGB picture beside its name and renames it."""
     done, data = cv2.imencode('.png', image[..., ::-1])
     assert done
-    _write(path, data.tobytes())
+    write_whole(path, data.tobytes())
 
 
 def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> None:
@@ -178,14 +179,7 @@ def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> 
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
     """
-    _write(path, encode_video(frames, fps, crf=crf))
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f'.{path.name}.part')
-    beside.write_bytes(data)
-    beside.replace(path)
+    write_whole(path, encode_video(frames, fps, crf=crf))
 
 
 def _tile_size(size: tuple[int, ...], tile_width: int) -> tuple[int, int]:

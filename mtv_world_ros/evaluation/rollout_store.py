@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -22,6 +23,7 @@ from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video_file import decode_video, encode_video
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
+from mtv_world_ros.whole_files import write_whole
 
 #: frames are shrunk until neither side is longer [px]; with `MAX_FRAMES` it bounds a file's size
 MAX_SIDE = 320
@@ -162,11 +164,9 @@ def save_rollout(path: Path, rollout: StoredRollout) -> None:
         held[name] = np.frombuffer(data, np.uint8)
     for name in _MASKS:
         held[name] = np.packbits(getattr(kept, name))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f'.{path.name}.part')
-    with beside.open('wb') as file:
-        np.savez_compressed(file, **held)
-    beside.replace(path)
+    archive = BytesIO()
+    np.savez_compressed(archive, **held)
+    write_whole(path, archive.getvalue())
 
 
 def load_rollout(path: Path) -> StoredRollout:

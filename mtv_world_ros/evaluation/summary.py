@@ -16,6 +16,7 @@ from mtv_world_ros.evaluation.outcomes import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
 from mtv_world_ros.evaluation.statistics import Estimate, summarise
+from mtv_world_ros.whole_files import write_whole
 
 BRACKETS = (
     'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: of the '
@@ -86,9 +87,9 @@ class Summary:
         """Writes metrics.json, rows.csv and tables.md; returns the tables."""
         tables.write_json(out / 'metrics.json', self.metrics())
         rows = ((r.episode, r.task, row) for r in self.results for row in r.rows)
-        tables.write_text(out / 'rows.csv', tables.rows_csv(rows))
+        write_whole(out / 'rows.csv', tables.rows_csv(rows))
         text = self.markdown()
-        tables.write_text(out / 'tables.md', text)
+        write_whole(out / 'tables.md', text)
         return text
 
     @property

@@ -12,6 +12,7 @@ from typing import Any
 
 from mtv_world_ros.evaluation.scores import FRAME_FIELDS, ScoreRow
 from mtv_world_ros.evaluation.statistics import Estimate
+from mtv_world_ros.whole_files import write_whole
 
 #: columns of the Markdown tables: key -> heading
 COLUMNS = {
@@ -39,17 +40,9 @@ NOT_MEASURED = Estimate(value=math.nan, interval=(math.nan, math.nan), num_episo
 QUALITY = {'fid': 'FID', 'fvd': 'FVD', 'psnr': 'PSNR [dB]', 'ssim': 'SSIM', 'lpips': 'LPIPS'}
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a file beside its name and renames it, so that no half file is left."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f'.{path.name}.part')
-    beside.write_text(text, encoding='utf-8')
-    beside.replace(path)
-
-
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Writes a JSON file; NaN becomes null."""
-    write_text(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
+    write_whole(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
 
 
 def plain(value: Any) -> Any:

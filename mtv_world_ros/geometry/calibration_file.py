@@ -13,6 +13,7 @@ from mtv_world_ros.config_values import check_keys, read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.transforms import is_rigid, pose
+from mtv_world_ros.whole_files import write_whole
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
          'T_mount_camera', 'position', 'quaternion_xyzw')  # fmt: skip
@@ -52,13 +53,8 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
         }
         for view, camera in cameras.items()
     }
-    path = Path(path)
-    beside = path.with_name(f'.{path.name}.part')
-    beside.write_text(
-        yaml.safe_dump({'views': views}, sort_keys=False, default_flow_style=None),
-        encoding='utf-8',
-    )
-    beside.replace(path)
+    text = yaml.safe_dump({'views': views}, sort_keys=False, default_flow_style=None)
+    write_whole(Path(path), text)
 
 
 def _camera(view: str, row: Any, where: str) -> CameraModel:

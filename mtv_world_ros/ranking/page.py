@@ -7,9 +7,10 @@ from pathlib import Path
 from mtv_world_ros.evaluation.charts import Point, scatter_chart
 from mtv_world_ros.evaluation.html_report import document
 from mtv_world_ros.evaluation.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.tables import write_json, write_text
+from mtv_world_ros.evaluation.tables import write_json
 from mtv_world_ros.ranking.summary import ALL_TASKS, JUDGES, Summary
 from mtv_world_ros.ranking.words import grids, markdown, remarks, TITLE
+from mtv_world_ros.whole_files import write_whole
 
 #: hues of the report's style sheet
 _NUM_HUES = 6
@@ -18,9 +19,9 @@ _NUM_HUES = 6
 def write_ranking(summary: Summary, out: Path) -> Path:
     """Writes `ranking.json`, `ranking.md` and `ranking.html`; returns the last one's path."""
     write_json(out / 'ranking.json', summary.as_json())
-    write_text(out / 'ranking.md', markdown(summary))
+    write_whole(out / 'ranking.md', markdown(summary))
     path = out / 'ranking.html'
-    write_text(path, document(TITLE, join([element('h1', TITLE), *_sections(summary)])))
+    write_whole(path, document(TITLE, join([element('h1', TITLE), *_sections(summary)])))
     return path
 
 

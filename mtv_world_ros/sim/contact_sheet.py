@@ -11,7 +11,7 @@ import numpy as np
 from mtv_world_ros.data.mcap_reader import read_episode
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.sim.dataset_card import EpisodeEntry
-from mtv_world_ros.sim.files import write_whole
+from mtv_world_ros.sim.files import write_file
 
 SHEET_FILE = 'contact_sheet.png'
 OUTCOMES = ('success', 'failure')
@@ -107,4 +107,4 @@ def contact_sheet(
 def write_sheet(path: Path, sheet: ByteArray) -> None:
     """Writes a picture (H, W, 3) uint8 RGB as PNG."""
     _, data = cv2.imencode('.png', np.ascontiguousarray(sheet[..., ::-1]))
-    write_whole(path, data.tobytes())
+    write_file(path, data.tobytes())

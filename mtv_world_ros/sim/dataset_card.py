@@ -15,7 +15,7 @@ import numpy as np
 
 from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.errors import EpisodeError, SimulatorError
-from mtv_world_ros.sim.files import write_whole
+from mtv_world_ros.sim.files import write_file
 
 CARD_FILE = 'dataset.json'
 TASKS_SET, ZERO_SHOT_SET = 'tasks', 'zero_shot'
@@ -191,4 +191,4 @@ def card_of(
 
 def write_card(out: Path, card: dict[str, Any]) -> None:
     """Writes `dataset.json`, whole or not at all."""
-    write_whole(out / CARD_FILE, (json.dumps(card, indent=1) + '\n').encode())
+    write_file(out / CARD_FILE, (json.dumps(card, indent=1) + '\n').encode())

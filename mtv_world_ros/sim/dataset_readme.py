@@ -18,7 +18,7 @@ from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.sim.contact_sheet import SHEET_FILE
 from mtv_world_ros.sim.dataset_card import EpisodeEntry, ZERO_SHOT_SET
 from mtv_world_ros.sim.episode_maker import CollectConfig
-from mtv_world_ros.sim.files import write_whole
+from mtv_world_ros.sim.files import write_file
 from mtv_world_ros.sim.tasks import TASKS
 
 README_FILE = 'README.md'
@@ -244,4 +244,4 @@ MCAP metadata record `{METADATA_NAME}`, also `custom_data` in `metadata.yaml`:
 
 def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> None:
     """Writes `README.md`, whole or not at all."""
-    write_whole(out / README_FILE, readme(out, card, entries).encode())
+    write_file(out / README_FILE, readme(out, card, entries).encode())

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.whole_files import write_whole
 
 Record = TypeVar('Record')
 
 
 def save_record(path: Path, record: Any, what: str) -> Path:
-    """Writes a dataclass into a checkpoint, beside its name first.
+    """Writes a dataclass into a checkpoint.
 
     Args:
         path: the file.
@@ -23,10 +24,8 @@ def save_record(path: Path, record: Any, what: str) -> Path:
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    beside = path.with_name(f'.{path.name}.part')
     try:
-        beside.write_text(json.dumps(asdict(record), indent=1) + '\n', encoding='utf-8')
-        beside.replace(path)
+        write_whole(path, json.dumps(asdict(record), indent=1) + '\n')
     except OSError as error:
         raise CheckpointError(
             f"the {what} cannot be stored in the checkpoint '{path.parent}' ({error}); copy the "

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict
 import hashlib
 import json
-import os
 from pathlib import Path
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError
 from mtv_world_ros.success.scene_objects import check_objects, SceneObject
+from mtv_world_ros.whole_files import write_whole
 
 
 class DescriptionCache:
@@ -46,12 +46,8 @@ class DescriptionCache:
             ConfigError: the folder cannot be written to.
         """
         content = {'model': model, 'objects': [asdict(item) for item in objects]}
-        file = self._file(key)
-        beside = file.with_suffix(f'.{os.getpid()}.part')  # others may describe the same frame
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            beside.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
-            beside.replace(file)
+            write_whole(self._file(key), json.dumps(content, indent=1) + '\n')
         except OSError as error:
             raise ConfigError(
                 f"the describer's 'cache' folder '{self.folder}' cannot be written to ({error}); "

@@ -1,0 +1,30 @@
+import os
+
+import pytest
+
+from mtv_world_ros.whole_files import write_whole
+
+
+@pytest.mark.parametrize(('content', 'data'), [('grün\n', 'grün\n'.encode()), (b'\0\1', b'\0\1')])
+def test_file_has_the_content_and_nothing_lies_beside_it(tmp_path, content, data):
+    path = tmp_path / 'new' / 'file'
+    write_whole(path, content)
+    write_whole(path, content)
+    assert path.read_bytes() == data
+    assert os.listdir(path.parent) == ['file']
+
+
+def test_what_was_there_stays_where_the_new_cannot_be_written(tmp_path, monkeypatch):
+    path = tmp_path / 'file'
+    write_whole(path, 'old')
+
+    def full(self, data):
+        with self.open('wb') as file:
+            file.write(data[:2])
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('pathlib.Path.write_bytes', full)
+    with pytest.raises(OSError, match='No space left'):
+        write_whole(path, 'new content')
+    assert path.read_text() == 'old'
+    assert os.listdir(tmp_path) == ['file']
