@@ -51,12 +51,14 @@ class Bin:
     """What was said and what came true, of those that were said about the same.
 
     Attributes:
+        middle: of the probabilities that belong here.
         said: mean probability.
         came_true: share.
         interval: of that share.
         count: how many.
     """
 
+    middle: float
     said: float
     came_true: float
     interval: tuple[float, float]
@@ -181,7 +183,7 @@ def _seconds_ticks(longest: float) -> list[float]:
 
 def reliability_chart(title: str, bins: Sequence[Bin], style: str) -> Markup:
     """Returns how often it came true against what was said; the diagonal is honest."""
-    left, top, size, height = 34.0, 22.0, 200.0, 262.0
+    left, top, size, height = 34.0, 22.0, 200.0, 276.0
 
     def x(value: float) -> float:
         return left + value * size
@@ -204,9 +206,7 @@ def reliability_chart(title: str, bins: Sequence[Bin], style: str) -> Markup:
         parts.append(_line(*ends, f'interval {style}'))
         at = (x(found.said), y(found.came_true))
         parts.append(element('circle', cx=at[0], cy=at[1], r=5.0, class_=f'mark {style}'))
-        side = 'end' if found.said > 0.8 else 'start'
-        place = at[0] + (-9 if side == 'end' else 9)
-        parts.append(_text(f'n={found.count}', place, at[1] + 4, 'tick', side))
+        parts.append(_text(f'n={found.count}', x(found.middle), top + size + 31, 'tick', 'middle'))
     return _svg(height, title, parts, width=left + size + 44)
 
 

@@ -25,6 +25,7 @@ def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
     place = np.minimum((said * _NUM_BINS).astype(int), _NUM_BINS - 1)
     return [
         Bin(
+            middle=(k + 0.5) / _NUM_BINS,
             said=float(said[place == k].mean()),
             came_true=float(true[place == k].mean()),
             interval=wilson(int(true[place == k].sum()), int((place == k).sum())),

@@ -9,7 +9,7 @@ from typing import Any
 from mtv_world_ros.evaluation.charts import Dot, dot_chart, Line, line_chart
 from mtv_world_ros.evaluation.evaluated import Evaluated
 from mtv_world_ros.evaluation.horizon import curve
-from mtv_world_ros.evaluation.markup import element, join, Markup
+from mtv_world_ros.evaluation.markup import element, join, Markup, table
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
 _KEYS = (
@@ -205,8 +205,31 @@ def horizon_section(evaluations: Sequence[Evaluated]) -> Markup | None:
         ),
         _key(evaluations),
         element('div', *panels, class_='panels'),
+        _by_chunk(evaluations),
         id='horizon',
     )
+
+
+def _by_chunk(evaluations: Sequence[Evaluated]) -> Markup | None:
+    """How J falls from chunk to chunk; None where no rollout has two."""
+    rows = []
+    for index, found in enumerate(evaluations):
+        for view, numbers in {**found.metrics['views'], 'all': found.metrics['overall']}.items():
+            values = numbers.get('j_moving_by_chunk') or []
+            cells = [
+                stacked({'j': value, 'intervals': {'j': around}}, 'j')
+                for value, around in zip(
+                    values, numbers['j_moving_by_chunk_interval'] if values else [], strict=True
+                )
+            ]
+            if cells:
+                rows.append([letter(index) if len(evaluations) > 1 else '', view, *cells])
+    if not rows:
+        return None
+    longest = max(map(len, rows))
+    head = ['', 'View', *(f'Chunk {k + 1}' for k in range(longest - 2))]
+    padded = [[*row, *['–'] * (longest - len(row))] for row in rows]
+    return table(head, padded, num_labels=2, caption='J of objects that move, by chunk')
 
 
 def _seconds(evaluations: Sequence[Evaluated], count: int) -> list[float]:

@@ -155,6 +155,16 @@ def test_page_shows_the_numbers_of_metrics_json(held, page):
         assert words in page.text
 
 
+def test_chained_rollouts_show_how_j_falls_from_chunk_to_chunk(make_pipeline, episodes, tmp_path):
+    out = scored(make_pipeline(), episodes, tmp_path, mode='imagine')
+    found = report(out)
+    overall = json.loads((out / 'metrics.json').read_text())['overall']
+    values = overall['j_moving_by_chunk']
+    assert len(values) > 1 and f'Chunk {len(values)}' in found.text
+    for value, (low, high) in zip(values, overall['j_moving_by_chunk_interval'], strict=True):
+        assert f'{value:.3f}\n[{low:.3f}, {high:.3f}]' in found.text
+
+
 def test_failed_episode_is_listed_with_its_reason(held, page):
     metrics = json.loads((held / 'metrics.json').read_text())
     (path, why), = metrics['failed'].items()  # fmt: skip
