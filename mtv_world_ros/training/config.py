@@ -8,9 +8,8 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.config_values import check_keys, read_yaml
+from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
@@ -245,9 +244,7 @@ def load_training_config(
     path = Path(preset)
     if path.suffix not in ('.yaml', '.yml'):
         path = share_path('config', 'models', f'{preset}.yaml')
-    if not path.is_file():
-        raise ConfigError(f"preset file '{path}' does not exist; give --preset another one")
-    values = yaml.safe_load(path.read_text()) or {}
+    values = read_yaml(path, 'preset file', '--preset') or {}
     for dotted, value in (overrides or {}).items():
         section, _, key = dotted.partition('.')
         if not key:
@@ -257,14 +254,9 @@ def load_training_config(
 
 
 def _read(kind: Any, values: Any, where: str) -> Any:
-    if not isinstance(values, Mapping):
-        raise ConfigError(f'{where}: expected keys and values, got {values!r}')
-    known = {f.name: f for f in fields(kind)}
-    for key in values:
-        if key not in known:
-            raise ConfigError(f"{where}: unknown key '{key}'{nearest(key, known)}")
+    known = [item.name for item in fields(kind)]
     arguments = {}
-    for key, value in values.items():
+    for key, value in check_keys(values, known, (), where).items():
         default = getattr(kind(), key)
         if hasattr(type(default), '__dataclass_fields__'):
             value = _read(type(default), value, f'{where}: {key}')
