@@ -38,7 +38,7 @@ from mtv_world_ros.training.batches import Batch, BatchSource
 from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.loss import batch_loss
-from mtv_world_ros.training.run import load_recordings, spec_of, spread
+from mtv_world_ros.training.run import load_recordings, spread
 from mtv_world_ros.training.speed import ideal_seconds, measured_peak
 from mtv_world_ros.training.trainer import Trainer
 
@@ -72,7 +72,7 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     overrides = {key: yaml.safe_load(value) for key, _, value in values}
     overrides['optimizer.steps'] = 10**6
     config = load_training_config(options.preset, overrides)
-    spec, robot = spec_of(config), load_robot(robot_path(config.video.robot))
+    spec, robot = config.spec, load_robot(robot_path(config.video.robot))
     paths = spread(select(options.train, default='train').paths, options.episodes)
     recordings, _ = load_recordings(paths, spec, robot, options.work / 'cache')
     actions = kept_actions(options.work, config.video.control, recordings, spec, robot)
@@ -87,13 +87,9 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     )
     source = BatchSource(
         recordings,
-        spec=spec,
+        config,
         robot=robot,
         segmenter=assemble_segmenter('colour'),
-        rendering=config.rendering,
-        object_mask=config.video.object_mask,
-        augment=config.augment,
-        batch_size=config.optimizer.batch_size,
         seed=options.seed,
         actions=actions,
         workers=options.data_workers,

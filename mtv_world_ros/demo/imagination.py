@@ -12,14 +12,14 @@ import subprocess
 import time
 
 from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.data.episode import CALIBRATION_FILE
-from mtv_world_ros.demo.child_processes import (
+from mtv_world_ros.child_processes import (
     module_command,
     private_domain,
     ros_arguments,
     start_process,
     stop_process,
 )
+from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.model.card import read_card, spec_of
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import subprocess
 import time
 
-from mtv_world_ros.demo.child_processes import (
+from mtv_world_ros.child_processes import (
     module_command,
     private_domain,
     ros_arguments,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-import signal
 import subprocess
-import sys
 
+from mtv_world_ros.child_processes import module_command, start_process, stop_process
 from mtv_world_ros.data.episode import (
     camera_info_topic,
     image_topic,
@@ -16,8 +15,6 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-
-_STOP_S = 30.0
 
 
 def record_topics(
@@ -38,7 +35,7 @@ def record_topics(
     try:
         process.wait()
     finally:
-        _stop(process)
+        stop_process(process)
     if process.returncode != 0:
         raise _failure(log)
     return out
@@ -50,28 +47,11 @@ def _start(
     images = [image_topic(view) for view in views]
     optional = [name for image in images for name in (image, f'{image}/compressed')]
     optional += [camera_info_topic(view) for view in views] + [JOINT_TRAJECTORY, INSTRUCTION]
-    command = [sys.executable, '-m', 'mtv_world_ros.ros.recorder', str(out), JOINT_STATES]
-    command += ['--wait-timeout', str(wait_s), '--duration', str(seconds)]
-    command += ['--if-published', *optional]
-    with log.open('wb') as stream:
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is not None:
-        return
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    options = ['--wait-timeout', str(wait_s), '--duration', str(seconds)]
+    command = module_command(
+        'recorder', str(out), JOINT_STATES, *options, '--if-published', *optional
+    )
+    return start_process(log.stem, command, log.parent)
 
 
 def _failure(log: Path) -> EpisodeError:

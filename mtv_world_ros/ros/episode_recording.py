@@ -8,7 +8,7 @@ import subprocess
 
 from std_srvs.srv import Trigger
 
-from mtv_world_ros.demo.child_processes import module_command, start_process, stop_process
+from mtv_world_ros.child_processes import module_command, start_process, stop_process
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.ros.peers import Peers
 

@@ -14,7 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from mtv_world_ros.demo.child_processes import PARENT_VARIABLE
+from mtv_world_ros.child_processes import PARENT_VARIABLE
 from mtv_world_ros.errors import MtvWorldError
 
 _PR_SET_PDEATHSIG = 1
@@ -24,7 +24,7 @@ AnyNode = TypeVar('AnyNode', bound=Node)
 def end_with_parent() -> None:
     """Lets this process get SIGINT when the one that started it is gone, even if it was killed.
 
-    Only where that one asks for it (`demo.child_processes`), and only on Linux.
+    Only where that one asks for it (`child_processes`), and only on Linux.
     """
     parent = os.environ.pop(PARENT_VARIABLE, '')
     if not parent or not sys.platform.startswith('linux'):

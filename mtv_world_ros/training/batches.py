@@ -16,14 +16,13 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.data.clips import chunk_of, clip_starts, cut_clip, Recording
-from mtv_world_ros.data_types import ByteArray, WorldModelSpec
+from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.segmenter import Segmenter
-from mtv_world_ros.training.config import AugmentConfig, HistoryConfig, SelfRolloutConfig
+from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.controls import ControlMaker
 from mtv_world_ros.training.history import draw_past, history_before, history_of_lead, Past
 from mtv_world_ros.training.leads import Lead, lead_before
@@ -90,43 +89,30 @@ class BatchSource:
 
     Args:
         recordings: where clips come from.
-        spec: what the model takes and gives.
+        config: views and times of clips, how they are drawn and disturbed, how many a step.
         robot: of the recordings.
         segmenter: finds the objects of the first frames.
-        rendering: how trajectory videos look.
-        object_mask: whether they carry the objects' masks.
-        augment: disturbances.
-        batch_size: clips of a step, over all processes.
         seed: of choice and disturbances.
         actions: how positions become actions, where they are not drawn.
-        self_rollout: which clips start from the model's own prediction.
-        history: what clips are shown of what came before them.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
-        clip_stride_s: time between the starts of clips [s]; 0 = one from every frame.
     """
 
     def __init__(
         self,
         recordings: Sequence[Recording],
+        config: TrainingConfig,
         *,
-        spec: WorldModelSpec,
         robot: RobotModel,
         segmenter: Segmenter,
-        rendering: TrajectoryVideoConfig,
-        object_mask: bool,
-        augment: AugmentConfig,
-        batch_size: int,
         seed: int,
         actions: ActionEncoding | None = None,
-        self_rollout: SelfRolloutConfig | None = None,
-        history: HistoryConfig | None = None,
         numbers: Sequence[int] | None = None,
         workers: int = 0,
-        clip_stride_s: float = 0.0,
     ) -> None:
-        self._numbers = range(batch_size) if numbers is None else numbers
-        whole = [(r, _spaced(r, clip_starts(r, spec), clip_stride_s)) for r in recordings]
+        self._numbers = range(config.optimizer.batch_size) if numbers is None else numbers
+        spec, stride_s = config.spec, config.video.clip_stride_s
+        whole = [(r, _spaced(r, clip_starts(r, spec), stride_s)) for r in recordings]
         self._starts = [(r, starts) for r, starts in whole if len(starts)]
         if not self._starts:
             raise TrainingError(
@@ -137,13 +123,12 @@ class BatchSource:
         self.controls = ControlMaker(
             robot=robot,
             segmenter=segmenter,
-            rendering=rendering,
-            object_mask=object_mask,
+            rendering=config.rendering,
+            object_mask=config.video.object_mask,
             actions=actions,
         )
-        self._spec, self._augment, self._seed = spec, augment, seed
-        self._self_rollout = self_rollout or SelfRolloutConfig()
-        self._history = history or HistoryConfig()
+        self._spec, self._augment, self._seed = spec, config.augment, seed
+        self._self_rollout, self._history = config.self_rollout, config.history
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None

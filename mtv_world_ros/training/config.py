@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.config_values import check_keys, read_yaml
+from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
+from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.resources import share_path
@@ -202,6 +204,11 @@ class TrainingConfig:
     self_rollout: SelfRolloutConfig = SelfRolloutConfig()
     lora: LoraSettings = LoraSettings()
     optimizer: OptimizerConfig = OptimizerConfig()
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """What a model of this configuration takes and gives."""
+        return spec_of(self.card({}))
 
     def with_steps(self, num_clips: int) -> TrainingConfig:
         """Returns the same with the steps that its epochs come to, where it counts in epochs."""

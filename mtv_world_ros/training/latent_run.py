@@ -9,7 +9,6 @@ from tqdm import tqdm
 
 from mtv_world_ros.data.latent_cache import LatentCache
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.cached_batches import CachedSource
@@ -49,7 +48,7 @@ def cached(
     _check(config)
     assert base is not None
     source.close()
-    controls, spec = source.controls, spec_of(config.card({}))
+    controls, spec = source.controls, config.spec
     settings = settings_of(config, base.folder, controls.robot, controls.segmenter.name, dtype)
     cache = LatentCache(root, settings)
     clips = list_clips(source.starts)

@@ -80,19 +80,6 @@ def load_recordings(
     return recordings, skipped
 
 
-def spec_of(config: TrainingConfig) -> WorldModelSpec:
-    """What a model of this configuration takes and gives."""
-    video = config.video
-    return WorldModelSpec(
-        views=video.views,
-        fps=video.fps,
-        num_frames=video.num_frames,
-        width=video.width,
-        height=video.height,
-        robot=video.robot,
-    )
-
-
 def train(
     config: TrainingConfig,
     dataset: Path | Sequence[Path],
@@ -150,27 +137,20 @@ def train(
     paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
     with processes.main_first():
         recordings, skipped = load_recordings(
-            spread(paths, num_episodes), spec_of(config), robot, cache or out / 'cache'
+            spread(paths, num_episodes), config.spec, robot, cache or out / 'cache'
         )
         actions = kept_actions(
-            out, config.video.control, recordings, spec_of(config), robot, initial=initial
+            out, config.video.control, recordings, config.spec, robot, initial=initial
         )
     source: BatchSource | CachedSource = BatchSource(
         recordings,
-        spec=spec_of(config),
+        config,
         robot=robot,
         segmenter=segmenter,
-        rendering=config.rendering,
-        object_mask=config.video.object_mask,
-        augment=config.augment,
-        batch_size=config.optimizer.batch_size,
         seed=seed,
         actions=actions,
-        self_rollout=config.self_rollout,
-        history=config.history,
         workers=data_workers,
         numbers=processes.share(config.optimizer.batch_size),
-        clip_stride_s=config.video.clip_stride_s,
     )
     base = None
     if make_trainer is Trainer and needs_base(config):  # another one brings its own
@@ -206,7 +186,7 @@ def train(
         (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
         tqdm.write(
             f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
-            f'{source.num_clips} clips, {num_dropped(recordings, spec_of(config))} dropped for '
+            f'{source.num_clips} clips, {num_dropped(recordings, config.spec)} dropped for '
             f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
             f'{processes.count} processes'
         )

@@ -243,7 +243,7 @@ def test_a_recorder_whose_parent_is_killed_closes_its_bag_and_ends(tmp_path, ros
     parent = (
         'import sys, time\n'
         'from pathlib import Path\n'
-        'from mtv_world_ros.demo.child_processes import module_command, start_process\n'
+        'from mtv_world_ros.child_processes import module_command, start_process\n'
         "child = start_process('recorder', module_command('recorder', sys.argv[1], '/said'),\n"
         '                      Path(sys.argv[1]).parent)\n'
         'print(child.pid, flush=True)\n'

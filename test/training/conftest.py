@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from sources import make_source
 
 from mtv_world_ros.data.clips import load_recording, Recording
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.run import spec_of
 
 TINY = {
     'transformer.num_attention_heads': 2,
@@ -50,21 +48,11 @@ def robot() -> RobotModel:
 
 @pytest.fixture(scope='session')
 def recording(episode: Path, tiny: TrainingConfig, robot: RobotModel) -> Recording:
-    return load_recording(episode, spec_of(tiny), robot)
+    return load_recording(episode, tiny.spec, robot)
 
 
 @pytest.fixture
 def source(recording: Recording, tiny: TrainingConfig, robot: RobotModel):
-    batches = BatchSource(
-        [recording],
-        spec=spec_of(tiny),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=tiny.rendering,
-        object_mask=True,
-        augment=tiny.augment,
-        batch_size=1,
-        seed=0,
-    )
+    batches = make_source([recording], tiny, robot)
     yield batches
     batches.close()

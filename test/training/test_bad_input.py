@@ -12,6 +12,7 @@ import signal
 
 import numpy as np
 import pytest
+from sources import make_source
 import torch
 
 from mtv_world_ros.data import messages
@@ -24,7 +25,7 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.run import spec_of, train
+from mtv_world_ros.training.run import train
 from mtv_world_ros.training.state import DiskError
 from mtv_world_ros.training.trainer import Trainer
 
@@ -120,18 +121,7 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
 def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel, source: BatchSource
 ) -> None:
-    workers = BatchSource(
-        [recording],
-        spec=spec_of(tiny),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=tiny.rendering,
-        object_mask=True,
-        augment=tiny.augment,
-        batch_size=1,
-        seed=0,
-        workers=2,
-    )
+    workers = make_source([recording], tiny, robot, workers=2)
     for step in range(3):
         expected, found = source.batch(step), workers.batch(step)
         assert torch.equal(found.start_frame, expected.start_frame)

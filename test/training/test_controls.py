@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sources import make_source, with_batch_size
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -19,12 +20,11 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.actions import fit_actions
-from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.loss import _kept
 from mtv_world_ros.training.objective import pooled_weights
-from mtv_world_ros.training.run import spec_of, train
+from mtv_world_ros.training.run import train
 
 ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']
 
@@ -97,20 +97,9 @@ def test_the_pipeline_hands_the_model_what_training_saw(
 def test_batches_carry_actions_and_no_trajectory_video(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel
 ) -> None:
-    spec = spec_of(tiny)
+    spec = tiny.spec
     actions = fit_actions('fast_tokens', [recording], spec, robot)
-    source = BatchSource(
-        [recording],
-        spec=spec,
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=tiny.rendering,
-        object_mask=True,
-        augment=tiny.augment,
-        batch_size=3,
-        seed=0,
-        actions=actions,
-    )
+    source = make_source([recording], with_batch_size(tiny, 3), robot, actions=actions)
     batch = source.batch(0)
     source.close()
     assert batch.trajectory is None
@@ -122,17 +111,8 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel
 ) -> None:
     def drawn_pixels(object_mask: bool) -> int:
-        source = BatchSource(
-            [recording],
-            spec=spec_of(tiny),
-            robot=robot,
-            segmenter=ColourSegmenter(),
-            rendering=tiny.rendering,
-            object_mask=object_mask,
-            augment=tiny.augment,
-            batch_size=1,
-            seed=0,
-        )
+        drawn = replace(tiny, video=replace(tiny.video, object_mask=object_mask))
+        source = make_source([recording], drawn, robot)
         batch = source.batch(0)
         source.close()
         assert batch.trajectory is not None

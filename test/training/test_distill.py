@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from sources import make_source, with_batch_size
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -24,7 +25,6 @@ from mtv_world_ros.training.distill import (
     DistillTrainer,
     student_config,
 )
-from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
 
 
@@ -82,17 +82,8 @@ def test_a_teacher_with_history_has_a_student_with_history(
     teacher = make_teacher(replace(tiny, history=settings), tmp_path)
     same = make(tmp_path / 'same', teacher, tiny, num_steps=2, teacher_steps=2)
     assert same.config.history == settings
-    source = BatchSource(
-        [recording],
-        spec=spec_of(tiny),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=tiny.rendering,
-        object_mask=True,
-        augment=tiny.augment,
-        batch_size=2,
-        seed=0,
-        history=same.config.history,
+    source = make_source(
+        [recording], with_batch_size(replace(tiny, history=same.config.history), 2), robot
     )
     assert same.loss(source.batch(0)).mean.item() < 1e-7
     source.close()

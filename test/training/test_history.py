@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sources import make_source, with_batch_size
 import torch
 
 from mtv_world_ros.data.clips import frame_indices, Recording
@@ -14,30 +15,17 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import HistoryConfig, load_training_config, TrainingConfig
 from mtv_world_ros.training.distill import student_config
 from mtv_world_ros.training.history import draw_past, history_before
-from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
 
 HISTORY = HistoryConfig(num_frames=4, reference='first_frame')
 
 
 def source_of(config: TrainingConfig, recording: Recording, robot: RobotModel) -> BatchSource:
-    return BatchSource(
-        [recording],
-        spec=spec_of(config),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=config.rendering,
-        object_mask=True,
-        augment=config.augment,
-        batch_size=4,
-        seed=0,
-        history=config.history,
-    )
+    return make_source([recording], with_batch_size(config, 4), robot)
 
 
 def position(recording: Recording, frame: np.ndarray) -> int:
@@ -50,7 +38,7 @@ def test_a_clip_is_shown_what_a_rollout_that_began_earlier_would_show(
     recording: Recording, tiny: TrainingConfig
 ) -> None:
     """Every number of frames up to N comes, the anchor is never younger than the history."""
-    spec, start = spec_of(tiny), 40
+    spec, start = tiny.spec, 40
     clock = frame_indices(recording, 0, spec, int(recording.times[-1] * 5) - 1)
     assert clock is not None
     every = int(clock[1] - clock[0])
@@ -73,7 +61,7 @@ def test_the_recordings_first_frame_has_nothing_before_it(
     recording: Recording, tiny: TrainingConfig
 ) -> None:
     rng = np.random.default_rng(0)
-    history = history_before(recording, 0, spec_of(tiny), replace(HISTORY, first_share=0.0), rng)
+    history = history_before(recording, 0, tiny.spec, replace(HISTORY, first_share=0.0), rng)
     assert history.frames.shape[1] == 0
     assert np.array_equal(history.anchor, recording.frames[:, 0])
 
@@ -83,12 +71,12 @@ def test_noise_levels_are_drawn_up_to_the_largest_and_one_means_nothing(
 ) -> None:
     config = replace(HISTORY, first_share=0.0, dropout=0.25, max_noise=0.2)
     rng = np.random.default_rng(0)
-    history = history_before(recording, 40, spec_of(tiny), config, rng)
+    history = history_before(recording, 40, tiny.spec, config, rng)
     drawn = np.array([draw_past(history, config, rng).sigma for _ in range(400)])
     assert 0.2 < (drawn == 1.0).mean() < 0.3
     levels = drawn[drawn < 1]
     assert levels.min() < 0.02 and 0.18 < levels.max() <= 0.2
-    begun = history_before(recording, 0, spec_of(tiny), config, rng)
+    begun = history_before(recording, 0, tiny.spec, config, rng)
     assert draw_past(begun, config, rng).sigma == 1.0
 
 

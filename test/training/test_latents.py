@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
+from sources import make_source, with_batch_size
 import torch
 from wan_base import make_base, tiny_preset
 
@@ -16,7 +17,6 @@ from mtv_world_ros.data.clips import cut_clip, load_recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.conditioning import condition, encode_chunk
-from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.base import Base, load_base
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.cached_batches import CachedSource
@@ -24,7 +24,6 @@ from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.latent_run import cached
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.processes import Processes
-from mtv_world_ros.training.run import spec_of
 
 CPU = torch.device('cpu')
 
@@ -53,18 +52,8 @@ def copied(tmp_path_factory: pytest.TempPathFactory, episode: Path) -> Path:
 
 
 def source_of(path: Path, config: TrainingConfig, robot: RobotModel) -> BatchSource:
-    return BatchSource(
-        [load_recording(path, spec_of(config), robot)],
-        spec=spec_of(config),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=config.rendering,
-        object_mask=True,
-        augment=config.augment,
-        batch_size=2,
-        seed=0,
-        history=config.history,
-        clip_stride_s=config.video.clip_stride_s,
+    return make_source(
+        [load_recording(path, config.spec, robot)], with_batch_size(config, 2), robot
     )
 
 
@@ -96,7 +85,7 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(
     assert len(starts) == held.num_clips > 2 and (gaps > 2 - 1e-6).all() and (gaps < 2.3).all()
     batch = held.batch(0)
     clip = held._clip(0, 1)
-    cut = cut_clip(recording, clip.start, spec_of(config))
+    cut = cut_clip(recording, clip.start, config.spec)
     frames = torch.from_numpy(cut.frames)[None]
     video, _ = source.controls.make(cut, cut.objects, cut.frames[:, 0])
     autoencoder = base.encoders.autoencoder

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sources import make_source
 import torch
 
 from mtv_world_ros.data.clips import frame_indices, Recording
@@ -26,7 +27,6 @@ from mtv_world_ros.training.config import (
     SelfRolloutConfig,
     TrainingConfig,
 )
-from mtv_world_ros.training.run import spec_of
 from mtv_world_ros.training.trainer import Trainer
 
 
@@ -38,22 +38,6 @@ def rolling(tiny: TrainingConfig) -> TrainingConfig:
         augment=replace(tiny.augment, colour_permutation=0.0, start_noise=0.0),
         self_rollout=SelfRolloutConfig(share=1.0, steps=1, max_chunks=2),
         optimizer=replace(tiny.optimizer, batch_size=3),
-    )
-
-
-def make_source(config: TrainingConfig, recording: Recording, robot: RobotModel) -> BatchSource:
-    return BatchSource(
-        [recording],
-        spec=spec_of(config),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=config.rendering,
-        object_mask=True,
-        augment=config.augment,
-        batch_size=config.optimizer.batch_size,
-        seed=0,
-        self_rollout=config.self_rollout,
-        history=config.history,
     )
 
 
@@ -113,7 +97,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
         lambda *parts: seeds.append((parts[2], noise_seed(*parts))) or seeds[-1][1],
     )
     seen = seen_batches(monkeypatch)
-    source = make_source(rolling, recording, robot)
+    source = make_source([recording], rolling, robot)
     next(trainer.run(source, save_every=100, on_save=lambda _: None))
     source.close()
     before, after = seen[0]
@@ -121,7 +105,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
     rolled = [i for i, lead in enumerate(before.leads) if lead is not None]
     assert rolled
     model = DiffusionWorldModel(load_checkpoint(tmp_path / 'checkpoint'))
-    spec = spec_of(rolling)
+    spec = rolling.spec
     pipeline = Pipeline(
         robot=robot,
         world_model=model,
@@ -179,7 +163,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
 def test_a_killed_run_continues_as_if_nothing_had_happened(
     recording: Recording, rolling: TrainingConfig, robot: RobotModel, tmp_path: Path
 ) -> None:
-    source = make_source(rolling, recording, robot)
+    source = make_source([recording], rolling, robot)
     whole = make_trainer(rolling, tmp_path / 'whole')
     losses = run(whole, source)
     cut = make_trainer(rolling, tmp_path / 'cut')
@@ -197,8 +181,8 @@ def test_off_or_before_its_step_it_changes_nothing(
 ) -> None:
     later = replace(rolling, self_rollout=replace(rolling.self_rollout, start_step=3))
     sources = {
-        'off': make_source(replace(rolling, self_rollout=SelfRolloutConfig()), recording, robot),
-        'later': make_source(later, recording, robot),
+        'off': make_source([recording], replace(rolling, self_rollout=SelfRolloutConfig()), robot),
+        'later': make_source([recording], later, robot),
     }
     for step in range(3):
         off, late = sources['off'].batch(step), sources['later'].batch(step)
@@ -216,7 +200,7 @@ def test_colours_are_exchanged_in_start_and_target_alike(
     """A model that holds its start frame gives back the frame before, in the clip's colours."""
     config = replace(rolling, augment=replace(rolling.augment, colour_permutation=1.0))
     seen = seen_batches(monkeypatch)
-    source = make_source(config, recording, robot)
+    source = make_source([recording], config, robot)
     monkeypatch.setattr(
         self_rollout,
         'sample_latents',

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sources import make_source
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -55,17 +56,8 @@ def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: Robo
                          tmp_path: Path) -> None:  # fmt: skip
     """The loss on the first frames of one episode halves within 60 steps."""
     config = replace(tiny, optimizer=replace(tiny.optimizer, steps=60))
-    source = BatchSource(
-        [recording],
-        spec=_spec(config),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=config.rendering,
-        object_mask=True,
-        augment=replace(config.augment, start_noise=0.0, colour_permutation=0.0),
-        batch_size=1,
-        seed=0,
-    )
+    augment = replace(config.augment, start_noise=0.0, colour_permutation=0.0)
+    source = make_source([recording], replace(config, augment=augment), robot)
     trainer = make(config, tmp_path)
     batch = source.batch(0)
     before = trainer.loss(batch).mean.item()
@@ -74,12 +66,6 @@ def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: Robo
         trainer.step += 1
     source.close()
     assert trainer.loss(batch).mean.item() < 0.5 * before
-
-
-def _spec(config: TrainingConfig):
-    from mtv_world_ros.training.run import spec_of
-
-    return spec_of(config)
 
 
 def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(
@@ -207,17 +193,8 @@ def test_failed_episodes_are_drawn_as_often_as_asked(
 ) -> None:
     failed = replace(recording, outcome='failure', frames=np.zeros_like(recording.frames))
     augment = replace(tiny.augment, start_noise=0.0, failure_share=0.5)
-    source = BatchSource(
-        [recording] * 9 + [failed],
-        spec=_spec(tiny),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=tiny.rendering,
-        object_mask=False,
-        augment=augment,
-        batch_size=1,
-        seed=0,
-    )
+    drawn = replace(tiny, augment=augment, video=replace(tiny.video, object_mask=False))
+    source = make_source([recording] * 9 + [failed], drawn, robot)
     black = [not source.batch(step).frames.any() for step in range(60)]
     source.close()
     # 0.5 + 0.5 / 10, three standard deviations of 60 draws

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.torch import load_file
+from sources import make_source
 import torch
 from wan_base import make_base, tiny_preset
 
@@ -22,7 +23,7 @@ from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.base import load_base
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.run import spec_of, train
+from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
 
 CPU = torch.device('cpu')
@@ -45,24 +46,12 @@ def base(tmp_path_factory: pytest.TempPathFactory, config: TrainingConfig) -> Pa
 
 @pytest.fixture(scope='module')
 def clips(episode: Path, config: TrainingConfig, robot: RobotModel) -> Recording:
-    return load_recording(episode, spec_of(config), robot)
+    return load_recording(episode, config.spec, robot)
 
 
 @pytest.fixture
 def batches(clips: Recording, config: TrainingConfig, robot: RobotModel):
-    source = BatchSource(
-        [clips],
-        spec=spec_of(config),
-        robot=robot,
-        segmenter=ColourSegmenter(),
-        rendering=config.rendering,
-        object_mask=True,
-        augment=config.augment,
-        batch_size=config.optimizer.batch_size,
-        seed=0,
-        history=config.history,
-        clip_stride_s=config.video.clip_stride_s,
-    )
+    source = make_source([clips], config, robot)
     yield source
     source.close()
 

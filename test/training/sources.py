@@ -1,0 +1,26 @@
+"""Batches of recordings, as tests want them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.config import TrainingConfig
+
+
+def with_batch_size(config: TrainingConfig, batch_size: int) -> TrainingConfig:
+    """The same with another batch size."""
+    return replace(config, optimizer=replace(config.optimizer, batch_size=batch_size))
+
+
+def make_source(
+    recordings: Sequence[Recording], config: TrainingConfig, robot: RobotModel, **more: Any
+) -> BatchSource:
+    """Their batches, with colour masks and seed 0."""
+    segmenter = ColourSegmenter()
+    return BatchSource(recordings, config, robot=robot, segmenter=segmenter, seed=0, **more)
