@@ -39,6 +39,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='N',
         help='so many of ten episodes of a task miss their grasp; 5 for mtv-world calibrate',
     )
+    parser.add_argument(
+        '--policies',
+        type=_names,
+        default=(),
+        metavar='NAMES',
+        help='scripted policies that take turns in place of the expert, whatever comes of it, '
+        'e.g. expert,expert-late-0.6,expert-shift-0.03',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
@@ -48,6 +56,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--sheets', action='store_true', help='also a larger contact sheet of every task'
     )
     parser.set_defaults(handler=_collect)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(',') if name.strip())
 
 
 def _collect(arguments: argparse.Namespace) -> int:
@@ -64,7 +76,11 @@ def _collect(arguments: argparse.Namespace) -> int:
         zero_shot=arguments.zero_shot,
         workers=arguments.workers,
         failures_of_ten=arguments.failures_of_ten,
-        config=CollectConfig(randomization=size, moved_share=arguments.moved_cameras),
+        config=CollectConfig(
+            randomization=size,
+            moved_share=arguments.moved_cameras,
+            policies=arguments.policies,
+        ),
         sheets=arguments.sheets,
     )
     return 0

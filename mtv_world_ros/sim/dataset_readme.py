@@ -32,6 +32,7 @@ KEYS = {
     'seed': 'of the episode; it alone reproduces the scene and the motion',
     'attempt': 'seeds dropped before this one',
     'index': 'number within the task',
+    'policy': 'what acted in place of the expert',
     'robot': 'name of the robot, `config/robots/`',
     'zero_shot': '`view`, `task` or `object`: what no training or test episode shows',
 }
@@ -46,7 +47,9 @@ def _number(count: int, noun: str) -> str:
     return f'{count} {noun}{"" if count == 1 else "s"}'
 
 
-def _counts(first: str, groups: Mapping[str, Mapping[str, Any]]) -> str:
+def _counts(
+    first: str, groups: Mapping[str, Mapping[str, Any]], *, is_filtered: bool = True
+) -> str:
     head = (first, 'episodes', 'success', 'failure', 'expert success before filtering', 'length')
     rows = []
     for name, counts in groups.items():
@@ -54,7 +57,7 @@ def _counts(first: str, groups: Mapping[str, Mapping[str, Any]]) -> str:
         rows.append(
             (
                 name, counts['episodes'], counts['success'], counts['failure'],
-                '-' if rate is None else f'{100 * rate:.0f} % of {attempts}',
+                '-' if rate is None or not is_filtered else f'{100 * rate:.0f} % of {attempts}',
                 f'{counts["mean_duration_s"]:.1f} s, {counts["mean_frames"]:.0f} frames',
             )
         )  # fmt: skip
@@ -72,6 +75,8 @@ def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[s
     )
     if share := card['config']['moved_share']:
         options += f' --moved-cameras {share}'
+    if policies := card['config']['policies']:
+        options += f' --policies {",".join(policies)}'
     end = f'--seed {card["seed"]}{options} --out DIR'
     if card['kind'] == ZERO_SHOT_SET:
         return [f'mtv-world collect --zero-shot {kinds} --episodes {number} {end}'
@@ -102,7 +107,8 @@ def _other_configuration(config: Mapping[str, Any]) -> str:
     usual = json.loads(json.dumps(asdict(CollectConfig())))
     for side in ('width', 'height'):
         usual['randomization'][side] = config['randomization'][side]
-    usual['moved_share'] = config['moved_share']
+    for key in ('moved_share', 'policies'):
+        usual[key] = config[key]
     if config == usual:
         return ''
     return (
@@ -167,9 +173,39 @@ def _splits(card: Mapping[str, Any]) -> str:
         )
     train, test = (len(card['splits'][split]) for split in ('train', 'test'))
     return (
-        f'{train} train, {test} test: by the parity of the index within the task, so 5:5; two '
-        'misses in ten, one of either parity. Zero-shot sets are made on their own '
+        f'{train} train, {test} test: by the parity of the index within the task, so 5:5'
+        f'{_misses(card)}. Zero-shot sets are made on their own '
         '(`mtv-world collect --zero-shot view,task,object`).'
+    )
+
+
+def _misses(card: Mapping[str, Any]) -> str:
+    return '' if card['config']['policies'] else '; two misses in ten, one of either parity'
+
+
+def _who(card: Mapping[str, Any]) -> str:
+    policies = card['config']['policies']
+    if not policies:
+        return 'a scripted expert'
+    return f'scripted policies that take turns: {", ".join(f"`{name}`" for name in policies)}'
+
+
+def _how(card: Mapping[str, Any]) -> str:
+    if card['config']['policies']:
+        return 'their faults were too large'
+    return 'a grasp misses and the motion goes on'
+
+
+def _filtering(card: Mapping[str, Any]) -> str:
+    if card['config']['policies']:
+        return (
+            'Whatever comes of it is kept; a scene that cannot be built, or in which the policy '
+            'finds no plan, is dropped and the next seed is tried.'
+        )
+    return (
+        "An expert's attempt that fails is dropped and the next seed is tried, scenes that cannot "
+        'be built\nincluded; "before filtering" is the share of attempts that succeeded, of the '
+        'episodes that were to\nsucceed.'
     )
 
 
@@ -193,8 +229,8 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
     size = f'{_number(len(entries), "episode")} of {_number(len(card["tasks"]), "task")}'
     return f"""# {what}: {size}
 
-Two YAM arms in MuJoCo and a scripted expert. {_number(outcomes['success'], 'episode')} with
-success; in the other {outcomes['failure']} a grasp misses and the motion goes on. Each episode
+Two YAM arms in MuJoCo and {_who(card)}. {_number(outcomes['success'], 'episode')} with
+success; in the other {outcomes['failure']} {_how(card)}. Each episode
 is a rosbag2 MCAP folder like a robot's recording; `dataset.json` says the same, and more, as data.
 
 ![a success and a failure of every task]({SHEET_FILE})
@@ -210,11 +246,9 @@ where it stopped.
 {_other_configuration(card['config'])}
 ## Tasks
 
-{_counts('task', card['tasks'])}
+{_counts('task', card['tasks'], is_filtered=not card['config']['policies'])}
 
-An expert's attempt that fails is dropped and the next seed is tried, scenes that cannot be built
-included; "before filtering" is the share of attempts that succeeded, of the episodes that were to
-succeed.
+{_filtering(card)}
 
 ## Splits
 

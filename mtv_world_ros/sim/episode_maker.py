@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.errors import EpisodeError, SimulatorError
+from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.resources import share_path
 from mtv_world_ros.sim.cameras import CameraMoves, TRAINING_MOVES
@@ -15,6 +15,7 @@ from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.files import GO_ON
 from mtv_world_ros.sim.jobs import episode_seed, Job
+from mtv_world_ros.sim.policy_variant import parse_variant
 from mtv_world_ros.sim.randomize import RandomizationConfig
 from mtv_world_ros.sim.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.tasks import task_named
@@ -34,6 +35,8 @@ class CollectConfig:
         zero_shot: where the cameras of zero-shot views stand.
         moved_share: share of ordinary episodes whose cameras stand elsewhere too.
         moves: ranges that such an episode chooses from; they leave zero-shot views unseen.
+        policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
+            whose grasps miss.
     """
 
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -42,6 +45,7 @@ class CollectConfig:
     zero_shot: CameraMoves = CameraMoves()
     moved_share: float = 0.0
     moves: tuple[CameraMoves, ...] = TRAINING_MOVES
+    policies: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 <= self.moved_share <= 1:
@@ -49,6 +53,8 @@ class CollectConfig:
                 f'the share of episodes with moved cameras is {self.moved_share}; it must be in '
                 '[0, 1]; set --moved-cameras'
             )
+        for name in self.policies:
+            parse_variant(name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,9 +115,12 @@ class EpisodeMaker:
         if job.zero_shot is None:
             randomization = cameras_of(seed, config)
         sim = SimEpisode(self._robot, self._expert.home, randomization)
+        faulty = parse_variant(job.policy) if job.policy else None
         try:
-            return sim, simulate(sim, self._expert, task, seed, config.record, miss=job.miss)
-        except SimulatorError:
+            return sim, simulate(
+                sim, self._expert, task, seed, config.record, miss=job.miss, variant=faulty
+            )
+        except (SimulatorError, PolicyError):
             return sim, None
 
     def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
@@ -119,6 +128,8 @@ class EpisodeMaker:
         extra = {'attempt': str(attempt), 'index': str(job.index)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
+        if job.policy:
+            extra['policy'] = job.policy
         try:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:

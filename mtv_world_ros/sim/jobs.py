@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import zlib
 
@@ -29,6 +29,7 @@ class Job:
         miss: whether the grasp misses.
         path: folder to make.
         zero_shot: `view`, `task` or `object`; None = an ordinary episode.
+        policy: name of the scripted policy that acts in place of the expert; empty = the expert.
     """
 
     task: str
@@ -37,6 +38,7 @@ class Job:
     miss: bool
     path: Path
     zero_shot: str | None = None
+    policy: str = ''
 
 
 def episode_seed(
@@ -64,9 +66,22 @@ def _number(task: str, zero_shot: str | None) -> int:
 
 
 def jobs_of(
-    tasks: Sequence[Task], num_episodes: int, seed: int, out: Path, num_of_ten: int = NUM_MISSED
+    tasks: Sequence[Task],
+    num_episodes: int,
+    seed: int,
+    out: Path,
+    num_of_ten: int = NUM_MISSED,
+    policies: Sequence[str] = (),
 ) -> list[Job]:
     """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
+
+    Args:
+        tasks: what to do.
+        num_episodes: of each.
+        seed: of the data set.
+        out: its folder.
+        num_of_ten: how many of ten grasps of the expert miss.
+        policies: scripted policies that take turns in every task; none = the expert.
 
     Raises:
         SimulatorError: not 0 to 10 of ten episodes are to miss.
@@ -75,11 +90,14 @@ def jobs_of(
         raise SimulatorError(
             f'{num_of_ten} of {BLOCK} episodes are to miss; set --failures-of-ten to 0 ... {BLOCK}'
         )
-    return [
+    jobs = [
         _job(task, index, seed, out, num_of_ten=num_of_ten)
         for index in range(num_episodes)
         for task in tasks
     ]
+    if not policies:
+        return jobs
+    return [replace(job, miss=False, policy=policies[job.index % len(policies)]) for job in jobs]
 
 
 def zero_shot_jobs(

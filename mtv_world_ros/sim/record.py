@@ -1,4 +1,4 @@
-"""Simulates one episode with the expert as the policy, and writes it as a bag."""
+"""Simulates one episode with the expert or a faulty variant of it, and writes it as a bag."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.episode import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.sim.expert import Expert
+from mtv_world_ros.sim.policy_variant import PolicyVariant
 from mtv_world_ros.sim.predicates import ever_and_final
+from mtv_world_ros.sim.scripted_policy import ScriptedPolicy
 from mtv_world_ros.sim.tasks import Task
 
 #: stamp of every episode's first frame [ns]; ROS takes zero for "not set"
@@ -59,11 +61,12 @@ class Take:
     Attributes:
         observations: T, one a frame.
         control_positions: (C, J) measured joints at every control period.
-        commands: what the expert commanded.
+        commands: what the policy commanded.
         ever: the task's predicate held in some frame.
         final: it held in each of the last frames.
         moved: role -> distance of the object from its start at the end [m].
         missed: role of the object that the gripper is to miss; None = none.
+        any_outcome: the policy has faults, and what comes of them is as wanted.
         physics_s: CPU time of planning and physics.
         rendering_s: CPU time of building the scene and rendering.
     """
@@ -75,11 +78,14 @@ class Take:
     final: bool
     moved: dict[str, float]
     missed: str | None
+    any_outcome: bool
     physics_s: float
     rendering_s: float
 
     def is_as_wanted(self) -> bool:
         """Returns whether a success succeeded and held, or a miss left its object alone."""
+        if self.any_outcome:
+            return True
         if self.missed is not None:
             return not self.ever and self.moved[self.missed] < MISS_TOLERANCE_M
         return self.ever and self.final
@@ -91,17 +97,39 @@ def expert_generator(seed: int) -> np.random.Generator:
 
 
 def simulate(
-    sim: SimEpisode, expert: Expert, task: Task, seed: int, config: RecordConfig, *, miss: bool
+    sim: SimEpisode,
+    expert: Expert,
+    task: Task,
+    seed: int,
+    config: RecordConfig,
+    *,
+    miss: bool,
+    variant: PolicyVariant | None = None,
 ) -> Take:
-    """Runs the expert open loop on the episode of a seed.
+    """Runs the expert, or a faulty variant of it, open loop on the episode of a seed.
+
+    Args:
+        sim: is reset.
+        expert: plans.
+        task: what to do.
+        seed: of the episode.
+        config: how it is sampled.
+        miss: the expert displaces one grasp.
+        variant: runs in place of the expert; None = the expert.
 
     Raises:
         SimulatorError: the expert cannot reach a way point.
+        PolicyError: the variant finds no plan.
     """
     started = time.process_time()
     observations = [sim.reset(seed, task)]
     rendering = time.process_time() - started
-    commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
+    if variant is None:
+        commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
+    else:
+        policy = ScriptedPolicy(variant, expert, task, sim.scene)
+        policy.reset(seed=seed)
+        commands = policy.plan
     measured = [sim.positions()]
     every = round(config.frame_period_s / CONTROL_PERIOD_S)
     last = len(commands.times) - 1
@@ -126,6 +154,7 @@ def simulate(
             for role, centres in history.positions.items()
         },
         missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
+        any_outcome=variant is not None,
         physics_s=time.process_time() - started - rendering,
         rendering_s=rendering,
     )

@@ -1,3 +1,4 @@
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
+from mtv_world_ros.cli import main
 from mtv_world_ros.data.mcap_reader import iter_messages, read_episode, read_info
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.sim.collect import collect
@@ -67,6 +69,33 @@ def _wait_for(condition, seconds=60.0):
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def test_policies_take_turns_and_whatever_comes_of_it_is_kept(tmp_path):
+    config = replace(SMALL, policies=('expert-stop-0', 'expert-late-0.2'))
+    entries = collect(TASKS, 2, SEED, tmp_path, config=config, progress=False)
+    said = {}
+    for entry in entries:
+        metadata = read_info(tmp_path / entry.name).metadata
+        said[entry.name] = (metadata['policy'], entry.outcome)
+        assert entry.attempt == 0 or entry.outcome == 'success'
+    assert [name for name, _ in said.values()] == ['expert-stop-0'] * 2 + ['expert-late-0.2'] * 2
+    stood = [outcome for name, outcome in said.values() if name == 'expert-stop-0']
+    assert stood == ['failure'] * 2  # the arms never move
+    still = read_episode(tmp_path / 'stack_blocks_two_00000').joint_states.positions
+    assert np.ptp(still, axis=0).max() < 0.01
+    text = (tmp_path / 'README.md').read_text()
+    assert '--policies expert-stop-0,expert-late-0.2 --out DIR' in text
+    assert 'a grasp misses' not in text
+    with pytest.raises(SimulatorError, match='another seed|configuration'):
+        _collect(tmp_path)
+
+
+def test_unknown_policy_is_refused_before_anything_is_made(tmp_path, capsys):
+    command = ['collect', '--task', TASKS, '--episodes', '1', '--out', str(tmp_path / 'set')]
+    assert main([*command, '--policies', 'expert,expert-lat-0.6']) == 1
+    assert "unknown fault 'lat' (did you mean 'late'?)" in capsys.readouterr().err
+    assert not (tmp_path / 'set').exists()
 
 
 def test_the_same_seed_gives_byte_equal_sets_in_other_processes(data_set, tmp_path):
