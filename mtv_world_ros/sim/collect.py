@@ -80,8 +80,13 @@ def collect(
         raise SimulatorError(
             f'episodes is {num_episodes} and workers is {workers}; both must be at least 1'
         )
-    load_mujoco()
     out, config = Path(out), config or CollectConfig()
+    if kinds and (config.policies or config.moved_share):
+        raise SimulatorError(
+            'a zero-shot set is acted by the expert and brings its own cameras; leave '
+            '--policies and --moved-cameras out, or --zero-shot'
+        )
+    load_mujoco()
     jobs = (
         zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
         if kinds

@@ -98,6 +98,14 @@ def test_unknown_policy_is_refused_before_anything_is_made(tmp_path, capsys):
     assert not (tmp_path / 'set').exists()
 
 
+@pytest.mark.parametrize('options', [['--policies', 'expert'], ['--moved-cameras', '0.5']])
+def test_zero_shot_sets_take_neither_policies_nor_moved_cameras(options, tmp_path, capsys):
+    command = ['collect', '--zero-shot', 'view', '--episodes', '1', '--out', str(tmp_path / 'set')]
+    assert main([*command, *options]) == 1
+    assert 'leave --policies and --moved-cameras out' in capsys.readouterr().err
+    assert not (tmp_path / 'set').exists()
+
+
 def test_the_same_seed_gives_byte_equal_sets_in_other_processes(data_set, tmp_path):
     _collect(tmp_path, workers=2)
     assert len(_names(tmp_path)) == 4
