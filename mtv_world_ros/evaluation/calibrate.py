@@ -11,7 +11,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.logistic import fit_logistic
+from mtv_world_ros.evaluation.logistic import fit_non_negative
 from mtv_world_ros.evaluation.outcomes import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.success.calibration import Calibration, weighed
@@ -151,7 +151,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
     # imagination rarely shows what failed, as an object left behind: there, what was stated holds
     stated = EstimatorConfig().weights
     prior = scales * [stated.get(name, 0.0) for name in FEATURES]
-    logistic = fit_logistic(standard, labels, l2=l2, prior=prior)
+    logistic = fit_non_negative(standard, labels, l2=l2, prior=prior)
     return {
         'features': FEATURES,
         'means': tuple(means.tolist()),

@@ -71,5 +71,33 @@ def fit_logistic(
     return Logistic(weights=theta[:-1], bias=float(theta[-1]))
 
 
+def fit_non_negative(
+    features: FloatArray, labels: BoolArray, *, l2: float = 1.0, prior: FloatArray
+) -> Logistic:
+    """Fits with weights of at least 0, for features that are larger where it is likelier.
+
+    A feature whose weight comes out negative, the most negative one first, is left out (weight
+    0) and the others are fitted again.
+
+    Args:
+        features: (N, F).
+        labels: (N,).
+        l2: see `fit_logistic`.
+        prior: (F,), at least 0.
+
+    Raises:
+        ConfigError: see `fit_logistic`.
+    """
+    kept = np.arange(features.shape[1])
+    while True:
+        found = fit_logistic(features[:, kept], labels, l2=l2, prior=prior[kept])
+        if (found.weights >= 0).all():
+            break
+        kept = np.delete(kept, int(np.argmin(found.weights)))
+    weights = np.zeros(features.shape[1])
+    weights[kept] = found.weights
+    return Logistic(weights=weights, bias=found.bias)
+
+
 def _sigmoid(logits: FloatArray) -> FloatArray:
     return 0.5 * (1 + np.tanh(logits / 2))

@@ -10,7 +10,7 @@ import pytest
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.evaluation.calibrate import AFTER, BEFORE, calibrate, FITTED, Sample
 from mtv_world_ros.evaluation.calibration_report import markdown, write_calibration_report
-from mtv_world_ros.evaluation.logistic import fit_logistic
+from mtv_world_ros.evaluation.logistic import fit_logistic, fit_non_negative
 from mtv_world_ros.evaluation.outcomes import (
     agreement,
     area_under_roc,
@@ -107,6 +107,25 @@ def test_logistic_needs_rows_and_a_penalty():
         fit_logistic(np.zeros((0, 2)), np.zeros(0, bool))
     with pytest.raises(ConfigError, match='l2 = 0'):
         fit_logistic(np.zeros((2, 2)), np.zeros(2, bool), l2=0)
+
+
+def test_weights_are_not_negative_and_are_the_best_of_those():
+    rng = np.random.default_rng(3)
+    features = rng.normal(size=(200, 3))
+    labels = rng.uniform(size=200) < 1 / (1 + np.exp(-2 * features[:, 0] + features[:, 1]))
+    prior = np.array([0.5, 0.5, 0.5])
+    found = fit_non_negative(features, labels, l2=1.0, prior=prior)
+    assert found.weights[1] == 0 and found.weights[0] > 1 and found.weights[2] >= 0
+
+    def objective(weights, bias):
+        logits = features @ weights + bias
+        likelihood = np.logaddexp(0, logits).sum() - logits[labels].sum()
+        return likelihood + 0.5 * ((weights - prior) ** 2).sum()
+
+    best = objective(found.weights, found.bias)
+    for _ in range(500):
+        weights = np.maximum(found.weights + rng.normal(scale=0.1, size=3), 0)
+        assert objective(weights, found.bias + rng.normal(scale=0.1)) >= best - 1e-9
 
 
 def made_samples(num=60, seed=0, tasks=('stack', 'serve', 'shake')):
