@@ -124,7 +124,7 @@ def reliability_page(found: Calibrated) -> str:
     figures = []
     for name in (BEFORE, AFTER):
         title = f'Share of real successes against the estimate, {_ROWS[name]}'
-        chart = reliability_chart(title, reliability_bins(found.judgements[name]), 'imagined')
+        chart = reliability_chart(title, reliability_bins(found.judgements[name]), 'c0')
         figures.append(element('figure', element('figcaption', _ROWS[name]), chart))
     head = element(
         'head',
