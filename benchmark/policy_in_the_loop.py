@@ -23,10 +23,11 @@ from page import parse_arguments, publish, table
 
 from mtv_world_ros.assembly import assemble_policy, load_pipeline
 from mtv_world_ros.data.bag_reader import BagReader
-from mtv_world_ros.data.mcap_reader import list_episodes, read_info
+from mtv_world_ros.data.mcap_reader import read_info
 from mtv_world_ros.data.messages import deserialize, header_stamp
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
+from mtv_world_ros.evaluation.dataset import select
 from mtv_world_ros.model import world_model as model_module
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.living import live
@@ -76,7 +77,7 @@ class MemoryWatch(Thread):
 def main() -> None:
     """Runs the episodes, reads their bags and prints the page."""
     options = parse_arguments(__doc__, repeats=20, more=_add_options)
-    episodes = tuple(list_episodes(options.data))[: options.repeats]
+    episodes = tuple(select(options.data, 'all', options.repeats).paths)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / 'policy.yaml').write_text(POLICY)
