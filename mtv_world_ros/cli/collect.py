@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from mtv_world_ros.cli.options import names
+
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
@@ -41,7 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         '--policies',
-        type=_names,
+        type=names,
         default=(),
         metavar='NAMES',
         help='scripted policies that take turns in place of the expert, whatever comes of it, '
@@ -56,10 +58,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--sheets', action='store_true', help='also a larger contact sheet of every task'
     )
     parser.set_defaults(handler=_collect)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(',') if name.strip())
 
 
 def _collect(arguments: argparse.Namespace) -> int:

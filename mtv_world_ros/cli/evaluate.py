@@ -15,6 +15,7 @@ from mtv_world_ros.cli.options import (
     add_segmenter,
     add_serving,
     add_task,
+    names,
     pipeline_choices,
     threads_of_workers,
 )
@@ -54,7 +55,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--workers', type=int, default=1, help='processes that score episodes')
     parser.add_argument(
         '--actions',
-        type=_names,
+        type=names,
         default=('true', 'shuffled'),
         metavar='LIST',
         help='what is imagined, of true,shuffled,zero,mirrored; default: true,shuffled',
@@ -72,7 +73,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='whose masks of the recorded frames are the truth',
     )
     parser.add_argument(
-        '--quality', type=_names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
+        '--quality', type=names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
     )
     parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
     parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
@@ -90,10 +91,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_segmenter(parser)
     add_task(parser)
     parser.set_defaults(handler=_evaluate)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(',') if name.strip())
 
 
 class Entry(NamedTuple):

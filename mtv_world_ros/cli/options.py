@@ -49,6 +49,11 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def names(text: str) -> tuple[str, ...]:
+    """Returns the names of a comma-separated list, as an option's type."""
+    return tuple(name.strip() for name in text.split(',') if name.strip())
+
+
 def _num_steps(text: str) -> int:
     number = int(text)
     if number < 0:

@@ -88,9 +88,18 @@ class Placed:
 
     def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
         """See `Situation`."""
-        cameras = {camera.view: camera for camera in self.views.footage.cameras}
-        painted = {view: picture.region(cameras[view]) for view, picture in regions.items()}
-        shares = self.views.share_inside(self.item(role), painted)
+        cameras = self.views.footage.cameras
+        painted = np.stack(
+            [
+                regions[c.view].region(c)
+                if c.view in regions
+                else np.zeros((c.height, c.width), bool)
+                for c in cameras
+            ]
+        )
+        has_region = np.array([camera.view in regions for camera in cameras])
+        inside = self.views.share_inside(self.item(role), painted)
+        shares = np.where(has_region, inside, np.nan)
         self._known(role, shares)
         return float(np.nanmin(shares))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,24 +123,17 @@ class Views:
         scores = np.median(jaccard(masks, reference[:, None]), axis=1)
         return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
 
-    def share_inside(self, item: int, regions: Mapping[str, BoolArray]) -> FloatArray:
-        """Returns (V,) shares of an object's mask in (H, W) regions by view; NaN = not known."""
-        shares = np.full(len(self.footage.cameras), np.nan)
-        known = self.end_ok(item)
-        for row, camera in enumerate(self.footage.cameras):
-            if camera.view in regions and known[row]:
-                masks = self.footage.masks.masks[row, item, -self.config.last_frames :]
-                inside = (masks & regions[camera.view]).sum((-2, -1))
-                shares[row] = np.median(inside / np.maximum(masks.sum((-2, -1)), 1))
-        return shares
+    def share_inside(self, item: int, regions: BoolArray) -> FloatArray:
+        """Returns (V,) shares of an object's mask in (V, H, W) regions; NaN = not known."""
+        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        area = np.maximum(masks.sum((-2, -1)), 1)
+        shares = np.median((masks & regions[:, None]).sum((-2, -1)) / area, axis=1)
+        return np.where(self.end_ok(item), shares, np.nan)
 
     def containment(self, item: int, within: int) -> float:
         """Returns the share of an object's mask in another's last unhidden one; the least."""
-        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
-        both = masks & self.memory.seen_masks[:, within, None]
-        area = np.maximum(masks.sum((-2, -1)), 1)
-        shares = np.median(both.sum((-2, -1)) / area, axis=1)
-        known = self.end_ok(item) & self.start_ok(within)
+        shares = self.share_inside(item, self.memory.seen_masks[:, within])
+        known = np.isfinite(shares) & self.start_ok(within)
         return float(shares[known].min()) if known.any() else float('nan')
 
     def check_visible(self, item: int) -> None:
