@@ -126,6 +126,28 @@ class RobotModel:
         offsets = np.stack([tool.T_link_tool for tool in self.tools])
         return self._poses(positions, [tool.link for tool in self.tools]) @ offsets[:, None]
 
+    def arm_points(self, positions: FloatArray) -> list[FloatArray]:
+        """Returns, for each arm, points (N, T, 3) along it for positions (T, J).
+
+        They are the origins of the joints that carry its tool, from the base on, and the tool
+        centre point; lines between them are a skeleton of the arm [m].
+        """
+        model, data = self.pinocchio_model, self.pinocchio_model.createData()
+        frames = [self._frame(tool.link) for tool in self.tools]
+        chains = [list(model.supports[model.frames[frame].parentJoint])[1:] for frame in frames]
+        base = self._frame(self.base_link)
+        configurations = self._configurations(positions)
+        arms = [np.empty((len(chain) + 1, len(configurations), 3)) for chain in chains]
+        for t, configuration in enumerate(configurations):
+            pin.forwardKinematics(model, data, configuration)
+            to_base = pin.updateFramePlacement(model, data, base).inverse()
+            for points, chain, frame, tool in zip(arms, chains, frames, self.tools, strict=True):
+                for n, joint in enumerate(chain):
+                    points[n, t] = to_base.act(data.oMi[joint].translation)
+                link = to_base * pin.updateFramePlacement(model, data, frame)
+                points[-1, t] = link.act(tool.T_link_tool[:3, 3])
+        return arms
+
     def gripper_openings(self, positions: FloatArray) -> FloatArray:
         """Returns (A, T) openings in [0, 1] for positions (T, J); 1 where there is no gripper."""
         openings = np.ones((len(self.tools), len(positions)))

@@ -31,6 +31,7 @@ from mtv_world_ros.rendering.glow import (
     Stamps,
     Trail,
 )
+from mtv_world_ros.rendering.links import ArmLinks
 from mtv_world_ros.rendering.tool_motion import tool_motion, ToolMotion
 
 
@@ -47,6 +48,8 @@ class TrajectoryVideoConfig:
         points_per_frame: least number of trail points from one frame to the next.
         max_gap_m: largest distance of trail points from each other [m], so that the trails of
             fast arms have no gaps; None leaves it at `points_per_frame`.
+        link_width_m: width of lines along each arm, from joint to joint, under the trails [m];
+            None = none, as in the paper.
     """
 
     half_life_s: float = 0.5
@@ -56,6 +59,7 @@ class TrajectoryVideoConfig:
     show_gripper: bool = True
     points_per_frame: int = 3
     max_gap_m: float | None = None
+    link_width_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ('half_life_s', 'point_radius_m', 'min_radius_px'):
@@ -70,14 +74,18 @@ class TrajectoryVideoConfig:
                 f'rendering.points_per_frame is {self.points_per_frame}, must be a whole number '
                 'of at least 1'
             )
-        if self.max_gap_m is not None and not self.max_gap_m > 0:
-            raise ConfigError(f'rendering.max_gap_m is {self.max_gap_m}, must be > 0 or null')
+        for name in ('max_gap_m', 'link_width_m'):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise ConfigError(f'rendering.{name} is {value}, must be > 0 and finite, or null')
 
 
 #: the core that shows a closed gripper, as a share of the glow's standard deviation
 _CORE_SHARE = 0.55
 #: smallest standard deviation of the core, so that it shows between pixels too [px]
 _LEAST_CORE_PX = 0.7
+#: brightness of an arm's lines, as a share of its trail's
+_LINK_SHARE = 0.5
 #: points nearer than this are drawn as large as at this depth [m]
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
@@ -184,10 +192,16 @@ def _draw_view(
     ]
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
     paints = [_Paint(arm_colour(arm, num_arms)) for arm in range(num_arms)]
+    links = None
+    if config.link_width_m is not None:
+        links = ArmLinks(camera, poses, robot.arm_points(positions), config.link_width_m)
     white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
     for k, trail_images in enumerate(zip(*trails, strict=True)):
+        if links is not None:
+            for arm in orders[:, k]:
+                links.draw(frames[k], arm, k, _LINK_SHARE * arm_colour(arm, num_arms))
         for arm in orders[:, k]:
             glow, box = trail_images[arm]
             paints[arm].lay(frames[k], glow, box)

@@ -95,6 +95,21 @@ def test_the_tool_is_the_grasp_point_not_the_flange(yam):
     np.testing.assert_allclose(np.linalg.norm(tool - flange, axis=1), 0.1347, atol=1e-9)
 
 
+def test_the_points_along_an_arm_are_those_of_its_links_and_its_tool(yam):
+    positions = np.linspace(yam.lower, yam.upper, 5) * 0.7
+    links, tools = yam.forward_kinematics(positions), yam.tool_poses(positions)
+    origins = np.stack([poses[:, :3, 3] for poses in links.values()])
+    arms = yam.arm_points(positions)
+    assert len(arms) == len(yam.tools)
+    for points, tool in zip(arms, tools, strict=True):
+        assert points.shape[1:] == (5, 3) and len(points) >= 7
+        np.testing.assert_allclose(points[-1], tool[:, :3, 3], atol=1e-12)
+        for joint in points[:-1]:  # each joint's origin is that of the link it carries
+            assert np.abs(origins - joint).max(axis=(1, 2)).min() < 1e-12
+    # the two arms have no joint in common
+    assert np.abs(arms[0][:-1, None] - arms[1][None, :-1]).max(axis=(2, 3)).min() > 0.01
+
+
 def test_limits_and_joint_order_are_the_published_ones(yam):
     assert len(yam.joint_names) == 14
     assert yam.joint_names[6] == 'left_gripper' and yam.joint_names[13] == 'right_gripper'

@@ -379,7 +379,7 @@ def test_what_does_not_fit_together_is_refused(one_arm, make_camera):
     [
         ('half_life_s', 0), ('point_radius_m', -1), ('min_radius_px', float('nan')),
         ('object_fill', 1.5), ('points_per_frame', 0), ('points_per_frame', 1.5),
-        ('max_gap_m', 0.0),
+        ('max_gap_m', 0.0), ('link_width_m', 0.0), ('link_width_m', float('inf')),
     ],
 )  # fmt: skip
 def test_wrong_settings_are_named(key, value):
