@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from diffusers.models.attention_dispatch import _AttentionBackendRegistry
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
@@ -26,12 +27,7 @@ def prepare(
         ConfigError: an option is not for this machine.
     """
     if serving.attention:
-        try:
-            transformer.set_attention_backend(serving.attention)
-        except (ValueError, RuntimeError, ImportError) as error:
-            raise ConfigError(
-                f"serving: attention '{serving.attention}' cannot be used: {error}"
-            ) from error
+        _set_attention(transformer, serving.attention)
     if serving.weights == 'float8':
         convert(transformer)
     if serving.offload:
@@ -47,6 +43,17 @@ def prepare(
         compile_blocks(transformer, device)
     if serving.cuda_graphs:
         capture(transformer, device)
+
+
+def _set_attention(transformer: MultiViewWanTransformer, name: str) -> None:
+    before, _ = _AttentionBackendRegistry.get_active_backend()
+    try:
+        transformer.set_attention_backend(name)
+    except (ValueError, RuntimeError, ImportError) as error:
+        raise ConfigError(f"serving: attention '{name}' cannot be used: {error}") from error
+    finally:
+        # diffusers sets it for all other models of the process, too
+        _AttentionBackendRegistry.set_active_backend(before)
 
 
 def decoder_of(
