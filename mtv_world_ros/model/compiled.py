@@ -15,6 +15,8 @@ from mtv_world_ros.model.transformer import MultiViewWanTransformer
 
 #: passes before a capture: kernels are chosen and compiled in them
 _WARM_UP = 3
+#: shapes that may be compiled: numbers of seeds, of views; torch gives up after 8
+_MOST_SHAPES = 64
 _COMPILERS = {'cpu': ('CXX', ('g++', 'clang++')), 'cuda': ('CC', ('gcc', 'clang', 'cc'))}
 
 
@@ -31,6 +33,8 @@ def compile_blocks(transformer: MultiViewWanTransformer, device: torch.device) -
             f'serving: compile=true needs a compiler ({" or ".join(names)}) on the path or named '
             f'by {variable}; install one (apt install g++), or leave it out'
         )
+    limits = torch._dynamo.config
+    limits.recompile_limit = max(limits.recompile_limit, _MOST_SHAPES)
     transformer.compile_repeated_blocks(fullgraph=True, dynamic=False)
 
 
@@ -42,23 +46,32 @@ def capture(transformer: MultiViewWanTransformer, device: torch.device) -> None:
     """
     if device.type != 'cuda':
         raise ConfigError(f'serving: cuda_graphs=true needs a CUDA device, device is {device}')
-    transformer.forward = _Captured(transformer)
+    transformer.forward = _Captured(transformer, device)
 
 
 class _Graph:
-    """A captured pass with the tensors that it reads and writes."""
+    """A captured pass with the tensors that it reads and writes.
 
-    def __init__(self, forward: Any, arguments: dict[str, Any]) -> None:
+    Args:
+        forward: what to capture.
+        arguments: of the pass; shapes count.
+        side: stream of the device, for the capture.
+        pool: of memory that all graphs of a transformer share: they run one after the other, and
+            nobody keeps what is in it.
+    """
+
+    def __init__(self, forward: Any, arguments: dict[str, Any], side: Any, pool: Any) -> None:
         self._inputs = {name: t.clone() for name, t in arguments.items()}
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(_WARM_UP):
-                forward(**self._inputs)
-        torch.cuda.current_stream().wait_stream(side)
         self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._out = forward(**self._inputs)
+        # streams are those of the device that is current, which is the first one otherwise
+        with torch.cuda.device(side.device):
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(_WARM_UP):
+                    forward(**self._inputs)
+            torch.cuda.current_stream().wait_stream(side)
+            with torch.cuda.graph(self._graph, pool=pool, stream=side):
+                self._out = forward(**self._inputs)
 
     def replay(self, arguments: dict[str, Any]) -> Tensor:
         for name, tensor in arguments.items():
@@ -68,8 +81,9 @@ class _Graph:
 
 
 class _Captured:
-    def __init__(self, transformer: MultiViewWanTransformer) -> None:
+    def __init__(self, transformer: MultiViewWanTransformer, device: torch.device) -> None:
         self._forward: Any = transformer.forward
+        self._side, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
         self._names = list(inspect.signature(self._forward).parameters)
         self._graphs: dict[tuple[Any, ...], _Graph] = {}
 
@@ -78,5 +92,5 @@ class _Captured:
         arguments = {name: value for name, value in given.items() if value is not None}
         key = tuple((name, tuple(t.shape), t.dtype) for name, t in sorted(arguments.items()))
         if key not in self._graphs:
-            self._graphs[key] = _Graph(self._forward, arguments)
+            self._graphs[key] = _Graph(self._forward, arguments, self._side, self._pool)
         return self._graphs[key].replay(arguments)
