@@ -57,10 +57,12 @@ class ServingOptions:
             for other in others:
                 if self._is_on(one) and self._is_on(other):
                     raise ConfigError(f'serving: {one} and {other} exclude each other')
-        if not self.fuse_lora and (self.context_parallel > 1 or self.weights == 'float8'):
+        fixed = self.context_parallel > 1 or self.cuda_graphs or self.offload
+        if not self.fuse_lora and (fixed or self.weights == 'float8'):
             raise ConfigError(
-                'serving: context_parallel and weights=float8 need fuse_lora=true: the weights '
-                'are all there is of an adapter'
+                'serving: context_parallel, cuda_graphs, offload and weights=float8 need '
+                'fuse_lora=true: they know the weights alone, no adapter that is exchanged beside '
+                'them'
             )
         if self.tiny_encoder and not self.tiny_decoder:
             raise ConfigError("serving: tiny_encoder=true needs tiny_decoder, the weights' file")
