@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from mtv_world_ros.geometry.robot import RobotModel
 
 _PLAIN = ServingOptions()
+#: in errors that have no class of their own: of torch on a CPU, of CUDA, cuBLAS and cuDNN
+_NO_MEMORY = ("can't allocate memory", 'out of memory', 'ALLOC_FAILED', 'ALLOCATION_FAILED')
 
 
 class DiffusionWorldModel:
@@ -220,7 +222,7 @@ class DiffusionWorldModel:
         except (torch.OutOfMemoryError, MemoryError) as error:
             raise self._out_of_memory(trajectory_frames, error) from error
         except RuntimeError as error:
-            if "can't allocate memory" not in str(error):
+            if not any(text in str(error) for text in _NO_MEMORY):
                 raise
             raise self._out_of_memory(trajectory_frames, error) from error
 

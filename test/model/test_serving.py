@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 import subprocess
@@ -9,6 +11,7 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+from diffusers.models.attention_dispatch import _AttentionBackendRegistry
 import numpy as np
 import pytest
 from small_transformer import build
@@ -24,6 +27,7 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.float8 import convert, Float8Linear
 from mtv_world_ros.model.parts import build_autoencoder
+from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.tiny_autoencoder import TinyAutoencoder
 from mtv_world_ros.model.transformer import MultiViewWanTransformer
@@ -63,7 +67,9 @@ def test_settings_are_read_from_a_text() -> None:
         ('fuse_lora=yes', r"fuse_lora is 'yes'; it must be true or false"),
         ('context_parallel', r"context_parallel is ''; it must be a whole number"),
         ('context_parallel=0', 'context_parallel is 0; it must be 1 or more'),
-        ('context_parallel=2 fuse_lora=false', 'context_parallel and .* need fuse_lora=true'),
+        ('context_parallel=2 fuse_lora=false', 'context_parallel, .* need fuse_lora=true'),
+        ('cuda_graphs=true fuse_lora=false', 'cuda_graphs, .* need fuse_lora=true'),
+        ('offload=true fuse_lora=false', 'offload and .* need fuse_lora=true'),
         ('weights=float8 fuse_lora=false', 'weights=float8 need fuse_lora=true'),
         ('weights=int4', "weights is 'int4'; it must be one of same, float8"),
         ('offload=true compile=true', 'offload and compile exclude each other'),
@@ -100,20 +106,90 @@ def test_an_unknown_attention_is_refused(folder: Path) -> None:
         load(folder, 'attention=fast')
 
 
+def test_attention_is_set_for_that_model_alone(folder: Path) -> None:
+    others, _ = _AttentionBackendRegistry.get_active_backend()
+    blocks: Any = load(folder, 'attention=_native_math').transformer.blocks
+    assert {block.attn1.processor._attention_backend for block in blocks} == {'_native_math'}
+    assert _AttentionBackendRegistry.get_active_backend()[0] == others != '_native_math'
+
+
 def test_cuda_graphs_need_cuda(folder: Path) -> None:
     with pytest.raises(ConfigError, match='cuda_graphs=true needs a CUDA device, device is cpu'):
         load(folder, 'cuda_graphs=true')
 
 
-def values(model: MultiViewWanTransformer, views: int = 2) -> dict[str, Tensor]:
+class FakeCuda:
+    """What `compiled` takes of `torch.cuda`: a replay computes the captured pass once more."""
+
+    def __init__(self) -> None:
+        self.now = ['cuda:0']
+        self.passes: list[Any] = []
+        self.captures: list[Any] = []
+
+    def Stream(self, device: torch.device) -> Any:
+        return SimpleNamespace(device=device, wait_stream=lambda other: None)
+
+    def CUDAGraph(self) -> Any:
+        made = SimpleNamespace()
+        made.replay = lambda: made.out.copy_(double(**made.inputs))
+        return made
+
+    def current_stream(self) -> Any:
+        return self.Stream(torch.device(self.now[-1]))
+
+    def graph_pool_handle(self) -> object:
+        return object()
+
+    @contextmanager
+    def device(self, device: torch.device) -> Iterator[None]:
+        self.now.append(str(device))
+        yield
+        self.now.pop()
+
+    @contextmanager
+    def stream(self, side: Any) -> Iterator[None]:
+        yield
+
+    @contextmanager
+    def graph(self, made: Any, *, pool: object, stream: Any) -> Iterator[None]:
+        yield
+        made.inputs, made.out = self.passes[-1]
+        self.captures.append((str(stream.device), self.now[-1], pool))
+
+
+def double(x: Tensor) -> Tensor:
+    return 2 * x
+
+
+def test_a_captured_pass_reads_its_inputs_anew_on_its_own_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fake = FakeCuda()
+    monkeypatch.setattr(torch, 'cuda', fake)
+
+    def forward(x: Tensor, y: Tensor | None = None) -> Tensor:
+        fake.passes.append(({'x': x}, double(x)))
+        return fake.passes[-1][1]
+
+    model: Any = SimpleNamespace(forward=forward)
+    compiled.capture(model, torch.device('cuda:1'))
+    given = [torch.full((size,), float(value)) for value, size in enumerate((2, 3, 2, 3))]
+    found = [model.forward(x, y=None) for x in given]
+    for x, out in zip(given, found, strict=True):  # none is overwritten by a later replay
+        assert torch.equal(out, 2 * x)
+    assert [capture[:2] for capture in fake.captures] == [('cuda:1', 'cuda:1')] * 2
+    assert fake.captures[0][2] is fake.captures[1][2]
+
+
+def values(model: MultiViewWanTransformer, views: int = 2, batch: int = 1) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(1)
 
     def random(*shape: int) -> Tensor:
-        return torch.randn(1, *shape, generator=generator)
+        return torch.randn(batch, *shape, generator=generator)
 
     return {
         'hidden_states': random(views, 16, 2, 4, 4),
-        'timestep': torch.tensor([500.0]),
+        'timestep': torch.full((batch,), 500.0),
         'control': random(views, 16, 2, 4, 4),
         'start': random(views, 16, 2, 4, 4),
         'reference': random(views, 16, 4, 4),
@@ -136,10 +212,13 @@ def test_a_block_compiles_without_a_break_and_without_a_compiler_is_refused(
     monkeypatch.setattr(
         model, 'compile_repeated_blocks', lambda **how: compiles(**how, backend='eager')
     )
-    compiled.compile_blocks(model, torch.device('cpu'))
-    torch._dynamo.utils.counters.clear()
-    torch.testing.assert_close(model(**values(model)), plain, rtol=0, atol=1e-5)
-    assert torch._dynamo.utils.counters['stats']['unique_graphs'] == 1
+    with torch._dynamo.config.patch(recompile_limit=1):
+        compiled.compile_blocks(model, torch.device('cpu'))
+        torch._dynamo.utils.counters.clear()
+        torch.testing.assert_close(model(**values(model)), plain, rtol=0, atol=1e-5)
+        assert torch._dynamo.utils.counters['stats']['unique_graphs'] == 1
+        model(**values(model, batch=2))  # another shape, beyond torch's own limit
+    assert torch._dynamo.utils.counters['stats']['unique_graphs'] == 2
 
 
 def test_float8_keeps_three_bits_and_a_scale_of_each_row() -> None:
@@ -268,6 +347,37 @@ def test_what_does_not_fit_says_what_it_needs_before_it_starts(
     assert held == 2 * (rest + 2 * block + vae)
 
 
+def test_a_graph_keeps_its_memory_beside_that_of_decoding(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checkpoint: Any = preset('wan-1.3b')
+    for serving, expected in (('', 5), ('cuda_graphs=true', 8)):
+        peaks = iter((3, 5))
+        monkeypatch.setattr(memory, 'peak_bytes', lambda work, peaks=peaks: next(peaks))
+        options = ServingOptions.parse(serving)
+        assert memory.activation_bytes(checkpoint, options, torch.bfloat16) == expected
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'CUDA error: out of memory',
+        'CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`',
+        'cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED',
+    ],
+)
+def test_a_lack_of_memory_outside_torchs_own_is_named(
+    folder: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError(text)
+
+    model = load(folder)
+    monkeypatch.setattr('mtv_world_ros.model.world_model.sample_latents', fail)
+    with pytest.raises(ModelMemoryError, match='out of memory on cpu with 2 views'):
+        predict(model, [0])
+
+
 _STARVED = """
 import resource
 import numpy as np
@@ -342,3 +452,24 @@ def test_products_in_float8_on_a_gpu_are_those_of_the_cpu() -> None:
     expected = F.linear(x.float(), kept.weight.float() * kept.scale, kept.bias.float())
     error = (kept(x).float() - expected).square().mean().sqrt() / expected.square().mean().sqrt()
     assert error < 0.05
+
+
+@pytest.mark.gpu
+def test_blocks_in_float8_compile_on_a_gpu() -> None:
+    """At widths that the device's product counts in, unlike those of the other tests."""
+    widths = {'attention_head_dim': 32, 'ffn_dim': 128, 'added_kv_proj_dim': 64}
+    model = build({**TRANSFORMER, **widths}).eval().requires_grad_(False)
+    place(model, torch.device('cuda'), torch.bfloat16)
+    kinds = {
+        name: torch.float32 if name == 'timestep' else torch.bfloat16 for name in values(model)
+    }
+    given = {name: v.to('cuda', kinds[name]) for name, v in values(model).items()}
+    with torch.inference_mode():
+        plain = model(**given).float()
+        convert(model)
+        eager = model(**given).float()
+        compiled.compile_blocks(model, torch.device('cuda'))
+        quick = model(**given).float()
+    for found in (eager, quick):
+        error = (found - plain).square().mean().sqrt() / plain.square().mean().sqrt()
+        assert 0 < error < 0.1
