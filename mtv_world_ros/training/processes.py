@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 import os
 
 from accelerate import PartialState
@@ -13,8 +14,28 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 
+#: how long processes wait for the main one: it reads, encodes and judges alone; NCCL's 10 minutes
+#: end a training meanwhile
+_PATIENCE = timedelta(days=1)
 #: numbers that are summed over the processes in one go
 _BUCKET = 2**24
+
+
+@contextmanager
+def memory_errors_named(device: torch.device) -> Iterator[None]:
+    """Says what to set where a training does not fit its device.
+
+    Raises:
+        TrainingError: in place of torch's error.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise TrainingError(
+            f'out of memory on {device}: set optimizer.gradient_checkpointing to true, raise '
+            'optimizer.accumulation or lower optimizer.batch_size, then run the same command '
+            f'again: it goes on from the last state ({str(error).splitlines()[0]})'
+        ) from error
 
 
 class Processes:
@@ -31,7 +52,7 @@ class Processes:
         chosen = torch.device(device)
         # accelerate would choose the number of threads anew
         os.environ.setdefault('OMP_NUM_THREADS', str(torch.get_num_threads()))
-        self._state = PartialState(cpu=chosen.type == 'cpu')
+        self._state = PartialState(cpu=chosen.type == 'cpu', timeout=_PATIENCE)
         self.number: int = self._state.process_index
         self.count: int = self._state.num_processes
         # several processes have a device each; accelerate knows which

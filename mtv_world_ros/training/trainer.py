@@ -29,7 +29,7 @@ from mtv_world_ros.training.encoding import EncodedBatch, Encoders
 from mtv_world_ros.training.export import export_adapter, export_checkpoint
 from mtv_world_ros.training.loss import batch_loss
 from mtv_world_ros.training.objective import Loss
-from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.processes import memory_errors_named, Processes
 from mtv_world_ros.training.self_rollout import SelfRollout
 from mtv_world_ros.training.state import check_card, load_state, read_card, save_state, STATE
 from mtv_world_ros.training.weights import Weights
@@ -171,8 +171,8 @@ class Trainer:
             on_save: called with the step after each, in the main process alone.
 
         Raises:
-            TrainingError: the loss is not finite, a state cannot be written, or another process
-                is gone; the last saved state stays whole.
+            TrainingError: the loss is not finite, the device is out of memory, a state cannot be
+                written, or another process is gone; the last saved state stays whole.
         """
         rollout = SelfRollout(
             source.controls,
@@ -189,7 +189,8 @@ class Trainer:
             if isinstance(batch, Batch) and any(batch.leads):
                 with self.weights.lent() as transformer:
                     batch = rollout.apply(batch, self.step, transformer)
-            report = self.train_step(batch)
+            with memory_errors_named(self.device):
+                report = self.train_step(batch)
             self.step += 1
             yield replace(report, seconds=time.perf_counter() - started, waited=waited)
             due = self.step % save_every == 0 or self.step == self.config.optimizer.steps

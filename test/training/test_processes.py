@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from datetime import timedelta
 import json
 import os
 from pathlib import Path
 import runpy
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from safetensors.torch import load_file
@@ -101,6 +103,20 @@ def test_shares_are_even_and_leave_nothing_out() -> None:
         shares.append(list(processes.share(8)))
     assert sum(shares, []) == list(range(8))
     assert sorted(map(len, shares)) == [2, 3, 3]
+
+
+def test_processes_wait_for_the_main_one_longer_than_nccl_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = {}
+
+    def state(**options: object) -> SimpleNamespace:
+        given.update(options)
+        return SimpleNamespace(process_index=0, num_processes=1)
+
+    monkeypatch.setattr('mtv_world_ros.training.processes.PartialState', state)
+    Processes('cuda')
+    assert given['timeout'] > 10 * timedelta(minutes=10) and given['cpu'] is False
 
 
 def test_fewer_clips_than_processes_are_refused(tiny: TrainingConfig, tmp_path: Path) -> None:

@@ -22,8 +22,9 @@ from mtv_world_ros.training.run import find_episodes, train
 from mtv_world_ros.training.trainer import learning_rate, Trainer
 
 
-def make(config: TrainingConfig, folder: Path, seed: int = 0) -> Trainer:
-    return Trainer(config, folder, seed=seed, device='cpu', dtype=torch.float32, trained_on={})
+def make(config: TrainingConfig, folder: Path, seed: int = 0, device: str = 'cpu') -> Trainer:
+    dtype = torch.float32 if device == 'cpu' else torch.bfloat16
+    return Trainer(config, folder, seed=seed, device=device, dtype=dtype, trained_on={})
 
 
 def run(trainer: Trainer, source: BatchSource, save_every: int = 1000) -> list[float]:
@@ -50,6 +51,35 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
         whole.weights.ema.shadow_params, resumed.weights.ema.shadow_params, strict=True
     ):
         assert torch.equal(one, other)
+
+
+@pytest.mark.gpu
+def test_a_killed_run_continues_on_a_gpu(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    config = replace(tiny, optimizer=replace(tiny.optimizer, gradient_checkpointing=True))
+    reports = make(config, tmp_path, device='cuda').run(
+        source, save_every=2, on_save=lambda _: None
+    )
+    first = [next(reports).loss for _ in range(3)]
+    reports.close()
+    resumed = make(config, tmp_path, device='cuda')
+    assert resumed.load_state() and resumed.step == 2
+    assert run(resumed, source)[0] == pytest.approx(first[2], rel=0.01)
+    resumed.export(tmp_path / 'checkpoint')
+    assert {p.device.type for p in resumed.weights.parameters} == {'cuda'}
+
+
+def test_a_lack_of_memory_says_what_to_set(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise torch.OutOfMemoryError('CUDA out of memory. Tried to allocate 2.00 GiB.')
+
+    trainer = make(tiny, tmp_path)
+    monkeypatch.setattr(trainer, 'gradients', fail)
+    with pytest.raises(TrainingError, match=r'out of memory on cpu: .*accumulation.*2\.00 GiB'):
+        run(trainer, source)
 
 
 def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: RobotModel,

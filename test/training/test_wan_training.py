@@ -56,15 +56,16 @@ def batches(clips: Recording, config: TrainingConfig, robot: RobotModel):
     source.close()
 
 
-def make(config: TrainingConfig, folder: Path, base: Path) -> Trainer:
+def make(config: TrainingConfig, folder: Path, base: Path, device: str = 'cpu') -> Trainer:
+    dtype = torch.float32 if device == 'cpu' else torch.bfloat16
     return Trainer(
         config,
         folder,
         seed=0,
-        device='cpu',
-        dtype=torch.float32,
+        device=device,
+        dtype=dtype,
         trained_on={},
-        base=load_base(config, base, CPU, torch.float32, seed=0),
+        base=load_base(config, base, torch.device(device), dtype, seed=0),
     )
 
 
@@ -173,6 +174,22 @@ def test_a_killed_run_continues_to_the_bit_and_exports_the_averages(
     assert torch.equal(stored[f'{key}.weight'], averages[f'{key}.adapter.weight'])
     beside = load_file(whole.result / 'beside.safetensors')
     assert torch.equal(beside['view_embedding'], averages['view_embedding'])
+
+
+@pytest.mark.gpu
+def test_an_adapter_trains_and_continues_on_a_gpu(
+    config: TrainingConfig, base: Path, batches: BatchSource, tmp_path: Path
+) -> None:
+    reports = make(config, tmp_path, base, 'cuda').run(
+        batches, save_every=2, on_save=lambda _: None
+    )
+    first = [next(reports).loss for _ in range(3)]
+    reports.close()
+    resumed = make(config, tmp_path, base, 'cuda')
+    assert resumed.load_state() and resumed.step == 2
+    assert run(resumed, batches)[0] == pytest.approx(first[2], rel=0.01)
+    resumed.export(resumed.result)
+    assert load_file(resumed.result / 'pytorch_lora_weights.safetensors')
 
 
 def test_a_state_on_top_of_other_weights_is_refused(
