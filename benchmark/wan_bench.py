@@ -57,6 +57,7 @@ class Bench:
         if serving.context_parallel > 1:
             self.followers = Followers(self.transformer, serving)
         prepare(self.transformer, serving, self.device)
+        self._forget_peak()
 
     def close(self) -> None:
         """Ends the other processes and frees the device."""
@@ -66,12 +67,17 @@ class Bench:
         gc.collect()
         if self.device.type == 'cuda':
             torch.cuda.empty_cache()
+
+    def _forget_peak(self) -> None:
+        """What making the parts took is none of serving's memory."""
+        if self.device.type == 'cuda':
             torch.cuda.reset_peak_memory_stats(self.device)
 
     def _random(self, module: Any, device: torch.device) -> Any:
         """Random weights that keep activations finite, made where they are used."""
         rope = getattr(module, 'rope', None)  # computed; `to_empty` would lose it
-        module = module.to_empty(device=device)
+        # its number format first: float32 takes twice the memory
+        module = place(module, torch.device('meta'), self.dtype).to_empty(device=device)
         if rope is not None:
             arguments = self.config.transformer
             module.rope = type(rope)(

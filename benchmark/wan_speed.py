@@ -106,7 +106,7 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
     stock = _stock(plain)
     plain.close()
     video = config.video
-    chunk = (
+    chunk = _told(
         f'A chunk: {len(video.views)} views of 1 + {video.num_frames} frames, '
         f'{video.width}x{video.height}, {_tokens(given)} tokens; '
         f'{parameters / 1e6:.1f} M parameters, {options.dtype}, no guidance. A step is '
@@ -116,11 +116,22 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
     return '\n\n'.join(
         [
             chunk,
-            *_whole(config, options, work, stock),
+            *_served(config, options, work, stock),
             'All options, one after the other:',
             _compared(config, options, work),
         ]
     )
+
+
+def _told(text: str) -> str:
+    """The text, said at once: what follows may not end in the time that there is."""
+    print(text, file=sys.stderr, flush=True)
+    return text
+
+
+def _reason(error: Exception) -> str:
+    told = (str(error).splitlines() or [''])[0].replace('|', '/')
+    return f'{type(error).__name__}: {told}'
 
 
 def _stock(bench: Bench) -> dict[int, float]:
@@ -143,11 +154,24 @@ class Work:
         return f'{rate / 1e12:.2f} TFLOP/s, {100 * rate / self.matrix:.0f} %'
 
 
-def _whole(
+def _served(
     config: TrainingConfig, options: argparse.Namespace, work: Work, stock: dict[int, float]
 ) -> list[str]:
     """Stages and totals under `--serving`, beside the stock pipeline."""
-    bench = Bench(config, options, ServingOptions.parse(options.serving))
+    head = f'Served with `{options.serving}`:' if options.serving else 'Served plainly:'
+    try:
+        bench = Bench(config, options, ServingOptions.parse(options.serving))
+        try:
+            return [_told(text) for text in (head, *_whole(bench, options, work, stock))]
+        finally:
+            bench.close()
+    except Exception as error:  # the other options are measured nevertheless
+        return [_told(f'{head} {_reason(error)}')]
+
+
+def _whole(
+    bench: Bench, options: argparse.Namespace, work: Work, stock: dict[int, float]
+) -> list[str]:
     given = bench.encode()
     step = seconds(bench, lambda: bench.step(given))
     rows = [
@@ -162,9 +186,7 @@ def _whole(
         totals.append([str(steps), _ms(ours), rate, _ms(theirs), f'{theirs / ours:.2f}'])
     header = ['steps', 'chunk [ms]', 'view-frames/s', 'stock pipeline [ms]', 'ratio']
     memory = _memory(bench.device)
-    bench.close()
     return [
-        f'Served with `{options.serving}`:' if options.serving else 'Served plainly:',
         table(['stage', 'median [ms]'], rows),
         f'The transformer: {work.share(step)} of that. Most memory held: {memory}.',
         table(header, totals),
@@ -177,8 +199,8 @@ def _compared(config: TrainingConfig, options: argparse.Namespace, work: Work) -
         try:
             rows.append([text or 'plain', *_row(config, options, work, text)])
         except Exception as error:  # one that does not run must not cost the others' numbers
-            told = (str(error).splitlines() or [''])[0].replace('|', '/')
-            rows.append([text, *['-'] * 5, f'{type(error).__name__}: {told}'])
+            rows.append([text or 'plain', *['-'] * 5, _reason(error)])
+        _told(' | '.join(rows[-1]))
     header = ['serving', 'step [ms]', 'of the matrix rate', 'decode [ms]']
     header += [f'chunk, {options.steps[0]} steps [ms]', 'view-frames/s', 'memory held']
     return table(header, rows)
