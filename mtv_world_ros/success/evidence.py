@@ -29,6 +29,8 @@ GRASP_M = 0.02
 RIM_GAP_M = 0.01
 #: a carried object may come to rest this far from where its tool carried it [m]
 CARRY_ERROR_M = 0.025
+#: J with the goal mask that a start can have and still be gained upon
+MAX_START_JACCARD = 0.5
 #: what the features are called, in order
 FEATURES = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry')
 
@@ -104,7 +106,11 @@ def _score(margin: Margin, task: TaskSpec) -> float:
 
 
 def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float]:
-    """J of every subject with its goal mask, and their mean gain over the start, in -1..1."""
+    """J of every subject with its goal mask, and their mean gain over the start, in -1..1.
+
+    The start counts as at most `MAX_START_JACCARD`: what was in its goal from the first frame on
+    has nothing to gain, and is judged by its J.
+    """
     found: dict[int, FloatArray] = {}
     gains = []
     for relation in task.relations:
@@ -113,7 +119,8 @@ def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float
             continue
         item = placed.item(relation.subject)
         found[item], before = placed.views.goal_jaccard(item, masks)
-        gain = (found[item] - before) / np.maximum(1 - before, 0.05)
+        before = np.minimum(before, MAX_START_JACCARD)
+        gain = (found[item] - before) / (1 - before)
         gains.append(view_mean(np.clip(2 * gain - 1, -1, 1)))
     return found, float(mean_of_known(np.array(gains))) if gains else nan
 

@@ -83,6 +83,18 @@ def test_block_where_the_picture_has_it_is_a_success_and_elsewhere_none(tmp_path
     assert "'as in the goal picture' missed by" in away.reasons[0]
 
 
+def test_block_that_is_at_its_goal_from_the_start_is_judged_by_its_j_not_by_its_gain(tmp_path):
+    task = load_task(write_task(tmp_path, 'as_pictured'))
+    estimator = SuccessEstimator([task], task='put_away', segmenter=ColourSegmenter())
+    found = {}
+    for name, end in (('stays', GOAL), ('leaves', RED)):
+        rollout = masks(path(GOAL, end), [BLUE] * 9)
+        judged = estimator.estimate(footage(rollout, masks([GOAL], [BLUE])), SAID)
+        found[name] = judged.estimate
+    assert found['stays'].features['goal'] > 0.5 and found['stays'].probability > 0.8
+    assert found['leaves'].features['goal'] < -0.5 and found['leaves'].probability < 0.2
+
+
 def test_block_in_the_painted_region_is_a_success_and_elsewhere_none(tmp_path):
     file = write_task(tmp_path, 'in_region', pictures=regions())
     inside = judge(file, (GOAL[0] + 0.01, GOAL[1], GOAL[2]))
