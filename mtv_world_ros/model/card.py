@@ -27,7 +27,7 @@ _CARD_KEYS = {
 #: what an adapter and the checkpoint that it is used on have in common
 SHARED_KEYS = tuple(key for key in _CARD_KEYS if key not in ('rendering', 'trained_on'))
 #: what only models with text need: the instruction, what to keep away from and how strongly; the
-#: denoising steps that a distilled model is made for; and `history.HistorySettings`
+#: denoising steps that a model is made for; and `history.HistorySettings`
 OPTIONAL_KEYS = {
     'prompt': str,
     'negative_prompt': str,

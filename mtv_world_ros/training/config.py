@@ -176,6 +176,24 @@ class SelfRolloutConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SamplingConfig:
+    """How its checkpoints are sampled where nothing else is said.
+
+    Attributes:
+        num_inference_steps: denoising steps.
+    """
+
+    num_inference_steps: int = 4
+
+    def __post_init__(self) -> None:
+        if self.num_inference_steps < 1:
+            raise ConfigError(
+                f'sampling.num_inference_steps is {self.num_inference_steps}; it must be at '
+                'least 1'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig:
     """A whole preset.
 
@@ -189,6 +207,7 @@ class TrainingConfig:
         augment: disturbances.
         history: what clips are shown of what came before them; off by default.
         self_rollout: clips that start from the model's own predictions.
+        sampling: what its checkpoints are served with.
         lora: what is trained in place of all weights.
         optimizer: steps and rates.
     """
@@ -202,6 +221,7 @@ class TrainingConfig:
     augment: AugmentConfig = AugmentConfig()
     history: HistoryConfig = HistoryConfig()
     self_rollout: SelfRolloutConfig = SelfRolloutConfig()
+    sampling: SamplingConfig = SamplingConfig()
     lora: LoraSettings = LoraSettings()
     optimizer: OptimizerConfig = OptimizerConfig()
 
@@ -236,6 +256,7 @@ class TrainingConfig:
             'object_mask': video.object_mask,
             'rendering': self.as_dict()['rendering'],
             **self.history.as_card(),
+            'num_inference_steps': self.sampling.num_inference_steps,
             'trained_on': dict(trained_on),
         }
 

@@ -182,11 +182,19 @@ def test_a_folder_without_episodes_says_how_to_get_some(tmp_path: Path) -> None:
         ({'optimiser.steps': 5}, r"unknown key 'optimiser' \(did you mean 'optimizer'\?\)"),
         ({'steps': 5}, 'must look like section.key'),
         ({'rendering.half_life_s': -1.0}, 'half_life_s'),
+        ({'sampling.num_inference_steps': 0}, 'num_inference_steps is 0; it must be at least 1'),
     ],
 )
 def test_a_wrong_setting_names_the_nearest(override: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_training_config('small', override)
+
+
+@pytest.mark.parametrize(('preset', 'steps'), [('small', 1), ('wan-1.3b', 50), ('wan-14b', 50)])
+def test_a_checkpoint_says_how_many_steps_it_is_made_for(preset: str, steps: int) -> None:
+    assert load_training_config(preset).card({})['num_inference_steps'] == steps
+    changed = load_training_config(preset, {'sampling.num_inference_steps': 7})
+    assert changed.spec.num_inference_steps == 7
 
 
 def test_a_run_may_start_from_the_weights_of_a_checkpoint(
