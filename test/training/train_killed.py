@@ -50,11 +50,18 @@ def finished(child: int) -> bool:
     return bool(done)
 
 
+def written_at(out: Path) -> int:
+    """When the state was written [ns]; 0 = there is none now, as between a save's two renames."""
+    try:
+        return (out / 'state' / 'state.json').stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
 def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
     """Kills a process some seconds after it began to step, or then while it writes its state."""
-    first = out / 'state' / 'state.json'
-    before = first.stat().st_mtime_ns if first.exists() else 0
-    while not first.exists() or first.stat().st_mtime_ns == before:
+    before = written_at(out)
+    while written_at(out) in (0, before):
         if finished(child):
             return None
         time.sleep(0.001)
