@@ -30,7 +30,6 @@ from typing import Any
 from control_tables import body, budget, Row, ROWS
 from page import machine_line, publish
 import torch
-import yaml
 
 from mtv_world_ros.assembly import (
     assemble_segmenter,
@@ -38,6 +37,7 @@ from mtv_world_ros.assembly import (
     load_pipeline,
     robot_path,
 )
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.comparison import write_comparison
 from mtv_world_ros.evaluation.controls import ACTIONS
@@ -91,10 +91,7 @@ def config_of(row: Row, options: argparse.Namespace) -> TrainingConfig:
     }
     if row.views:
         overrides |= {'video.views': list(row.views), 'transformer.num_views': len(row.views)}
-    for item in options.set:
-        key, _, value = item.partition('=')
-        overrides[key] = yaml.safe_load(value)
-    return load_training_config(options.preset, overrides)
+    return load_training_config(options.preset, overrides | set_overrides(options.set))
 
 
 def train_row(name: str, options: argparse.Namespace) -> dict[str, Any]:

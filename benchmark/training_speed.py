@@ -24,11 +24,11 @@ from typing import Any
 import accelerate
 from accelerate import Accelerator
 from diffusers.training_utils import EMAModel
-from page import publish, table
+from page import parse_arguments, publish, table
 import torch
-import yaml
 
 from mtv_world_ros.assembly import assemble_segmenter, robot_path
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.evaluation.dataset import select
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.runtime import choose_dtype, place
@@ -45,11 +45,8 @@ from mtv_world_ros.training.trainer import Trainer
 _WARM_UP = 2
 
 
-def parse() -> argparse.Namespace:
-    """Reads the options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds what other benchmarks do not have."""
     parser.add_argument('train', type=Path, help='folder of episodes')
     parser.add_argument('--work', type=Path, required=True, help='what was read of them')
     parser.add_argument('--preset', default='small')
@@ -59,18 +56,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument('--dtype', default='auto')
     parser.add_argument('--threads', type=int, default=1)
     parser.add_argument('--data-workers', type=int, default=0)
-    parser.add_argument('--repeats', type=int, default=10, help='steps of each median')
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--machine', default='cpu2', help='name of the machine on the page')
-    parser.add_argument('--out', type=Path, help='folder for the page')
-    return parser.parse_args()
 
 
 def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     """The trainer and its data, as `mtv-world train` makes them."""
-    values = (item.partition('=') for item in options.set)
-    overrides = {key: yaml.safe_load(value) for key, _, value in values}
-    overrides['optimizer.steps'] = 10**6
+    overrides = {**set_overrides(options.set), 'optimizer.steps': 10**6}
     config = load_training_config(options.preset, overrides)
     spec, robot = config.spec, load_robot(robot_path(config.video.robot))
     paths = spread(select(options.train, default='train').paths, options.episodes)
@@ -150,7 +140,7 @@ def alternate(
 
 def main() -> None:
     """Measures, and prints the page."""
-    options = parse()
+    options = parse_arguments(__doc__, repeats=10, more=add_options)
     torch.set_num_threads(options.threads)
     trainer, source = make(options)
     dtype = trainer.weights.worker.dtype

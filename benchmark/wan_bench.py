@@ -105,6 +105,10 @@ class Bench:
             sigmas = torch.full((1,), history.noise_level, device=self.device)
             before = self.frames[:, :, : history.num_frames]
             latents = with_history(self.autoencoder, latents, before, sigmas)
+        return self.with_tokens(latents)
+
+    def with_tokens(self, latents: Conditioning) -> Conditioning:
+        """The same under a text and start images."""
         views, arguments = self.frames.shape[1], self.config.transformer
         text = self._tokens(NUM_TEXT_TOKENS, arguments['text_dim'])
         image = self._tokens(views * _IMAGE_TOKENS, arguments['image_dim'])

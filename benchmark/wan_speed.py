@@ -28,8 +28,8 @@ from page import publish, table
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from wan_bench import Bench
-import yaml
 
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
@@ -74,10 +74,7 @@ def main() -> None:
     parser.add_argument('--out', type=Path, help='folder to write the page into')
     options = parser.parse_args()
     options.machine = options.machine or _device_name(options.device).replace(' ', '_')
-    overrides = {
-        key: yaml.safe_load(value) for key, _, value in (s.partition('=') for s in options.set)
-    }
-    config = load_training_config(options.preset, overrides)
+    config = load_training_config(options.preset, set_overrides(options.set))
     with torch.inference_mode():
         body = measure(config, options)
     publish(

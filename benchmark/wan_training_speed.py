@@ -21,11 +21,11 @@ import sys
 import tempfile
 import time
 
-from page import publish, table
+from page import parse_arguments, publish, table
 import torch
 from wan_bench import Bench
-import yaml
 
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.serving import ServingOptions
@@ -37,21 +37,13 @@ from mtv_world_ros.training.speed import ideal_seconds, measured_peak
 from mtv_world_ros.training.trainer import Trainer
 
 
-def parse() -> argparse.Namespace:
-    """Reads the options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds what other benchmarks do not have."""
     parser.add_argument('--preset', default='wan-1.3b')
     parser.add_argument('--set', action='append', default=[], metavar='SECTION.KEY=VALUE')
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--dtype', default='bfloat16', help='bfloat16 or float32')
     parser.add_argument('--threads', type=int, default=2)
-    parser.add_argument('--repeats', type=int, default=5, help='steps of each median')
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--machine', default='cpu2', help='name of the machine on the page')
-    parser.add_argument('--out', type=Path, help='folder for the page')
-    return parser.parse_args()
 
 
 def random_clip(bench: Bench) -> Batch:
@@ -70,10 +62,9 @@ def random_clip(bench: Bench) -> Batch:
     )
 
 
-def repeated(clip: EncodedBatch, given: Bench, size: int) -> EncodedBatch:
+def repeated(clip: EncodedBatch, bench: Bench, size: int) -> EncodedBatch:
     """A step's batch of one clip, with the tokens of text and start images."""
-    tokens = given.encode()
-    one = replace(clip.conditioning, text=tokens.text, image=tokens.image)
+    one = bench.with_tokens(clip.conditioning)
     values = {
         name: value.repeat_interleave(size, 0)
         for name in one.__dataclass_fields__
@@ -112,11 +103,9 @@ def make(bench: Bench, config: TrainingConfig, encoders: Encoders, work: Path) -
 
 def main() -> None:
     """Measures, and prints the page."""
-    options = parse()
+    options = parse_arguments(__doc__, repeats=5, more=add_options)
     torch.set_num_threads(options.threads)
-    values = (item.partition('=') for item in options.set)
-    overrides = {key: yaml.safe_load(value) for key, _, value in values}
-    config = load_training_config(options.preset, overrides).with_steps(10**6)
+    config = load_training_config(options.preset, set_overrides(options.set)).with_steps(10**6)
     bench = Bench(config, options, ServingOptions())
     encoders = Encoders(autoencoder=bench.autoencoder, history=config.history)
     filling = []

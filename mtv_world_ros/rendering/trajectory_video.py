@@ -120,12 +120,14 @@ def render_trajectory_video(
     positions, times = np.asarray(positions, np.float64), np.asarray(times, np.float64)
     _check(cameras, positions, times, object_masks)
     motion = tool_motion(robot, positions, times, config.points_per_frame, config.max_gap_m)
+    arms = () if config.link_width_m is None else robot.arm_points(positions)
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.empty(shape, np.uint8)
     for view, camera in enumerate(cameras):
         masks = () if object_masks is None else object_masks[view]
         frames[view] = _canvas(camera, masks, config)
-        _draw_view(frames[view], camera, robot, positions, motion, config)
+        poses = camera_poses(camera, robot, positions)
+        _draw_view(frames[view], camera, poses, arms, motion, config)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
@@ -176,13 +178,12 @@ def _canvas(
 def _draw_view(
     frames: ByteArray,
     camera: CameraModel,
-    robot: RobotModel,
-    positions: FloatArray,
+    poses: FloatArray,
+    arms: Sequence[FloatArray],
     motion: ToolMotion,
     config: TrajectoryVideoConfig,
 ) -> None:
-    """Draws all arms onto the (T, H, W, 3) frames of one view."""
-    poses = camera_poses(camera, robot, positions)
+    """Draws all arms onto the (T, H, W, 3) frames of one view; links where `arms` has points."""
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
     core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
@@ -191,17 +192,18 @@ def _draw_view(
         for arm in range(num_arms)
     ]
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
-    paints = [_Paint(arm_colour(arm, num_arms)) for arm in range(num_arms)]
+    colours = [arm_colour(arm, num_arms) for arm in range(num_arms)]
+    paints = [_Paint(colour) for colour in colours]
     links = None
     if config.link_width_m is not None:
-        links = ArmLinks(camera, poses, robot.arm_points(positions), config.link_width_m)
+        links = ArmLinks(camera, poses, arms, config.link_width_m)
     white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
     for k, trail_images in enumerate(zip(*trails, strict=True)):
         if links is not None:
             for arm in orders[:, k]:
-                links.draw(frames[k], arm, k, _LINK_SHARE * arm_colour(arm, num_arms))
+                links.draw(frames[k], arm, k, _LINK_SHARE * colours[arm])
         for arm in orders[:, k]:
             glow, box = trail_images[arm]
             paints[arm].lay(frames[k], glow, box)
