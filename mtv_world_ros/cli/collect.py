@@ -49,6 +49,18 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='scripted policies that take turns in place of the expert, whatever comes of it, '
         'e.g. expert,expert-late-0.6,expert-shift-0.03',
     )
+    parser.add_argument(
+        '--faults',
+        choices=('train', 'calibrate', 'test'),
+        help='random faulty policies, of the fault kinds of this split, keeping successes and '
+        'failures alike',
+    )
+    parser.add_argument(
+        '--pictures',
+        choices=('all', 'first'),
+        default='all',
+        help='first: render the first frame only, for training the contact model',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
@@ -63,7 +75,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect import collect
     from mtv_world_ros.sim.episode_maker import CollectConfig
+    from mtv_world_ros.sim.policy_variant import kinds_of
     from mtv_world_ros.sim.randomize import RandomizationConfig
+    from mtv_world_ros.sim.record import RecordConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
     collect(
@@ -78,6 +92,8 @@ def _collect(arguments: argparse.Namespace) -> int:
             randomization=size,
             moved_share=arguments.moved_cameras,
             policies=arguments.policies,
+            kinds=kinds_of(arguments.faults) if arguments.faults else (),
+            record=RecordConfig(pictures=arguments.pictures),
         ),
         sheets=arguments.sheets,
     )

@@ -47,6 +47,7 @@ class Recording:
         positions: (N, J) measured joint positions at `times`.
         commands: what the policy commanded; times on the same clock.
         stamp_ns: stamp of the first frame.
+        object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
         warnings: what was wrong with it and how the reader dealt with that.
     """
 
@@ -62,6 +63,7 @@ class Recording:
     positions: FloatArray
     commands: JointTrajectory
     stamp_ns: int
+    object_poses: FloatArray | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -76,6 +78,8 @@ class Clip:
         frames: (V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (V, 1 + T, H, W) uint8 or None.
         positions: (1 + T, J); row 0 measured, row k the command of frame k.
+        object_poses: (1 + T, O, 4, 4) T_base_object [m], or None.
+        origin: the episode's first frame; None where object poses are not known.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -84,6 +88,23 @@ class Clip:
     frames: ByteArray
     object_ids: ByteArray | None
     positions: FloatArray
+    object_poses: FloatArray | None = None
+    origin: Origin | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """The frame in which the objects of a clip were found.
+
+    Attributes:
+        frames: (V, H, W, 3) uint8 RGB.
+        positions: (J,) measured joint positions.
+        object_poses: (O, 4, 4) T_base_object [m].
+    """
+
+    frames: ByteArray
+    positions: FloatArray
+    object_poses: FloatArray
 
 
 def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) -> JointTrajectory:
@@ -153,6 +174,7 @@ def load_recording(
         positions=_measured(episode, robot, stamps),
         commands=stitch(matched, origin),
         stamp_ns=origin,
+        object_poses=_object_poses(episode, stamps),
         warnings=episode.warnings,
     )
 
@@ -182,6 +204,14 @@ def _object_ids(episode: Episode, stamps: np.ndarray, spec: WorldModelSpec) -> B
         small = resize_labels(np.asarray(ids), spec.width, spec.height)
         rows.append(small[_nearest(np.asarray(own_stamps), stamps)])
     return np.stack(rows)
+
+
+def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
+    """(N, O, 4, 4) of the instants nearest to the frames."""
+    found = episode.object_poses
+    if found is None or len(found.stamps_ns) == 0:
+        return None
+    return found.T_base_object[_nearest(found.stamps_ns, stamps)]
 
 
 def _measured(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
@@ -251,6 +281,18 @@ def cut_clip(
         frames=recording.frames[:, index],
         object_ids=None if ids is None else ids[:, index],
         positions=commanded(recording, start, times),
+        object_poses=None if recording.object_poses is None else recording.object_poses[index],
+        origin=_origin(recording),
+    )
+
+
+def _origin(recording: Recording) -> Origin | None:
+    if recording.object_poses is None:
+        return None
+    return Origin(
+        frames=recording.frames[:, 0],
+        positions=recording.positions[0],
+        object_poses=recording.object_poses[0],
     )
 
 
@@ -267,6 +309,7 @@ def chunk_of(clip: Clip, chunk: int, num_frames: int) -> Clip:
         frames=clip.frames[:, window],
         object_ids=None if clip.object_ids is None else clip.object_ids[:, window],
         positions=clip.positions[window],
+        object_poses=None if clip.object_poses is None else clip.object_poses[window],
     )
 
 

@@ -17,6 +17,8 @@ from mtv_world_ros.errors import EpisodeError, nearest
 JOINT_STATES = '/joint_states'
 JOINT_TRAJECTORY = '/joint_trajectory'
 INSTRUCTION = '/instruction'
+#: where the objects are in the base frame, in the order of their names: of a simulator, of markers
+OBJECT_POSES = '/object_poses'
 #: name of the MCAP metadata record that says what the episode shows
 METADATA_NAME = 'mtv_world'
 CALIBRATION_FILE = 'calibration.yaml'
@@ -163,6 +165,18 @@ class JointStates:
     positions: FloatArray
 
 
+class ObjectPoses(NamedTuple):
+    """Where objects are over time.
+
+    Attributes:
+        stamps_ns: (N,) int64, increasing.
+        T_base_object: (N, O, 4, 4) [m], in the order of the episode's objects.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    T_base_object: FloatArray
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Episode:
     """A recorded episode.
@@ -176,6 +190,7 @@ class Episode:
         trajectories: (start stamp [ns], trajectory), by stamp.
         masks: object masks of the views that have them; None where there are none.
         instructions: (stamp [ns], text), by stamp.
+        object_poses: where the objects were; None where it was not recorded.
         truncated: the record ends before its end.
         warnings: what was found wrong and how it was dealt with, one line each; where
             `truncated`, the first says where the record was cut.
@@ -189,5 +204,6 @@ class Episode:
     trajectories: list[tuple[int, JointTrajectory]]
     masks: Mapping[str, Track] | None
     instructions: list[tuple[int, str]]
+    object_poses: ObjectPoses | None = None
     truncated: bool = False
     warnings: tuple[str, ...] = ()

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 import re
 
-from mtv_world_ros.data.episode import image_topic, INSTRUCTION, JOINT_STATES, JOINT_TRAJECTORY
+from mtv_world_ros.data.episode import (
+    image_topic,
+    INSTRUCTION,
+    JOINT_STATES,
+    JOINT_TRAJECTORY,
+    OBJECT_POSES,
+)
 from mtv_world_ros.data.messages import COMPRESSED_IMAGE, IMAGE
 from mtv_world_ros.errors import EpisodeError, nearest
 
@@ -16,6 +22,7 @@ STREAMS = {
     'joint_states': JOINT_STATES,
     'joint_trajectory': JOINT_TRAJECTORY,
     'instruction': INSTRUCTION,
+    'object_poses': OBJECT_POSES,
 }
 _PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed)?')
 
@@ -37,10 +44,11 @@ class EpisodeTopics:
     joint_states: str
     joint_trajectory: str
     instruction: str
+    object_poses: str
 
     def names(self, *, with_masks: bool) -> set[str]:
         """All of them."""
-        names = {self.joint_states, self.joint_trajectory, self.instruction}
+        names = {self.joint_states, self.joint_trajectory, self.instruction, self.object_poses}
         for view in self.views.values():
             names |= {view.image, view.camera_info, *([view.mask] if with_masks else [])}
         return names

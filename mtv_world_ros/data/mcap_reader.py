@@ -15,6 +15,7 @@ from mtv_world_ros.data.episode import (
     Episode,
     EpisodeInfo,
     METADATA_NAME,
+    ObjectPoses,
     parse_info,
     Track,
 )
@@ -131,6 +132,7 @@ class _EpisodeReader:
             trajectories=self._trajectories(),
             masks={view: track for view, track in masks.items() if track} or None,
             instructions=instructions,
+            object_poses=self._object_poses(len(episode_info.objects)),
             truncated=bool(self.bag.truncated),
             warnings=self._all_warnings(),
         )
@@ -193,6 +195,23 @@ class _EpisodeReader:
             except MtvWorldError as error:
                 self._refuse(topic, error)
         return in_order(topic, good, self.warnings)
+
+    def _object_poses(self, num_objects: int) -> ObjectPoses | None:
+        topic = self.topics.object_poses
+        good: Stamped = []
+        for stamp, message in self._take(topic, messages.POSE_ARRAY):
+            if len(message.poses) == num_objects:
+                good.append((stamp, messages.parse_pose_array(message)))
+            else:
+                self._refuse(
+                    topic,
+                    EpisodeError(f'{len(message.poses)} poses for {num_objects} objects'),
+                )
+        ordered = in_order(topic, good, self.warnings)
+        if not ordered:
+            return None
+        stamps = np.array([stamp for stamp, _ in ordered], np.int64)
+        return ObjectPoses(stamps, np.stack([poses for _, poses in ordered]))
 
     def _cameras(
         self, calibration: Path | str | None, images: Mapping[str, Track]

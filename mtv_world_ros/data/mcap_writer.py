@@ -23,6 +23,7 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
     mask_topic,
     METADATA_NAME,
+    OBJECT_POSES,
     optical_frame,
 )
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
@@ -135,6 +136,11 @@ class EpisodeWriter(BagWriter):
         """Records what the policy commands; the trajectory starts at `stamp_ns`."""
         message = messages.make_joint_trajectory(stamp_ns, trajectory)
         self._write(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
+
+    def write_object_poses(self, stamp_ns: int, T_base_object: ArrayLike) -> None:
+        """Records where the objects are, (O, 4, 4) in the order of their names [m]."""
+        message = messages.make_pose_array(stamp_ns, 'base_link', T_base_object)
+        self._write(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
 
     def write_instruction(self, stamp_ns: int, text: str | None = None) -> None:
         """Records the instruction (latched); by default the episode's own."""

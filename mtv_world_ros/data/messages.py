@@ -16,6 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from mtv_world_ros.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, nearest
+from mtv_world_ros.geometry.transforms import quaternion, rotation
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -23,6 +24,7 @@ CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 JOINT_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 STRING = 'std_msgs/msg/String'
+POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 
 NANO = 1_000_000_000
 #: CameraInfo's names of the distortion models that are called otherwise here
@@ -153,6 +155,34 @@ def make_joint_state(
             raise EpisodeError(f'{key} has shape {array.shape}, expected ({len(names)},)')
     header = make_header(stamp_ns, '')
     return make(JOINT_STATE, header=header, name=list(names), effort=np.empty(0), **arrays)
+
+
+def make_pose_array(stamp_ns: int, frame_id: str, poses: ArrayLike) -> Any:
+    """geometry_msgs/PoseArray of poses (O, 4, 4) in a frame."""
+    items = []
+    for pose in np.asarray(poses, np.float64).reshape(-1, 4, 4):
+        x, y, z, w = quaternion(pose[:3, :3])
+        px, py, pz = (float(v) for v in pose[:3, 3])
+        items.append(
+            make(
+                'geometry_msgs/msg/Pose',
+                position=make('geometry_msgs/msg/Point', x=px, y=py, z=pz),
+                orientation=make(
+                    'geometry_msgs/msg/Quaternion', x=float(x), y=float(y), z=float(z), w=float(w)
+                ),
+            )
+        )
+    return make(POSE_ARRAY, header=make_header(stamp_ns, frame_id), poses=items)
+
+
+def parse_pose_array(message: Any) -> NDArray[np.float64]:
+    """Poses (O, 4, 4) of a geometry_msgs/PoseArray."""
+    poses = np.tile(np.eye(4), (len(message.poses), 1, 1))
+    for pose, item in zip(poses, message.poses, strict=True):
+        p, q = item.position, item.orientation
+        pose[:3, :3] = rotation((q.x, q.y, q.z, q.w))
+        pose[:3, 3] = p.x, p.y, p.z
+    return poses
 
 
 def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:

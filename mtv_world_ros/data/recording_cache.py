@@ -13,7 +13,7 @@ from mtv_world_ros.data_types import CameraModel, JointTrajectory, WorldModelSpe
 from mtv_world_ros.geometry.robot import RobotModel
 
 #: raised when what is stored, or how it is computed, changes
-_VERSION = 1
+_VERSION = 2
 
 
 def cached_recording(
@@ -71,6 +71,8 @@ def _save(file: Path, recording: Recording) -> None:
     }
     if recording.object_ids is not None:
         arrays['object_ids'] = recording.object_ids
+    if recording.object_poses is not None:
+        arrays['object_poses'] = recording.object_poses
     if commands.velocities is not None:
         arrays['command_velocities'] = commands.velocities
     for index, camera in enumerate(recording.cameras):
@@ -111,4 +113,5 @@ def _load(file: Path, path: Path) -> Recording:
                 velocities=stored['command_velocities'] if 'command_velocities' in names else None,
             ),
             stamp_ns=text['stamp_ns'],
+            object_poses=stored['object_poses'] if 'object_poses' in names else None,
         )

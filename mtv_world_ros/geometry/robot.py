@@ -24,6 +24,8 @@ class Tool:
         gripper_joint: joint that opens the gripper, or None.
         gripper_closed: its value when closed [rad or m].
         gripper_open: its value when open [rad or m].
+        finger_travel_m: how far each finger is from the tool point along the tool's y axis when
+            the gripper is open [m]; None = fingers are not drawn.
     """
 
     arm: str
@@ -32,6 +34,7 @@ class Tool:
     gripper_joint: str | None = None
     gripper_closed: float = 0.0
     gripper_open: float = 1.0
+    finger_travel_m: float | None = None
 
     def __post_init__(self) -> None:
         offset = np.array(self.T_link_tool, dtype=float)

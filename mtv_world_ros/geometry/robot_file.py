@@ -19,7 +19,7 @@ from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 _KEYS = ('name', 'urdf', 'dh', 'base_link', 'joints', 'mimic', 'tools')
 _MIMIC_KEYS = ('joint', 'source', 'multiplier', 'offset')
 _TOOL_KEYS = ('arm', 'link', 'position', 'quaternion_xyzw', 'gripper_joint', 'gripper_closed',
-              'gripper_open')  # fmt: skip
+              'gripper_open', 'finger_travel_m')  # fmt: skip
 _ARM_KEYS = ('arm', 'convention', 'position', 'quaternion_xyzw', 'joints', 'gripper')
 _ROW_KEYS = ('joint', 'a', 'alpha', 'd', 'theta', 'lower', 'upper', 'type')
 _GRIPPER_KEYS = ('joint', 'lower', 'upper')
@@ -104,6 +104,9 @@ def _tool(row: Any, where: str) -> Tool:
         gripper_joint=row.get('gripper_joint'),
         gripper_closed=number(row, 'gripper_closed', 0.0, where),
         gripper_open=number(row, 'gripper_open', 1.0, where),
+        finger_travel_m=(
+            number(row, 'finger_travel_m', 0.0, where) if 'finger_travel_m' in row else None
+        ),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
 
@@ -27,6 +28,11 @@ def rotation(quaternion_xyzw: Sequence[float] | FloatArray) -> FloatArray:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def quaternion(R: FloatArray) -> FloatArray:
+    """Returns the unit quaternion (x, y, z, w) of a rotation (3, 3)."""
+    return np.asarray(pin.Quaternion(np.asarray(R, dtype=float)).coeffs())
 
 
 def pose(

@@ -12,6 +12,8 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
 
+#: how much of a finger is drawn [m]
+_FINGER_LENGTH_M = 0.03
 #: most trail points from one frame to the next
 _MOST_POINTS = 32
 
@@ -25,12 +27,15 @@ class ToolMotion:
         points: (A, N, 3) in the base frame [m].
         closed: (A, T) 0 open .. 1 closed, at the frames.
         shown_at: (T,) index of each frame's own point.
+        fingers: two of each arm: (2, T, 3) the ends of a line along the finger, at the frames [m];
+            NaN where it is not known how the fingers travel.
     """
 
     times: FloatArray
     points: FloatArray
     closed: FloatArray
     shown_at: np.ndarray
+    fingers: tuple[FloatArray, ...]
 
 
 def tool_motion(
@@ -64,5 +69,20 @@ def tool_motion(
         times=(1 - share) * times[left] + share * times[right],
         points=robot.tool_poses(dense)[..., :3, 3],
         closed=1.0 - robot.gripper_openings(positions),
+        fingers=_fingers(robot, positions),
         shown_at=shown_at,
     )
+
+
+def _fingers(robot: RobotModel, positions: FloatArray) -> tuple[FloatArray, ...]:
+    """Two points along each finger, (2, T, 3) [m]: of each arm the left, then the right one."""
+    poses, openings = robot.tool_poses(positions), robot.gripper_openings(positions)
+    lines = []
+    for tool, pose, opening in zip(robot.tools, poses, openings, strict=True):
+        apart = np.full(len(positions), np.nan)
+        if tool.finger_travel_m is not None:
+            apart = tool.finger_travel_m * opening
+        for side in (1.0, -1.0):
+            tip = pose[:, :3, 3] + (side * apart)[:, None] * pose[:, :3, 1]
+            lines.append(np.stack([tip, tip - _FINGER_LENGTH_M * pose[:, :3, 2]]))
+    return tuple(lines)

@@ -50,6 +50,10 @@ class TrajectoryVideoConfig:
             fast arms have no gaps; None leaves it at `points_per_frame`.
         link_width_m: width of lines along each arm, from joint to joint, under the trails [m];
             None = none, as in the paper.
+        finger_width_m: width of a line along each finger, white and magenta, apart as far as the
+            gripper is commanded to open [m]; None = none, as in the paper.
+        object_motion: whether the objects' fills go where the objects are expected to go, or stay
+            where they were, as in the paper.
     """
 
     half_life_s: float = 0.5
@@ -60,6 +64,8 @@ class TrajectoryVideoConfig:
     points_per_frame: int = 3
     max_gap_m: float | None = None
     link_width_m: float | None = None
+    finger_width_m: float | None = None
+    object_motion: bool = False
 
     def __post_init__(self) -> None:
         for name in ('half_life_s', 'point_radius_m', 'min_radius_px'):
@@ -74,7 +80,7 @@ class TrajectoryVideoConfig:
                 f'rendering.points_per_frame is {self.points_per_frame}, must be a whole number '
                 'of at least 1'
             )
-        for name in ('max_gap_m', 'link_width_m'):
+        for name in ('max_gap_m', 'link_width_m', 'finger_width_m'):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise ConfigError(f'rendering.{name} is {value}, must be > 0 and finite, or null')
@@ -89,6 +95,8 @@ _LINK_SHARE = 0.5
 #: points nearer than this are drawn as large as at this depth [m]
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
+#: of an arm's two fingers
+_FINGER_COLOURS = (_WHITE, np.array([1.0, 0.0, 1.0]))
 
 
 def render_trajectory_video(
@@ -107,7 +115,8 @@ def render_trajectory_video(
         robot: gives the tool points.
         positions: (T, J) joint positions; frame k shows row k, row 0 is the current state.
         times: (T,) [s], increasing.
-        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
+        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or
+            (V, O, T, H, W) of every frame; or None.
         config: how it looks.
 
     Returns:
@@ -124,8 +133,7 @@ def render_trajectory_video(
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.empty(shape, np.uint8)
     for view, camera in enumerate(cameras):
-        masks = () if object_masks is None else object_masks[view]
-        frames[view] = _canvas(camera, masks, config)
+        _fill(frames[view], () if object_masks is None else object_masks[view], config)
         poses = camera_poses(camera, robot, positions)
         _draw_view(frames[view], camera, poses, arms, motion, config)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
@@ -158,6 +166,8 @@ def _check(
     if len(sizes) != 1:
         raise ObservationError(f'the cameras have sizes (H, W) {sorted(sizes)}; one is needed')
     expected = (len(cameras), *sizes.pop())
+    if masks is not None and masks.ndim == 5 and masks.shape[2] == len(times):
+        masks = masks[:, :, 0]
     if masks is not None and (masks.ndim != 4 or (len(masks), *masks.shape[2:]) != expected):
         raise ObservationError(
             f'object masks have shape {masks.shape}, expected (V, O, H, W) with (V, H, W) = '
@@ -165,14 +175,14 @@ def _check(
         )
 
 
-def _canvas(
-    camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
-) -> ByteArray:
-    """(H, W, 3) black with the objects' fills."""
-    canvas = np.zeros((camera.height, camera.width, 3), np.uint8)
+def _fill(
+    frames: ByteArray, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
+) -> None:
+    """Makes (T, H, W, 3) frames black with the objects' fills; masks (T, H, W) or (H, W) each."""
+    frames[...] = 0
     for index, mask in enumerate(masks):
-        canvas[mask] = np.rint(255 * object_colour(index, config.object_fill))
-    return canvas
+        colour = np.rint(255 * object_colour(index, config.object_fill)).astype(np.uint8)
+        frames[np.broadcast_to(mask, frames.shape[:3])] = colour
 
 
 def _draw_view(
@@ -197,6 +207,9 @@ def _draw_view(
     links = None
     if config.link_width_m is not None:
         links = ArmLinks(camera, poses, arms, config.link_width_m)
+    fingers = None
+    if config.finger_width_m is not None:
+        fingers = ArmLinks(camera, poses, motion.fingers, config.finger_width_m)
     white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
@@ -211,6 +224,9 @@ def _draw_view(
                 box = cores[arm].draw(core, k, motion.closed[arm, k])
                 white.lay(frames[k], core, box)
                 region(core, box)[...] = 0
+            if fingers is not None:
+                for side, colour in enumerate(_FINGER_COLOURS):
+                    fingers.draw(frames[k], 2 * arm + side, k, colour)
 
 
 def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:

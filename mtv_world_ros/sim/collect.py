@@ -90,7 +90,14 @@ def collect(
     jobs = (
         zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
         if kinds
-        else jobs_of(chosen, num_episodes, seed, out, failures_of_ten, config.policies)
+        else jobs_of(
+            chosen,
+            num_episodes,
+            seed,
+            out,
+            0 if config.kinds else failures_of_ten,
+            config.policies,
+        )
     )
     with locked(out):
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)

@@ -164,6 +164,10 @@ class SimEpisode:
             pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
         return poses
 
+    def seen_poses(self) -> FloatArray:
+        """Returns T_base_object (T, O, 4, 4) [m] at every observation since reset."""
+        return np.array([poses for poses, _ in self._seen])
+
     def history(self) -> History:
         """Returns what predicates look at: all that was observed since reset."""
         poses = np.array([poses for poses, _ in self._seen])

@@ -15,7 +15,7 @@ from mtv_world_ros.sim.episode import SimEpisode
 from mtv_world_ros.sim.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.files import GO_ON
 from mtv_world_ros.sim.jobs import episode_seed, Job
-from mtv_world_ros.sim.policy_variant import parse_variant
+from mtv_world_ros.sim.policy_variant import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.sim.randomize import RandomizationConfig
 from mtv_world_ros.sim.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.tasks import task_named
@@ -37,6 +37,7 @@ class CollectConfig:
         moves: ranges that such an episode chooses from; they leave zero-shot views unseen.
         policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
             whose grasps miss.
+        kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
     """
 
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -46,6 +47,7 @@ class CollectConfig:
     moved_share: float = 0.0
     moves: tuple[CameraMoves, ...] = TRAINING_MOVES
     policies: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 <= self.moved_share <= 1:
@@ -115,7 +117,7 @@ class EpisodeMaker:
         if job.zero_shot is None:
             randomization = cameras_of(seed, config)
         sim = SimEpisode(self._robot, self._expert.home, randomization)
-        faulty = parse_variant(job.policy) if job.policy else None
+        faulty = self._policy(job, seed)
         try:
             return sim, simulate(
                 sim, self._expert, task, seed, config.record, miss=job.miss, variant=faulty
@@ -123,13 +125,21 @@ class EpisodeMaker:
         except (SimulatorError, PolicyError):
             return sim, None
 
+    def _policy(self, job: Job, seed: int) -> PolicyVariant | None:
+        """What acts in place of the expert."""
+        if self._config.kinds:
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+            return draw_variant(self._config.kinds, rng)
+        return parse_variant(job.policy) if job.policy else None
+
     def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
         started = time.process_time()
         extra = {'attempt': str(attempt), 'index': str(job.index)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
-        if job.policy:
-            extra['policy'] = job.policy
+        policy = self._policy(job, seed)
+        if policy is not None:
+            extra['policy'] = policy.name
         try:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:

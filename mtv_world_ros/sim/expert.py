@@ -20,6 +20,7 @@ from mtv_world_ros.sim.picking import (
 from mtv_world_ros.sim.placement import arm_of
 from mtv_world_ros.sim.scene import Place, Scene, SceneObject
 from mtv_world_ros.sim.tasks import Move, PickPlace, Shake, Task
+from mtv_world_ros.sim.way_points import WayPoint, WayPointFaults
 
 #: the tools' rest poses in the base frame [m], pointing down, in view of both cameras
 HOME_TOOL = {'left': (-0.2, 0.17, 0.13), 'right': (0.2, 0.17, 0.13)}
@@ -67,17 +68,6 @@ class ExpertConfig:
     picking: PickingConfig = PickingConfig()
 
 
-@dataclass(frozen=True, slots=True)
-class _WayPoint:
-    """Where one arm's tool is at the end of a segment; `seconds` None = as its speed has it."""
-
-    position: FloatArray
-    yaw: float
-    opening: float
-    seconds: float | None = None
-    lean: float = 0.0
-
-
 def home_positions(robot: RobotModel) -> FloatArray:
     """Returns the joint positions (J,) of both arms at rest, grippers open."""
     positions = np.zeros(len(robot.joint_names))
@@ -112,7 +102,13 @@ class Expert:
         }
 
     def plan(
-        self, task: Task, scene: Scene, rng: np.random.Generator, *, miss: bool
+        self,
+        task: Task,
+        scene: Scene,
+        rng: np.random.Generator,
+        *,
+        miss: bool,
+        faults: WayPointFaults | None = None,
     ) -> JointTrajectory:
         """Returns the trajectory (T, J) with velocities that carries out the task's moves.
 
@@ -123,6 +119,7 @@ class Expert:
             scene: where everything is at the start, and the goals.
             rng: draws heights, tempo and the size of a miss.
             miss: displace one grasp so that the gripper closes on nothing.
+            faults: what goes wrong with the way points of one move.
 
         Raises:
             SimulatorError: a way point is out of the arm's reach.
@@ -134,6 +131,8 @@ class Expert:
         for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = self._stops(pick, move, now, goal, rng)
+            if faults is not None and number == faults.move_of(len(task.moves)):
+                stops = faults.applied(stops, pick.yaw)
             rows = self._follow(pick.arm, stops, rng, alone=len(task.moves) == 1)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
             start = max(1, busy - overlap)
@@ -184,14 +183,14 @@ class Expert:
         now: dict[str, SceneObject],
         goal: Place,
         rng: np.random.Generator,
-    ) -> list[_WayPoint]:
+    ) -> list[WayPoint]:
         config, place, yaw, wide = self._config, pick.position, pick.yaw, pick.opening
         heights = config.lift if isinstance(move, PickPlace) else move.lift
         above, lift = (_rise(rng.uniform(*r)) for r in (config.above_grasp, heights))
         start = [
-            _WayPoint(place + above, yaw, wide),
-            _WayPoint(place, yaw, wide),
-            _WayPoint(place, yaw, 0.0, config.close_s),
+            WayPoint('above', place + above, yaw, wide),
+            WayPoint('grasp', place, yaw, wide),
+            WayPoint('close', place, yaw, 0.0, config.close_s),
         ]
         if isinstance(move, Shake):
             middle = self._swings(move, pick, place + lift)
@@ -202,25 +201,33 @@ class Expert:
                 config.above_place if move.rest != 'in' else config.above_drop
             )
             lifted = np.array([*place[:2], max(place[2] + lift[2], pre_place[2])])
-            middle = [_WayPoint(lifted, yaw, 0.0), _WayPoint(pre_place, turned, 0.0)]
+            middle = [
+                WayPoint('lift', lifted, yaw, 0.0),
+                WayPoint('carry', pre_place, turned, 0.0),
+            ]
         home = np.asarray(HOME_TOOL[pick.arm])
         return [
             *start,
             *middle,
-            _WayPoint(down, turned, 0.0),
-            _WayPoint(down, turned, pick.released, config.open_s),
-            _WayPoint(down + _rise(config.retreat), turned, 1.0),
-            _WayPoint(home, 0.0, 1.0),
+            WayPoint('lower', down, turned, 0.0),
+            WayPoint('open', down, turned, pick.released, config.open_s),
+            WayPoint('retreat', down + _rise(config.retreat), turned, 1.0),
+            WayPoint('home', home, 0.0, 1.0),
         ]
 
-    def _swings(self, move: Shake, pick: Pick, lifted: FloatArray) -> list[_WayPoint]:
+    def _swings(self, move: Shake, pick: Pick, lifted: FloatArray) -> list[WayPoint]:
         inwards = 1.0 if pick.arm == 'left' else -1.0
-        upright = _WayPoint(lifted, pick.yaw, 0.0)
+        upright = WayPoint('lift', lifted, pick.yaw, 0.0)
         swings = [
-            replace(upright, lean=inwards * move.lean[k % 2], seconds=self._config.swing_s)
+            replace(
+                upright,
+                phase='carry',
+                lean=inwards * move.lean[k % 2],
+                seconds=self._config.swing_s,
+            )
             for k in range(move.num_swings)
         ]
-        return [upright, *swings, upright]
+        return [upright, *swings, replace(upright, phase='carry')]
 
     def _place(
         self, pick: Pick, move: PickPlace, now: dict[str, SceneObject], goal: Place
@@ -235,7 +242,7 @@ class Expert:
                 rest = np.array([*goal[:2], top + self._config.drop + subject.size[2] / 2])
         return rest + tool_offset(subject, turned) + _rise(0.002), turned
 
-    def _timed(self, stops: list[_WayPoint], home: FloatArray) -> list[float]:
+    def _timed(self, stops: list[WayPoint], home: FloatArray) -> list[float]:
         """Time of each segment before scaling [s]."""
         seconds, before = [], home
         for point in stops:
@@ -245,11 +252,11 @@ class Expert:
         return seconds
 
     def _follow(
-        self, arm: str, stops: list[_WayPoint], rng: np.random.Generator, *, alone: bool
+        self, arm: str, stops: list[WayPoint], rng: np.random.Generator, *, alone: bool
     ) -> FloatArray:
         """Minimum-jerk blends between way points, scaled to the drawn motion time."""
         config = self._config
-        home = _WayPoint(np.asarray(HOME_TOOL[arm]), 0.0, 1.0)
+        home = WayPoint('home', np.asarray(HOME_TOOL[arm]), 0.0, 1.0)
         seconds = self._timed(stops, home.position)
         wanted = rng.uniform(*(config.motion_s if alone else config.motions_s))
         ends = np.cumsum([0.0, *seconds]) * wanted / sum(seconds)

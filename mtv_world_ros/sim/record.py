@@ -35,6 +35,7 @@ class RecordConfig:
         point_period_s: between the points of a chunk [s]; a multiple of 0.02.
         jpeg_quality: of the recorded frames, 1 to 100.
         max_attempts: seeds tried before an episode is given up.
+        pictures: `all` frames have them, or only the `first`.
     """
 
     hold_s: float = 0.6
@@ -43,6 +44,7 @@ class RecordConfig:
     point_period_s: float = 0.1
     jpeg_quality: int = 88
     max_attempts: int = 25
+    pictures: str = 'all'
 
     def __post_init__(self) -> None:
         for field in ('hold_s', 'frame_period_s', 'chunk_s', 'point_period_s'):
@@ -69,6 +71,7 @@ class Take:
         any_outcome: the policy has faults, and what comes of them is as wanted.
         physics_s: CPU time of planning and physics.
         rendering_s: CPU time of building the scene and rendering.
+        object_poses: (T, O, 4, 4) T_base_object [m].
     """
 
     observations: tuple[SimObservation, ...]
@@ -81,6 +84,7 @@ class Take:
     any_outcome: bool
     physics_s: float
     rendering_s: float
+    object_poses: FloatArray
 
     def is_as_wanted(self) -> bool:
         """Returns whether a success succeeded and held, or a miss left its object alone."""
@@ -139,7 +143,7 @@ def simulate(
         measured.append(sim.positions())
         if k % every == 0:
             before = time.process_time()
-            observations.append(sim.observe())
+            observations.append(sim.observe(rendering=config.pictures == 'all'))
             rendering += time.process_time() - before
     history = sim.history()
     ever, final = ever_and_final(task.succeeds(history))
@@ -157,6 +161,7 @@ def simulate(
         any_outcome=variant is not None,
         physics_s=time.process_time() - started - rendering,
         rendering_s=rendering,
+        object_poses=sim.seen_poses(),
     )
 
 
@@ -217,6 +222,7 @@ def write_take(
             stamp = _stamp(k * CONTROL_PERIOD_S)
             writer.write_joint_states(stamp, names, positions, velocities[k])
             if k % frame_every == 0:
+                writer.write_object_poses(stamp, take.object_poses[k // frame_every])
                 _write_frame(writer, sim, take.observations[k // frame_every], stamp)
             if k % chunk_every == 0 and k < last:
                 commands = chunk(take.commands, k * CONTROL_PERIOD_S, config)
@@ -224,7 +230,7 @@ def write_take(
 
 
 def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:
-    for camera in sim.scene.cameras:
+    for camera in sim.scene.cameras if seen.images else ():
         writer.write_camera_info(camera.view, stamp, camera)
         writer.write_image(camera.view, stamp, seen.images[camera.view])
         writer.write_mask(camera.view, stamp, seen.masks[camera.view])

@@ -19,6 +19,7 @@ from mtv_world_ros.sim.randomize import draw_scene, instruction_of, Randomizatio
 from mtv_world_ros.sim.scene import Place, Scene
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks import Move, PickPlace, START, Task, task_named
+from mtv_world_ros.sim.way_points import WayPointFaults
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +38,11 @@ class ScriptedPolicyConfig:
     point_period_s: float = 0.1
     hold_s: float = 0.6
     max_draws: int = 20
+
+
+def fault_generator(seed: int) -> np.random.Generator:
+    """Returns the generator that draws which move of an episode goes wrong, and to which side."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
 
 
 class ScriptedPolicy:
@@ -94,7 +100,9 @@ class ScriptedPolicy:
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
         self._first_ns = None
-        self._plan = with_faults(self._draw_plan(rng), self.variant, self._expert.robot, rng)
+        faults = WayPointFaults(self.variant, fault_generator(seed))
+        plan = self._draw_plan(rng, faults)
+        self._plan = with_faults(plan, self.variant, self._expert.robot, rng)
 
     def act(self, observation: Observation, instruction: str = '') -> JointTrajectory | None:
         """Returns the next commands, or None where the episode is over.
@@ -132,13 +140,17 @@ class ScriptedPolicy:
         """How long its episode lasts [s]."""
         return float(self.plan.times[-1]) + self._config.hold_s
 
-    def _draw_plan(self, rng: np.random.Generator) -> JointTrajectory:
-        is_wrong, is_miss = rng.uniform(size=2) < (self.variant.wrong, self.variant.miss)
+    def _draw_plan(self, rng: np.random.Generator, faults: WayPointFaults) -> JointTrajectory:
+        is_wrong, is_miss = rng.uniform(size=2) < (
+            self.variant.size('wrong'),
+            self.variant.size('miss'),
+        )
         reason = ''
         for _ in range(self._config.max_draws):
             for task, scene in self._intentions(rng, is_wrong=bool(is_wrong)):
                 try:
-                    return self._expert.plan(task, self._seen(scene, rng), rng, miss=bool(is_miss))
+                    seen = self._seen(scene, rng)
+                    return self._expert.plan(task, seen, rng, miss=bool(is_miss), faults=faults)
                 except SimulatorError as error:
                     reason = str(error)
         raise PolicyError(
@@ -191,12 +203,12 @@ class ScriptedPolicy:
         return replace(
             scene,
             objects=tuple(
-                replace(item, position=moved(item.position, self.variant.shift))
+                replace(item, position=moved(item.position, self.variant.size('shift')))
                 if item.role in subjects
                 else item
                 for item in scene.objects
             ),
-            goals=tuple(moved(goal, self.variant.place) for goal in scene.goals),
+            goals=tuple(moved(goal, self.variant.size('place')) for goal in scene.goals),
         )
 
 

@@ -190,6 +190,8 @@ class BatchSource:
             clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
         past = self._past(recording, start, lead, rng)
         names = clip.objects or objects_from_instruction(recording.instruction)
+        if rng.random() < self._augment.name_dropout:
+            names = tuple(name for name in names if rng.random() < 0.5)
         trajectory, actions = self.controls.make(clip, names, clip.frames[:, 0])
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:

@@ -20,6 +20,7 @@ from mtv_world_ros.training.optimizer_config import LoraSettings, OptimizerConfi
 
 _SIGMA_WEIGHTINGS = ('uniform', 'middle')
 _PROBABILITIES = (
+    'name_dropout',
     'start_noise',
     'colour_permutation',
     'action_dropout',
@@ -99,6 +100,8 @@ class AugmentConfig:
         colour_permutation: probability of exchanged colour channels.
         failure_share: share of clips drawn from failed episodes alone, on top of those that come
             by chance: they are few, and a model that rarely sees a miss imagines grasps instead.
+        name_dropout: probability of a clip of which only some objects, or none, are named, so that
+            what an instruction does not name stays in the picture.
         action_dropout: probability of a sample without its actions; control `ee_mlp` alone
             (Ctrl-World's value).
         control_dropout: probability of a sample without its trajectory video.
@@ -110,6 +113,7 @@ class AugmentConfig:
     start_noise_std: float = 0.04
     colour_permutation: float = 0.3
     failure_share: float | None = None
+    name_dropout: float = 0.0
     action_dropout: float = 0.05
     control_dropout: float = 0.0
     reference_dropout: float = 0.0

@@ -8,7 +8,9 @@ from threading import Lock
 import numpy as np
 
 from mtv_world_ros.data.clips import Clip
-from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.data_types import BoolArray, ByteArray
+from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.object_motion import moved_masks, ObjectMotion
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
@@ -53,8 +55,9 @@ class ControlMaker:
             return None, self.actions.encode(self.robot, clip.positions)
         masks = None
         if self.object_mask:
-            with self._lock:
-                masks = self.segmenter.segment(start_frame[:, None], names).masks[:, :, 0]
+            masks = self._moving_masks(clip, names)
+            if masks is None:
+                masks = self._masks(start_frame, names)
         video = render_trajectory_video(
             cameras=clip.cameras,
             robot=self.robot,
@@ -64,3 +67,34 @@ class ControlMaker:
             config=self.rendering,
         )
         return video.frames, None
+
+    def _masks(self, frames: ByteArray, names: tuple[str, ...]) -> BoolArray:
+        """(V, O, H, W) of frames (V, H, W, 3)."""
+        with self._lock:
+            return self.segmenter.segment(frames[:, None], names).masks[:, :, 0]
+
+    def _moving_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray | None:
+        """(V, O, 1 + T, H, W) masks that go where the objects went; None = they are held.
+
+        They are those of the episode's first frame, as in a rollout of chained chunks.
+        """
+        origin, poses = clip.origin, clip.object_poses
+        if not self.rendering.object_motion or origin is None or poses is None:
+            return None
+        if any(name not in clip.objects for name in names):
+            return None
+        items = [clip.objects.index(name) for name in names]
+        first, poses = origin.object_poses[items], poses[:, items]
+        motion = ObjectMotion(
+            reference=first[:, :3, 3],
+            points=poses[..., :3, 3],
+            rotations=poses[..., :3, :3] @ np.swapaxes(first[:, :3, :3], -1, -2),
+        )
+        at_first = origin.positions[None]
+        return moved_masks(
+            self._masks(origin.frames, names),
+            motion,
+            clip.cameras,
+            [camera_poses(camera, self.robot, at_first)[0] for camera in clip.cameras],
+            np.stack([camera_poses(c, self.robot, clip.positions) for c in clip.cameras]),
+        )

@@ -59,9 +59,9 @@ def _succeeds(sim, policy, seed):
 
 def test_names_and_variants_are_the_same_thing():
     assert parse_variant('expert') == PolicyVariant()
-    assert parse_variant(' expert-noise-0.02 ').noise == 0.02
+    assert parse_variant(' expert-noise-0.02 ').size('noise') == 0.02
     both = parse_variant('expert-miss-.5-late-0.3')
-    assert (both.miss, both.late, both.noise) == (0.5, 0.3, 0.0)
+    assert both.sizes == (('miss', 0.5), ('late', 0.3)) and both.size('noise') == 0.0
     assert both.name == 'expert-miss-0.5-late-0.3' and parse_variant(both.name) == both
     assert parse_variant('expert-stop-0').name == 'expert-stop-0'
 

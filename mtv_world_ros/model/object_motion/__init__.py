@@ -1,0 +1,1 @@
+"""How objects move under commanded tools: a graph network over objects and grippers."""

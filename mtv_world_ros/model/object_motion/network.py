@@ -1,0 +1,300 @@
+"""A graph network that carries, pushes and drops objects: one step of 0.1 s after the other.
+
+Nodes are objects and tools. Every step an object hears of every tool (where it is in the tool's
+own frame, how far the fingers are open) and of every other object, and decides how far it goes
+along with which tool. It is translation-invariant in the plane by construction.
+
+Interaction networks: Battaglia et al. 2016; their use as simulators: Sanchez-Gonzalez et al. 2020.
+
+Shape letters: B batch, O objects, A tools, T steps, D width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn, Tensor
+import torch.nn.functional as F
+
+#: between two steps [s]
+STEP_S = 0.1
+_SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """What the network is given of B episodes.
+
+    Attributes:
+        points: (B, O, 3) where the objects are at first [m].
+        features: (B, O, V, F) of `object_shapes`.
+        present: (B, O) bool, False where the batch is padded.
+        tools: (B, T + 1, A, 4, 4) T_base_tool as commanded.
+        openings: (B, T + 1, A) of the grippers as commanded, 0 closed to 1 open.
+    """
+
+    points: Tensor
+    features: Tensor
+    present: Tensor
+    tools: Tensor
+    openings: Tensor
+
+    def to(self, device: torch.device | str) -> Scene:
+        """Returns it on a device."""
+        return Scene(**{name: getattr(self, name).to(device) for name in self.__slots__})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """Where the objects go; row 0 is the start.
+
+    Attributes:
+        points: (B, T + 1, O, 3) [m].
+        rotations: (B, T + 1, O, 3, 3) from the start.
+        held: (B, T + 1, O, A) share of the motion that each tool gives.
+        spread: (B, T + 1, O) expected error of `points` [m], as learned.
+    """
+
+    points: Tensor
+    rotations: Tensor
+    held: Tensor
+    spread: Tensor
+
+
+def _mlp(*widths: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for number, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
+        layers += [nn.Linear(a, b)] + ([nn.SiLU()] if number < len(widths) - 2 else [])
+    return nn.Sequential(*layers)
+
+
+class ObjectMotionNetwork(nn.Module):
+    """See the module.
+
+    Args:
+        num_features: F times V, numbers that describe an object.
+        width: D.
+        hidden: numbers that an object remembers from step to step.
+    """
+
+    def __init__(self, num_features: int = 18, width: int = 128, hidden: int = 48) -> None:
+        super().__init__()
+        self.config = {'num_features': num_features, 'width': width, 'hidden': hidden}
+        self.hidden = hidden
+        shape = 32
+        self.shape = _mlp(num_features + 1, width, shape)
+        # r now, next, before (9) | rotation in the tool (6) | openings (3) | tool: height, way (4)
+        self.tool_edge = _mlp(22 + shape + hidden, width, width, width)
+        # offset (3) | velocities (6) | rotation of the other (6)
+        self.object_edge = _mlp(15 + 2 * shape + hidden, width, width)
+        self.gate = nn.Linear(width, 1)
+        self.push = nn.Linear(width, 6)
+        # height, velocity, spin, rotation
+        self.node = _mlp(1 + 3 + 3 + 6 + shape + hidden + 2 * width, width, width)
+        self.free = nn.Linear(width, 6)
+        self.stay = nn.Linear(width, 1)
+        self.memory = nn.GRUCell(width, hidden)
+        self.scale = nn.Linear(width, 1)
+        for layer in (self.push, self.free):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        nn.init.constant_(self.stay.bias, 2.0)
+        nn.init.constant_(self.scale.bias, -6.0)
+
+    def forward(
+        self,
+        scene: Scene,
+        truth: tuple[Tensor, Tensor] | None = None,
+        forced: Tensor | None = None,
+    ) -> Motion:
+        """Returns the motion over T steps.
+
+        Args:
+            scene: what is given.
+            truth: (B, T + 1, O, 3) points and (B, T + 1, O, 3, 3) rotations, for training.
+            forced: (B, T) bool, steps that start from the truth; needs `truth`.
+        """
+        batch, objects = scene.present.shape
+        described = torch.cat(
+            [scene.features.flatten(2) * _SCALE, scene.points[..., 2:] * _SCALE], dim=-1
+        )
+        shape = self.shape(described)
+        points = scene.points
+        rotations = torch.eye(3, device=points.device).expand(batch, objects, 3, 3)
+        memory = points.new_zeros(batch, objects, self.hidden)
+        velocity = points.new_zeros(batch, objects, 6)
+        spread = points.new_zeros(batch, objects)
+        held = points.new_zeros(batch, objects, scene.tools.shape[2])
+        track = [(points, rotations, held, spread)]
+        for step in range(scene.tools.shape[1] - 1):
+            if truth is not None and forced is not None:
+                known = forced[:, step][:, None, None]
+                points = torch.where(known, truth[0][:, step], points)
+                rotations = torch.where(known[..., None], truth[1][:, step], rotations)
+            rows = [max(step - 1, 0), step, step + 1]
+            moved, turned, held, memory, more = self.step(
+                scene.tools[:, rows],
+                scene.openings[:, rows],
+                scene.present,
+                shape,
+                points,
+                rotations,
+                velocity,
+                memory,
+            )
+            velocity = torch.cat([moved - points, _vector(turned @ rotations.mT)], dim=-1)
+            points, rotations = moved, turned
+            spread = spread + more
+            track.append((points, rotations, held, spread))
+        return Motion(
+            points=torch.stack([t[0] for t in track], 1),
+            rotations=torch.stack([t[1] for t in track], 1),
+            held=torch.stack([t[2] for t in track], 1),
+            spread=torch.stack([t[3] for t in track], 1),
+        )
+
+    def step(
+        self,
+        tools: Tensor,
+        openings: Tensor,
+        present: Tensor,
+        shape: Tensor,
+        points: Tensor,
+        rotations: Tensor,
+        velocity: Tensor,
+        memory: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """One step, from the tools (B, 3, A, 4, 4) and openings (B, 3, A) before, now and after.
+
+        Returns points, rotations, shares of the tools, memory, and what is added to the spread.
+        """
+        before, now, after = tools.unbind(1)
+        heard, gates, pushed = self._from_tools(
+            openings, shape, points, rotations, memory, (before, now, after)
+        )
+        told = self._from_objects(present, shape, points, rotations, velocity, memory)
+        node = self.node(
+            torch.cat(
+                [
+                    points[..., 2:] * _SCALE,
+                    velocity[..., :3] * _SCALE,
+                    velocity[..., 3:],
+                    rotations[..., :2].flatten(-2),
+                    shape,
+                    memory,
+                    heard,
+                    told,
+                ],
+                dim=-1,
+            )
+        )
+        memory = self.memory(node.flatten(0, 1), memory.flatten(0, 1)).unflatten(
+            0, memory.shape[:2]
+        )
+        weights = torch.cat([gates, self.stay(node)], dim=-1).softmax(dim=-1)
+        held = weights[..., :-1]
+        carry = after @ _inverse(now)  # (B, A, 4, 4)
+        there = torch.einsum('baij,boj->boai', carry[..., :3, :3], points)
+        there = there + carry[:, None, :, :3, 3]
+        free = self.free(node)
+        moved = (
+            points
+            + (held[..., None] * (there - points[:, :, None])).sum(2)
+            + pushed[..., :3]
+            + free[..., :3] / _SCALE
+        )
+        spin = _vector(carry[..., :3, :3])  # (B, A, 3)
+        turn = (held[..., None] * spin[:, None]).sum(2) + pushed[..., 3:] + free[..., 3:]
+        turned = _rotation(turn) @ rotations
+        more = F.softplus(self.scale(node.detach())[..., 0]) / _SCALE
+        return moved, turned, held, memory, more
+
+    def _from_tools(
+        self,
+        openings: Tensor,
+        shape: Tensor,
+        points: Tensor,
+        rotations: Tensor,
+        memory: Tensor,
+        tools: tuple[Tensor, Tensor, Tensor],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Messages (B, O, D), logits of being carried (B, O, A), pushes (B, O, 6)."""
+        before, now, after = tools
+        seen = [_local(tool, points) * _SCALE for tool in (now, after, before)]
+        num_tools = now.shape[1]
+        turned = now[:, None, :, :3, :3].mT @ rotations[:, :, None]
+        grip = openings.transpose(1, 2)[:, None].expand(-1, points.shape[1], -1, -1)
+        way = torch.einsum('baji,baj->bai', now[..., :3, :3], (after - now)[..., :3, 3])
+        tool = torch.cat([now[:, :, 2:3, 3], way], dim=-1) * _SCALE
+        own = torch.cat([shape, memory], dim=-1)[:, :, None].expand(-1, -1, num_tools, -1)
+        inputs = [
+            # far away is far away
+            *(value.clamp(-4, 4) for value in seen),
+            turned[..., :2].flatten(-2),
+            grip,
+            tool[:, None].expand(-1, points.shape[1], -1, -1),
+            own,
+        ]
+        edge = self.tool_edge(torch.cat(inputs, dim=-1))
+        push = self.push(edge)
+        frame = now[:, None, :, :3, :3]
+        linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
+        angular = (frame @ push[..., 3:, None])[..., 0]
+        return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
+
+    def _from_objects(
+        self,
+        present: Tensor,
+        shape: Tensor,
+        points: Tensor,
+        rotations: Tensor,
+        velocity: Tensor,
+        memory: Tensor,
+    ) -> Tensor:
+        """Messages (B, O, D) of the other objects."""
+        count = points.shape[1]
+        offset = ((points[:, None] - points[:, :, None]) * _SCALE).clamp(-6, 6)
+        own = torch.cat([shape, memory], dim=-1)[:, :, None].expand(-1, -1, count, -1)
+        other = torch.cat(
+            [velocity[..., :3] * _SCALE, velocity[..., 3:], rotations[..., :2].flatten(-2), shape],
+            dim=-1,
+        )
+        other = other[:, None].expand(-1, count, -1, -1)
+        edge = self.object_edge(torch.cat([offset, other, own], dim=-1))
+        pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=points.device)
+        return (edge * pairs[..., None]).sum(2)
+
+
+def _local(tools: Tensor, points: Tensor) -> Tensor:
+    """(B, O, A, 3) points in the frames of tools (B, A, 4, 4)."""
+    offset = points[:, :, None] - tools[:, None, :, :3, 3]
+    return torch.einsum('baji,boaj->boai', tools[..., :3, :3], offset)
+
+
+def _inverse(poses: Tensor) -> Tensor:
+    R = poses[..., :3, :3].mT
+    out = torch.zeros_like(poses)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ poses[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
+def _rotation(vector: Tensor) -> Tensor:
+    """(..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    square = (vector * vector).sum(-1)[..., None, None]
+    angle = (square + 1e-12).sqrt()
+    a, b = torch.sinc(angle / torch.pi), 0.5 * torch.sinc(angle / (2 * torch.pi)) ** 2
+    return torch.eye(3, device=vector.device) + a * skew + b * (skew @ skew)
+
+
+def _vector(rotations: Tensor) -> Tensor:
+    """(..., 3) rotation vectors [rad] of small rotations, to first order."""
+    R = rotations
+    return 0.5 * torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
