@@ -92,7 +92,7 @@ setup(
     entry_points={
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
-            'world_model = mtv_world_ros.ros.node:main',
+            'world_model = mtv_world_ros.ros.world_model.node:main',
         ],
     },
     zip_safe=True,

@@ -18,15 +18,15 @@ import time
 import numpy as np
 from page import parse_arguments, publish, table
 
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.episode import scene_generator
-from mtv_world_ros.sim.episode_maker import CollectConfig, EpisodeMaker, ROBOT_FILE, Spent
-from mtv_world_ros.sim.jobs import jobs_of
-from mtv_world_ros.sim.opengl import load_mujoco
-from mtv_world_ros.sim.randomize import draw_scene
-from mtv_world_ros.sim.scene import scene_xml
-from mtv_world_ros.sim.tasks import task_named, tasks_named
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, ROBOT_FILE, Spent
+from mtv_world_ros.sim.collect.jobs import jobs_of
+from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
+from mtv_world_ros.sim.world.opengl import load_mujoco
+from mtv_world_ros.sim.world.randomize import draw_scene
+from mtv_world_ros.sim.world.scene import scene_xml
+from mtv_world_ros.sim.world.simulator import scene_generator
 
 PARTS = {'planning and physics': 'physics_s', 'rendering': 'rendering_s', 'writing': 'writing_s'}
 

@@ -38,13 +38,14 @@ from mtv_world_ros.assembly import (
     robot_path,
 )
 from mtv_world_ros.cli.train import set_overrides
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.comparison import write_comparison
-from mtv_world_ros.evaluation.controls import ACTIONS
-from mtv_world_ros.evaluation.dataset import select
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
-from mtv_world_ros.evaluation.summary import Summary
-from mtv_world_ros.evaluation.tables import estimates_json, plain, write_json
+from mtv_world_ros.evaluation.references import ACTIONS
+from mtv_world_ros.evaluation.report.comparison import write_comparison
+from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.evaluation.report.tables import estimates_json
+from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.runtime import choose_dtype

@@ -22,9 +22,9 @@ from page import machine_line, table
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
-from mtv_world_ros.evaluation.summary import Summary
+from mtv_world_ros.evaluation.report.summary import Summary
 
 
 def main() -> None:

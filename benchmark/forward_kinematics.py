@@ -16,9 +16,9 @@ import numpy as np
 from page import measure, parse_arguments, publish, table
 import pinocchio as pin
 
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
 
 STEPS = 81
 

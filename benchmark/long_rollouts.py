@@ -30,12 +30,12 @@ from page import parse_arguments, publish, table
 import torch
 
 from mtv_world_ros.assembly import fingerprint, load_pipeline
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.dataset import select
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
-from mtv_world_ros.evaluation.summary import Summary
-from mtv_world_ros.evaluation.tables import write_json
+from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.files import write_json
 from mtv_world_ros.history import History
 from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel

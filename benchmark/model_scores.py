@@ -10,12 +10,12 @@ import statistics
 from control_tables import cell
 
 from mtv_world_ros.assembly import fingerprint, load_pipeline
-from mtv_world_ros.data.clips import load_recording
-from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+from mtv_world_ros.evaluation.report.summary import Summary
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
-from mtv_world_ros.evaluation.summary import Summary
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 from mtv_world_ros.training.run import spread
 
 #: columns of a table, and what `Summary.estimates` calls them

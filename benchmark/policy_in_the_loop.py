@@ -22,27 +22,27 @@ import numpy as np
 from page import parse_arguments, publish, table
 
 from mtv_world_ros.assembly import assemble_policy, load_pipeline
-from mtv_world_ros.data.bag_reader import BagReader
-from mtv_world_ros.data.mcap_reader import read_info
-from mtv_world_ros.data.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode_reader import read_info
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
-from mtv_world_ros.evaluation.dataset import select
 from mtv_world_ros.model import world_model as model_module
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.living import live
-from mtv_world_ros.ranking.simulated import SimulatedWorld
-from mtv_world_ros.sim.episode import SimEpisode
-from mtv_world_ros.sim.expert import home_positions
+from mtv_world_ros.ranking.worlds import SimulatedWorld
+from mtv_world_ros.sim.expert.expert import home_positions
+from mtv_world_ros.sim.world.simulator import SimEpisode
 
 #: the expert's plans are shorter than the episodes: it holds still at their end
 POLICY = 'kind: scripted\nvariant: expert\nhold_s: 60.0\n'
 NODES = ('world_model', 'policy', 'runner', 'recorder')
 MODULES = {
-    'ros.node': 'world_model',
-    'ros.policy_node': 'policy',
-    'ros.episode_runner': 'runner',
-    'ros.episode_recorder': 'recorder',
+    'ros.world_model.node': 'world_model',
+    'ros.policy.node': 'policy',
+    'ros.episodes.runner': 'runner',
+    'ros.episodes.recorder': 'recorder',
 }
 SIM_EPISODES = 2
 
@@ -215,7 +215,7 @@ def _memory(watch: MemoryWatch) -> str:
 
 def _decoding(pipeline: Pipeline, episode: Path, steps: int) -> tuple[float, float]:
     """Seconds of decoding, and of the model altogether, for one chunk; medians of three."""
-    from mtv_world_ros.data.clips import load_recording
+    from mtv_world_ros.data.recording import load_recording
 
     recording = load_recording(episode, pipeline.spec, pipeline.robot)
     spec, spent = pipeline.spec, []

@@ -31,18 +31,18 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.ros.conversions import to_joint_state, values_of
-from mtv_world_ros.ros.image_conversions import to_image
-from mtv_world_ros.ros.node import main as node_main
+from mtv_world_ros.ros.messages.conversions import to_joint_state, values_of
+from mtv_world_ros.ros.messages.images import to_image
+from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.stamps import make_header
+from mtv_world_ros.ros.world_model.node import main as node_main
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 VIEWS = ('low', 'high')
 SIZES = ((96, 72, 16), (384, 288, 16), (384, 288, 80))

@@ -24,11 +24,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.ros.image_conversions import to_image
+from mtv_world_ros.files import share_path
+from mtv_world_ros.ros.messages.images import to_image
+from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.stamps import make_header
-from mtv_world_ros.ros.view_publisher import ViewPublisher
+from mtv_world_ros.ros.world_model.view_publisher import ViewPublisher
 
 NUM_IMAGES = 200
 CAMERA_HZ = 30.0

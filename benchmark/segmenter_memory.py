@@ -22,9 +22,14 @@ import numpy as np
 import page
 
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.success.mask_tracking import drop_old, reach, start_session, stored_entries
-from mtv_world_ros.success.sam2_segmenter import Sam2Video
-from mtv_world_ros.success.vision_weights import find_weights
+from mtv_world_ros.vision.segmenters.mask_tracking import (
+    drop_old,
+    reach,
+    start_session,
+    stored_entries,
+)
+from mtv_world_ros.vision.segmenters.sam import Sam2Video
+from mtv_world_ros.vision.segmenters.weights import find_weights
 
 HEIGHT, WIDTH = 288, 384
 REPORTED = (100, 200, 500, 1000, 2000, 5000)
@@ -75,7 +80,7 @@ def _resident_mib() -> float:
 
 def _tiny(folder: Path) -> Sam2Video:
     """The one that the tests use."""
-    sys.path.insert(0, str(Path(__file__).parent.parent / 'test' / 'success'))
+    sys.path.insert(0, str(Path(__file__).parent.parent / 'test' / 'vision'))
     return Sam2Video(importlib.import_module('tiny_vision').save_sam2(folder))
 
 

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
 from mtv_world_ros.data.recording_cache import cached_recording
-from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.card import read_card

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.data.clips import load_recording
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 
 
 def main() -> None:

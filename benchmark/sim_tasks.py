@@ -24,20 +24,20 @@ from pathlib import Path
 import numpy as np
 from page import publish, table
 
-from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
-from mtv_world_ros.sim.dataset_readme import commands
-from mtv_world_ros.sim.episode import SimEpisode
-from mtv_world_ros.sim.episode_maker import CollectConfig, ROBOT_FILE
+from mtv_world_ros.sim.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
+from mtv_world_ros.sim.collect.dataset_readme import commands
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, ROBOT_FILE
+from mtv_world_ros.sim.collect.jobs import episode_seed
+from mtv_world_ros.sim.collect.record import simulate
 from mtv_world_ros.sim.episode_measures import EpisodeMeasures, measure
-from mtv_world_ros.sim.expert import Expert
-from mtv_world_ros.sim.jobs import episode_seed
-from mtv_world_ros.sim.record import simulate
-from mtv_world_ros.sim.tasks import task_named
-from mtv_world_ros.success.jaccard import mean_of_known
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.tasks.tasks import task_named
+from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: indices that no data set reaches
 OTHER_SEEDS = 1_000_000

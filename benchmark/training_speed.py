@@ -29,14 +29,14 @@ import torch
 
 from mtv_world_ros.assembly import assemble_segmenter, robot_path
 from mtv_world_ros.cli.train import set_overrides
-from mtv_world_ros.evaluation.dataset import select
+from mtv_world_ros.data.splits import select
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.runtime import choose_dtype, place
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.actions import kept_actions, transformer_arguments
-from mtv_world_ros.training.batches import Batch, BatchSource
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.batches import Batch, BatchSource
+from mtv_world_ros.training.clips.fit_actions import kept_actions, transformer_arguments
 from mtv_world_ros.training.config import load_training_config
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.loss import batch_loss
 from mtv_world_ros.training.run import load_recordings, spread
 from mtv_world_ros.training.speed import ideal_seconds, measured_peak

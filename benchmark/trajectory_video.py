@@ -19,6 +19,7 @@ import numpy as np
 from page import measure, parse_arguments, publish, table
 
 from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.rendering.trajectory_video import (
@@ -27,7 +28,6 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
-from mtv_world_ros.resources import share_path
 
 #: name, frames, width, height, frames a second
 CASES = (('small preset', 17, 96, 72, 5.0), ('81 frames', 81, 384, 288, 10.0))

@@ -13,17 +13,17 @@ from diffusers import WanImageToVideoPipeline, WanTransformer3DModel
 import torch
 from torch import nn, Tensor
 
+from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.conditioning import condition, Conditioning, decode_frames
-from mtv_world_ros.model.context import NUM_TEXT_TOKENS
-from mtv_world_ros.model.followers import Followers
-from mtv_world_ros.model.history import with_anchor, with_history
+from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
-from mtv_world_ros.model.preparation import prepare
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, sample_latents
-from mtv_world_ros.model.serving import ServingOptions
-from mtv_world_ros.model.tiny_autoencoder import TinyAutoencoder
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.serving.followers import Followers
+from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.prepare import prepare
+from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import TrainingConfig
 
 _IMAGE_TOKENS = 257

@@ -31,7 +31,7 @@ from wan_bench import Bench
 
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.conditioning import Conditioning
-from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 
 _COMPARED = (

@@ -28,9 +28,9 @@ from wan_bench import Bench
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.lora import add_adapter
-from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.training.base import Base
-from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.speed import ideal_seconds, measured_peak

@@ -8,24 +8,24 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, PolicyError
+from mtv_world_ros.files import content_digest, share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import content_digest, share_path
 from mtv_world_ros.success.calibration import CALIBRATION, Calibration, load_calibration
-from mtv_world_ros.success.describer import Describer, InstructionDescriber
 from mtv_world_ros.success.estimator import SuccessEstimator
-from mtv_world_ros.success.segmenter import Segmenter
-from mtv_world_ros.success.segmenter_choice import choose_segmenter
 from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
 from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon
+from mtv_world_ros.vision.describers.describer import Describer, InstructionDescriber
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 if TYPE_CHECKING:
-    from mtv_world_ros.success.describer_config import DescriberConfig
-    from mtv_world_ros.success.vlm_describer import Chat
+    from mtv_world_ros.vision.describers.config import DescriberConfig
+    from mtv_world_ros.vision.describers.vlm import Chat
 
 BUNDLED = 'bundled'
 _YAML = ('.yaml', '.yml')
@@ -114,7 +114,7 @@ def load_pipeline(
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
     from mtv_world_ros.model.runtime import choose_dtype, set_num_threads
-    from mtv_world_ros.model.serving import ServingOptions
+    from mtv_world_ros.model.serving.options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
 
     options = ServingOptions.parse(serving)
@@ -219,9 +219,9 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
 
 
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
-    from mtv_world_ros.sim.expert import Expert
-    from mtv_world_ros.sim.policy_variant import parse_variant
-    from mtv_world_ros.sim.scripted_policy import scripted_policy, ScriptedPolicyConfig
+    from mtv_world_ros.sim.expert.expert import Expert
+    from mtv_world_ros.sim.expert.faults import parse_variant
+    from mtv_world_ros.sim.expert.scripted_policy import scripted_policy, ScriptedPolicyConfig
 
     variant = settings.variant
     parse_variant(variant)
@@ -254,21 +254,21 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
         ConfigError: the configuration is wrong, a key or a package is missing.
         CheckpointError: the local model cannot be loaded.
     """
-    from mtv_world_ros.success.describer_config import DescriberConfig, load_describer_config
+    from mtv_world_ros.vision.describers.config import DescriberConfig, load_describer_config
 
     if config is None:
         return InstructionDescriber()
     if not isinstance(config, DescriberConfig):
         config = load_describer_config(Path(config))
     if config.kind == 'list':
-        from mtv_world_ros.success.object_list import load_object_list
+        from mtv_world_ros.vision.describers.object_list import load_object_list
 
         return load_object_list(Path(config.list))
     chat = _chat(config)
     if chat is None:
         return InstructionDescriber()
-    from mtv_world_ros.success.description_cache import DescriptionCache
-    from mtv_world_ros.success.vlm_describer import VlmDescriber
+    from mtv_world_ros.vision.describers.description_cache import DescriptionCache
+    from mtv_world_ros.vision.describers.vlm import VlmDescriber
 
     return VlmDescriber(chat, DescriptionCache(Path(config.cache)) if config.cache else None)
 
@@ -276,11 +276,11 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
 def _chat(config: DescriberConfig) -> Chat | None:
     """The vision-language model, if one is asked for."""
     if config.kind == 'openai' and config.openai:
-        from mtv_world_ros.success.openai_chat import OpenAIChat
+        from mtv_world_ros.vision.describers.openai_chat import OpenAIChat
 
         return OpenAIChat(config.openai)
     if config.kind == 'local' and config.local:
-        from mtv_world_ros.success.local_vlm import LocalVlm
+        from mtv_world_ros.vision.describers.local_vlm import LocalVlm
 
         return LocalVlm(config.local)
     return None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 
 
 def run(*arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
@@ -92,7 +92,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Pa
 
 @needs_checkpoint
 def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
-    from mtv_world_ros.data.bag_reader import BagReader
+    from mtv_world_ros.data.bag.reader import BagReader
 
     episode = share_path('resource', 'demo_episode')
     out = tmp_path / 'imagined'

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.assembly import assemble
-from mtv_world_ros.data.clips import load_recording
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.ensemble import imagine_seeds, SEED_STEP
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
 from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
 SPEC = WorldModelSpec(

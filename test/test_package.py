@@ -185,7 +185,7 @@ def test_installed_like_colcon_the_commands_lie_where_ros2_run_looks(prefix):
 
 def test_installed_like_colcon_the_bundled_files_are_found(prefix):
     pytest.importorskip('ament_index_python')
-    code = "from mtv_world_ros.resources import share_path; print(share_path('config', 'robots'))"
+    code = "from mtv_world_ros.files import share_path; print(share_path('config', 'robots'))"
     found = Path(_run_installed(prefix, '-c', code).strip())
     assert found == prefix / 'share' / 'mtv_world_ros' / 'config' / 'robots'
 
@@ -203,7 +203,7 @@ def test_help_starts_without_torch_and_diffusers():
 
 @pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_modules_are_short(path):
-    limit = 200 if path.name == 'node.py' else 300
+    limit = 200 if path.parts[-2:] == ('world_model', 'node.py') else 300
     num_lines = len(path.read_text().splitlines())
     assert num_lines <= limit
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.assembly import assemble
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.errors import CheckpointError, ObservationError, TrajectoryError
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.resources import share_path
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'

@@ -21,9 +21,9 @@ from mtv_world_ros.cli.options import (
 from mtv_world_ros.cli.provenance import provenance
 
 if TYPE_CHECKING:
-    from mtv_world_ros.evaluation.dataset import Selection
+    from mtv_world_ros.data.splits import Selection
+    from mtv_world_ros.evaluation.report.summary import Summary
     from mtv_world_ros.evaluation.results import EpisodeResult
-    from mtv_world_ros.evaluation.summary import Summary
     from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
 _EPILOG = """\
@@ -68,9 +68,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
-    from mtv_world_ros.evaluation.calibrate import calibrate, samples_of
-    from mtv_world_ros.evaluation.calibration_report import write_calibration_report
-    from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
+    from mtv_world_ros.evaluation.calibration.report import write_calibration_report
     from mtv_world_ros.success.calibration import save_calibration
     from mtv_world_ros.success.trusted_horizon import save_horizon
 
@@ -139,7 +139,7 @@ def _horizon(
     runs: Sequence[Sequence[EpisodeResult]], summary: Summary, made: dict[str, str]
 ) -> HorizonCurve | None:
     """J of the objects that move against the horizon; None = nothing moves."""
-    from mtv_world_ros.evaluation.horizon import curve
+    from mtv_world_ros.evaluation.metrics.horizon import curve
     from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
     rows: dict[str, list] = {}

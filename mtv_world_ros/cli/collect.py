@@ -73,11 +73,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _collect(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.sim.collect import collect
-    from mtv_world_ros.sim.episode_maker import CollectConfig
-    from mtv_world_ros.sim.policy_variant import kinds_of
-    from mtv_world_ros.sim.randomize import RandomizationConfig
-    from mtv_world_ros.sim.record import RecordConfig
+    from mtv_world_ros.sim.collect.collect import collect
+    from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+    from mtv_world_ros.sim.collect.record import RecordConfig
+    from mtv_world_ros.sim.expert.faults import kinds_of
+    from mtv_world_ros.sim.world.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
     collect(

@@ -22,7 +22,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _demo(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.demo.run import run_demo
-    from mtv_world_ros.resources import share_path
+    from mtv_world_ros.files import share_path
 
     text = run_demo(
         arguments.episode or share_path('resource', 'demo_episode'),

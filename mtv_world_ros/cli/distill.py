@@ -53,7 +53,7 @@ def _distill(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.cli.train import set_overrides
-    from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.data.splits import select
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.card import read_card
     from mtv_world_ros.model.runtime import choose_dtype

@@ -53,7 +53,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.data.mcap_reader import read_episode
+    from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.inspection.inspect import load_inspector
     from mtv_world_ros.inspection.report import to_text
 
@@ -73,7 +73,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
 
 
 def _write(inspector: Inspector, episode: Episode, inspection: Inspection, out: Path) -> None:
-    from mtv_world_ros.data.messages import encode_png
+    from mtv_world_ros.data.bag.messages import encode_png
     from mtv_world_ros.inspection.report import to_markdown
 
     out.mkdir(parents=True, exist_ok=True)

@@ -23,8 +23,8 @@ from mtv_world_ros.cli.provenance import provenance
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mtv_world_ros.evaluation.dataset import Selection
-    from mtv_world_ros.evaluation.summary import Summary
+    from mtv_world_ros.data.splits import Selection
+    from mtv_world_ros.evaluation.report.summary import Summary
     from mtv_world_ros.pipeline import Pipeline
 
 _EPILOG = """\
@@ -147,8 +147,8 @@ def _row(entry: Entry, pipeline: Pipeline) -> str:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
-    from mtv_world_ros.evaluation.comparison import write_comparison
-    from mtv_world_ros.evaluation.dataset import select
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.evaluation.report.comparison import write_comparison
     from mtv_world_ros.model.card import read_card
 
     entries = parse_entries(arguments.checkpoints)
@@ -167,7 +167,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         print(summaries[0].markdown())
     print(text)
     if arguments.report:
-        from mtv_world_ros.evaluation.html_report import write_report
+        from mtv_world_ros.evaluation.report.html import write_report
 
         print(f'report: {write_report(folders, arguments.out / "report.html")}')
     return 0

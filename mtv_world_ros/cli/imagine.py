@@ -40,7 +40,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _imagine(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.data.mcap_reader import list_episodes
+    from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
     from mtv_world_ros.errors import ConfigError
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mtv_world_ros.model.import_weights import PartReport
+    from mtv_world_ros.model.wan_import.import_weights import PartReport
 
 #: of the paper, Implementation Details
 PROMPT = 'The robotic arm picks up objects from the table and places them'
@@ -41,7 +41,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _import_weights(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.model.import_weights import import_weights
+    from mtv_world_ros.model.wan_import.import_weights import import_weights
     from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
     # public weights never saw a history: they take one once they are trained with it

@@ -74,9 +74,9 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.ranking.page import write_ranking
     from mtv_world_ros.ranking.rank import run_jobs
+    from mtv_world_ros.ranking.report import console
     from mtv_world_ros.ranking.runner import RolloutConfig
     from mtv_world_ros.ranking.summary import Summary
-    from mtv_world_ros.ranking.words import console
 
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
@@ -118,8 +118,8 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
         make_jobs,
         policies_named,
     )
-    from mtv_world_ros.sim.expert import Expert
-    from mtv_world_ros.sim.tasks import tasks_named
+    from mtv_world_ros.sim.expert.expert import Expert
+    from mtv_world_ros.sim.tasks.tasks import tasks_named
 
     policies = policies_named(
         ','.join(DEFAULT_POLICIES) if arguments.policies is None else arguments.policies
@@ -135,7 +135,7 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
 def _settings(arguments: argparse.Namespace) -> dict[str, str]:
     """What rollouts depend on: those of other settings are run again."""
     from mtv_world_ros.assembly import fingerprint
-    from mtv_world_ros.resources import share_path
+    from mtv_world_ros.files import share_path
 
     return {
         'checkpoint': fingerprint(arguments.checkpoint),

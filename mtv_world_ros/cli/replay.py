@@ -23,7 +23,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'replay',
         help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
         epilog='Without --offline it takes the options of the ROS player (--rate, --loop, '
-        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.player --help.',
+        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.bags.player --help.',
         allow_abbrev=False,
     )
     parser.add_argument('episode', type=Path)
@@ -42,7 +42,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _replay(arguments: argparse.Namespace) -> int:
     if not arguments.offline:
         return _play(arguments)
-    from mtv_world_ros.evaluation.replay import replay_offline
+    from mtv_world_ros.replay.offline import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
     summary = replay_offline(
@@ -61,5 +61,5 @@ def _play(arguments: argparse.Namespace) -> int:
     import runpy
 
     sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.player]
-    runpy.run_module('mtv_world_ros.ros.player', run_name='__main__')
+    runpy.run_module('mtv_world_ros.ros.bags.player', run_name='__main__')
     return 0

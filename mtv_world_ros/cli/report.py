@@ -19,7 +19,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.evaluation.html_report import write_report
+    from mtv_world_ros.evaluation.report.html import write_report
 
     path = arguments.out or arguments.evaluations[0] / 'report.html'
     print(f'written: {write_report(arguments.evaluations, path)}')

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.held_out import add_held_out, held_out
 from mtv_world_ros.cli.options import add_dtype
+from mtv_world_ros.cli.train_held_out import add_held_out, held_out
 
 if TYPE_CHECKING:
     import torch
@@ -91,8 +91,8 @@ def _train(arguments: argparse.Namespace) -> int:
     import torch
 
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.data.splits import select
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.evaluation.dataset import select
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.training.config import load_training_config

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 import re
 
+from mtv_world_ros.data.bag.messages import COMPRESSED_IMAGE, IMAGE
 from mtv_world_ros.data.episode import (
     image_topic,
     INSTRUCTION,
@@ -14,7 +15,6 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
     OBJECT_POSES,
 )
-from mtv_world_ros.data.messages import COMPRESSED_IMAGE, IMAGE
 from mtv_world_ros.errors import EpisodeError, nearest
 
 #: keys of a topic map that are not views, and the topics they stand for

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import CameraModel, JointTrajectory, WorldModelSpec
 from mtv_world_ros.geometry.robot import RobotModel
 

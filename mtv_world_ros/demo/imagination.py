@@ -12,16 +12,16 @@ import subprocess
 import time
 
 from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.child_processes import (
+from mtv_world_ros.data.episode import CALIBRATION_FILE
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
     start_process,
     stop_process,
 )
-from mtv_world_ros.data.episode import CALIBRATION_FILE
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.model.card import read_card, spec_of
 
 #: what an episode starts from stays valid for as long as the policy thinks [s]
 _NO_AGE = 3600.0
@@ -141,12 +141,12 @@ def _world_model_command(options: ImagineOptions, views: Sequence[str]) -> list[
         'num_inference_steps': options.num_inference_steps,
         'segmenter': options.segmenter,
     }
-    return module_command('node', *ros_arguments(parameters, _REMAPS))
+    return module_command('world_model.node', *ros_arguments(parameters, _REMAPS))
 
 
 def _policy_command(options: ImagineOptions, views: Sequence[str]) -> list[str]:
     parameters = {**_common(options, views), 'policy': options.policy, 'mode': 'imagine'}
-    return module_command('policy_node', *ros_arguments(parameters, _REMAPS))
+    return module_command('policy.node', *ros_arguments(parameters, _REMAPS))
 
 
 def _runner_command(options: ImagineOptions, views: Sequence[str], out: Path) -> list[str]:
@@ -158,4 +158,4 @@ def _runner_command(options: ImagineOptions, views: Sequence[str], out: Path) ->
         arguments += ['--episodes', *(str(path) for path in options.episodes)]
     else:
         arguments += ['--live']
-    return module_command('episode_runner', *arguments)
+    return module_command('episodes.runner', *arguments)

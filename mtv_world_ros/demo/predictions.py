@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data.bag_reader import BagReader
-from mtv_world_ros.data.images import raw_to_rgb
-from mtv_world_ros.data.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.images import raw_to_rgb
+from mtv_world_ros.data.bag.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.demo.processes import NODE
 from mtv_world_ros.errors import EpisodeError

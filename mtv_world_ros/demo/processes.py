@@ -8,14 +8,14 @@ from pathlib import Path
 import subprocess
 import time
 
-from mtv_world_ros.child_processes import (
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
     start_process,
     stop_process,
 )
-from mtv_world_ros.errors import EpisodeError
 
 STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw')
 TOPICS = ('predicted/joint_states', 'success', 'jaccard', 'report')
@@ -56,12 +56,12 @@ def record_through_node(
     try:
         recorded = [f'{NODE}/{view}/{stream}' for view in views for stream in STREAMS]
         recorded += [f'{NODE}/{topic}' for topic in TOPICS]
-        command = module_command('recorder', str(out / 'predictions'), *recorded)
+        command = module_command('bags.recorder', str(out / 'predictions'), *recorded)
         command += ['--overwrite', '--stamp', 'header', '--wait-timeout', str(_NODE_START_S)]
         recorder = start_process('recorder', command, logs, environment)
         wanted = [f'/{view}/image_raw/compressed' for view in views] + ['/joint_trajectory']
         command = module_command(
-            'player', str(episode), '--clock', '--lock-step', '--wait-for', *wanted, *recorded
+            'bags.player', str(episode), '--clock', '--lock-step', '--wait-for', *wanted, *recorded
         )
         command += ['--wait-timeout', str(_NODE_START_S), '--answer-timeout', '300']
         player = start_process('player', command, logs, environment)
@@ -90,7 +90,7 @@ def _node_command(options: DemoOptions) -> list[str]:
         # the same numbers whatever weights are at hand
         'segmenter': 'colour',
     }
-    return module_command('node', *ros_arguments(parameters))
+    return module_command('world_model.node', *ros_arguments(parameters))
 
 
 def _wait(

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.demo.predictions import Predictions, read_predictions, RecordedChunk
 from mtv_world_ros.demo.processes import DemoOptions, record_through_node
-from mtv_world_ros.evaluation.report import (
+from mtv_world_ros.evaluation.metrics.scores import score_frames, score_rows, ScoreRow, true_masks
+from mtv_world_ros.evaluation.metrics.statistics import episode_means
+from mtv_world_ros.evaluation.rollouts import Stretch
+from mtv_world_ros.evaluation.video import (
     Comparison,
     contact_sheet,
     side_by_side,
     write_png,
     write_video,
 )
-from mtv_world_ros.evaluation.rollouts import Stretch
-from mtv_world_ros.evaluation.scores import score_frames, score_rows, ScoreRow, true_masks
-from mtv_world_ros.evaluation.statistics import episode_means
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.card import read_card, spec_of
 

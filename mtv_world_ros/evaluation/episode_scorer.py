@@ -11,14 +11,22 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.controls import with_actions
-from mtv_world_ros.evaluation.feature_store import feature_path, FeatureTaker
-from mtv_world_ros.evaluation.image_quality import ImageQuality
-from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.evaluation.rollout_store import (
+from mtv_world_ros.evaluation.metrics.frechet.store import feature_path, FeatureTaker
+from mtv_world_ros.evaluation.metrics.image_quality import ImageQuality
+from mtv_world_ros.evaluation.metrics.scores import (
+    find_masks,
+    score_frames,
+    score_rows,
+    ScoreRow,
+    true_masks,
+    Truth,
+)
+from mtv_world_ros.evaluation.references import with_actions
+from mtv_world_ros.evaluation.results import (
+    EpisodeResult,
     join,
     rollout_path,
     save_rollout,
@@ -32,19 +40,11 @@ from mtv_world_ros.evaluation.rollouts import (
     stretches,
 )
 from mtv_world_ros.evaluation.round_trip import Reconstruct
-from mtv_world_ros.evaluation.scores import (
-    find_masks,
-    score_frames,
-    score_rows,
-    ScoreRow,
-    true_masks,
-    Truth,
-)
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.success.describer import objects_from_instruction
-from mtv_world_ros.success.jaccard import object_scores, ObjectScores
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from mtv_world_ros.vision.jaccard import object_scores, ObjectScores
 
 #: what the time of an episode goes into
 STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')

@@ -15,28 +15,28 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import DescriptionError, EpisodeError, MtvWorldError
-from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
-from mtv_world_ros.evaluation.feature_store import (
+from mtv_world_ros.evaluation.metrics.frechet.features import clip_features, frame_features
+from mtv_world_ros.evaluation.metrics.frechet.store import (
     distances,
     feature_path,
     FeatureTaker,
     load_features,
 )
-from mtv_world_ros.evaluation.features import clip_features, frame_features
-from mtv_world_ros.evaluation.image_quality import image_quality
+from mtv_world_ros.evaluation.metrics.image_quality import image_quality
+from mtv_world_ros.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.evaluation.report.summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.round_trip import round_trip
 from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
-from mtv_world_ros.evaluation.statistics import Estimate
-from mtv_world_ros.evaluation.summary import Group, Summary
-from mtv_world_ros.evaluation.workers import score_all
+from mtv_world_ros.files import plain, write_json
+from mtv_world_ros.parallel import score_all
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.success.describer import Describer
-from mtv_world_ros.success.jaccard import mean_of_known
-from mtv_world_ros.success.scene_objects import names_of
+from mtv_world_ros.vision.describers.describer import Describer
+from mtv_world_ros.vision.describers.scene_objects import names_of
+from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: makes the pipeline anew, in another process
 MakePipeline = Callable[[], Pipeline]
@@ -242,7 +242,7 @@ class _Run:
                 yield job, outcome
                 continue
             values = {'settings': self._settings_of(job), 'result': outcome}
-            tables.write_json(self._file(job), values)
+            write_json(self._file(job), values)
             yield job, EpisodeResult.from_json(outcome)
 
     def _described(self, job: Job) -> Job | tuple[Job, str]:
@@ -290,7 +290,7 @@ class _Run:
             return None
         try:
             stored = json.loads(self._file(job).read_text(encoding='utf-8'))
-            if stored['settings'] == tables.plain(self._settings_of(job)):
+            if stored['settings'] == plain(self._settings_of(job)):
                 return EpisodeResult.from_json(stored['result'])
         except (OSError, ValueError, KeyError, TypeError):
             pass  # not there, half written, or of another version: score it again

@@ -7,7 +7,7 @@ from math import floor
 
 import numpy as np
 
-from mtv_world_ros.data.clips import commanded, frame_indices, Recording
+from mtv_world_ros.data.recording import commanded, frame_indices, Recording
 from mtv_world_ros.data_types import (
     ByteArray,
     JointTrajectory,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.controls import check_actions
+from mtv_world_ros.evaluation.references import check_actions
 from mtv_world_ros.evaluation.rollouts import check_mode
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from mtv_world_ros.config_values import check_keys, read_yaml
+from mtv_world_ros.config import check_keys, read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.transforms import is_rigid, pose

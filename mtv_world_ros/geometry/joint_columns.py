@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.config_values import check_keys, number, numbers, word
+from mtv_world_ros.config import check_keys, number, numbers, word
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel

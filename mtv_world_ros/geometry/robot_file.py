@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from mtv_world_ros.config_values import check_keys, number, read_yaml, word
+from mtv_world_ros.config import check_keys, number, read_yaml, word
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool

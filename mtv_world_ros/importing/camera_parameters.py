@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.config_values import check_keys, numbers, text, word
+from mtv_world_ros.config import check_keys, numbers, text, word
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.mcap_writer import EpisodeWriter
+from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses

@@ -8,14 +8,14 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.config_values import check_keys, number, read_yaml, text, word
+from mtv_world_ros.config import check_keys, number, read_yaml, text, word
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.joint_columns import JointColumn, parse_joints, UNITS
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.importing.camera_parameters import CameraSource, parse_camera
-from mtv_world_ros.resources import share_path
 
 _KEYS = ('robot', 'views', 'state', 'action', 'task', 'instruction', 'outcome',
          'outcome_feature', 'objects', 'chunk_s', 'limit_tolerance', 'jpeg_quality')  # fmt: skip

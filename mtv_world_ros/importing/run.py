@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from mtv_world_ros.data.mcap_reader import read_info
+from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.importing.convert import convert_episode, MAPPING_KEY
 from mtv_world_ros.importing.lerobot import LeRobotDataset

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.clips import stitch
 from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.resample import match_joints
@@ -31,7 +31,7 @@ from mtv_world_ros.inspection.motion_residual import (
 )
 from mtv_world_ros.inspection.overlay import overlay_picture
 from mtv_world_ros.inspection.projection_checks import check_limits, check_visibility
-from mtv_world_ros.inspection.shapes import load_shape, RobotShape
+from mtv_world_ros.inspection.robot_shape import load_shape, RobotShape
 
 Checked = tuple[dict[str, str], list[Finding]]
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 import subprocess
 
-from mtv_world_ros.child_processes import module_command, start_process, stop_process
 from mtv_world_ros.data.episode import (
     camera_info_topic,
     image_topic,
@@ -15,6 +14,7 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.processes import module_command, start_process, stop_process
 
 
 def record_topics(
@@ -49,7 +49,7 @@ def _start(
     optional += [camera_info_topic(view) for view in views] + [JOINT_TRAJECTORY, INSTRUCTION]
     options = ['--wait-timeout', str(wait_s), '--duration', str(seconds)]
     command = module_command(
-        'recorder', str(out), JOINT_STATES, *options, '--if-published', *optional
+        'bags.recorder', str(out), JOINT_STATES, *options, '--if-published', *optional
     )
     return start_process(log.stem, command, log.parent)
 

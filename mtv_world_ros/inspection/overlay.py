@@ -12,7 +12,7 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.inspection.joint_track import JointTrack
-from mtv_world_ros.inspection.shapes import LinkShape
+from mtv_world_ros.inspection.robot_shape import LinkShape
 from mtv_world_ros.inspection.silhouettes import draw_silhouettes
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,

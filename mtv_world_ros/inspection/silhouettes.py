@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.inspection.shapes import LinkShape
+from mtv_world_ros.inspection.robot_shape import LinkShape
 
 #: pixels are drawn with this many fractional bits
 _SHIFT_BITS = 4

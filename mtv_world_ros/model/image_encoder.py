@@ -12,7 +12,7 @@ from torch import nn, Tensor
 import torch.nn.functional as F
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.encoder_configs import import_transformers
+from mtv_world_ros.model.tensor_files import import_transformers
 
 #: mean and standard deviation of the colours that CLIP was trained with
 _MEAN = (0.48145466, 0.4578275, 0.40821073)

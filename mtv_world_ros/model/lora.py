@@ -19,7 +19,7 @@ from torch import Tensor
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.card import CARD
 from mtv_world_ros.model.lora_keys import Factors, METADATA, read_lora
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 ADAPTER = 'pytorch_lora_weights.safetensors'
 #: weights that are trained whole and saved beside the adapter: phi, views, the way in

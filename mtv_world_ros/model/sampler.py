@@ -12,7 +12,7 @@ from torch import Tensor
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.parts import Scheduler
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
 def flow_of(transformer: MultiViewWanTransformer, out: Tensor, noisy: Tensor, sigma: Tensor):

@@ -14,7 +14,7 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
 INDEX = '.safetensors.index.json'
@@ -178,3 +178,19 @@ def _plan(tensors: dict[str, StoredTensor], shard_bytes: int) -> list[list[str]]
         shards[-1].append(name)
         held += tensor.num_bytes
     return shards
+
+
+def import_transformers() -> Any:
+    """Returns the package.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import transformers
+    except ImportError as error:
+        raise ConfigError(
+            "umT5 and CLIP need the package 'transformers'; install it with "
+            "pip install 'mtv_world_ros[wan]'"
+        ) from error
+    return transformers

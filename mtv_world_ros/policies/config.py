@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from mtv_world_ros.config_values import check_keys, number, read_yaml, text
+from mtv_world_ros.config import check_keys, number, read_yaml, text
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.policies.lerobot_client import lerobot_config

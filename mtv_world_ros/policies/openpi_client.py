@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import os
 from typing import Any
 
-from mtv_world_ros.config_values import check_keys, number, text
+from mtv_world_ros.config import check_keys, number, text
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mtv_world_ros.config_values import check_keys, number, text, word
+from mtv_world_ros.config import check_keys, number, text, word
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.geometry.joint_columns import (

@@ -13,11 +13,11 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import fit_observation, Pipeline
-from mtv_world_ros.ranking.simulated import SeenChunk
+from mtv_world_ros.ranking.worlds import SeenChunk
 from mtv_world_ros.rendering.resize import resize_frames
-from mtv_world_ros.success.describer import objects_from_instruction
 from mtv_world_ros.success.footage import footage_of
 from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
 
 class ImaginedWorld:

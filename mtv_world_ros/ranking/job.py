@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
-from mtv_world_ros.sim.expert import Expert
-from mtv_world_ros.sim.jobs import episode_seed
-from mtv_world_ros.sim.policy_variant import EXPERT, parse_variant
-from mtv_world_ros.sim.scripted_policy import scripted_policy
-from mtv_world_ros.sim.tasks import tasks_named
+from mtv_world_ros.sim.collect.jobs import episode_seed
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.expert.faults import EXPERT, parse_variant
+from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.tasks.tasks import tasks_named
 
 #: from the expert to one that never finishes; in between, faults of several kinds and sizes
 DEFAULT_POLICIES = (

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mtv_world_ros.evaluation.charts import Point, scatter_chart
-from mtv_world_ros.evaluation.html_report import document
-from mtv_world_ros.evaluation.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.tables import write_json
+from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
+from mtv_world_ros.evaluation.report.html import document
+from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
+from mtv_world_ros.files import write_json
+from mtv_world_ros.ranking.report import grids, markdown, remarks, TITLE
 from mtv_world_ros.ranking.summary import ALL_TASKS, JUDGES, Summary
-from mtv_world_ros.ranking.words import grids, markdown, remarks, TITLE
 from mtv_world_ros.whole_files import write_whole
 
 #: hues of the report's style sheet

@@ -12,11 +12,11 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation import tables
-from mtv_world_ros.evaluation.workers import Outcome, score_all
+from mtv_world_ros.files import plain, write_json
+from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.job import Job
-from mtv_world_ros.ranking.result import Result
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.runner import make_runner, RolloutConfig
 
 FOLDER = 'rollouts'
@@ -62,7 +62,7 @@ def run_jobs(
         if isinstance(outcome, str):
             failed[job.name] = outcome
             continue
-        tables.write_json(_path(out, job), {'settings': kept, 'result': outcome})
+        write_json(_path(out, job), {'settings': kept, 'result': outcome})
         found[job] = Result.from_json(outcome)
     if jobs and not found:
         raise MtvWorldError(f'no rollout has a result; the first: {next(iter(failed.items()))}')
@@ -91,5 +91,5 @@ def _stored(out: Path, job: Job, settings: Mapping[str, Any]) -> Result | None:
         result = Result.from_json(values['result'])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    same = values['settings'] == tables.plain(settings) and result.seed == job.seed
+    same = values['settings'] == plain(settings) and result.seed == job.seed
     return result if same else None

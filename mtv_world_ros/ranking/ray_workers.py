@@ -7,7 +7,7 @@ import importlib
 from typing import Any, TypeVar
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.workers import Outcome, outcome_of, Scorer
+from mtv_world_ros.parallel import Outcome, outcome_of, Scorer
 
 Job = TypeVar('Job')
 

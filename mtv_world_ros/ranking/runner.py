@@ -11,12 +11,12 @@ from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.imagined import ImaginedWorld, judge
 from mtv_world_ros.ranking.job import Job
+from mtv_world_ros.ranking.jobs import Judged, Result
 from mtv_world_ros.ranking.living import Life, live, World
-from mtv_world_ros.ranking.result import Judged, Result
-from mtv_world_ros.ranking.simulated import SimulatedWorld
-from mtv_world_ros.sim.episode import SimEpisode
-from mtv_world_ros.sim.expert import Expert
-from mtv_world_ros.sim.scripted_policy import scripted_policy
+from mtv_world_ros.ranking.worlds import SimulatedWorld
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.world.simulator import SimEpisode
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
 MakePolicy = Callable[[str, str, int, Expert], Policy]

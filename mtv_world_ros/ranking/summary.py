@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.evaluation.policy_score import (
+from mtv_world_ros.evaluation.metrics.policy_agreement import (
     bootstrap,
     Interval,
     mean_maximum_rank_violation,
@@ -21,7 +21,7 @@ from mtv_world_ros.evaluation.policy_score import (
     rates,
     wilson,
 )
-from mtv_world_ros.ranking.result import Judged, Result
+from mtv_world_ros.ranking.jobs import Judged, Result
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'

@@ -204,12 +204,8 @@ def _draw_view(
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
     colours = [arm_colour(arm, num_arms) for arm in range(num_arms)]
     paints = [_Paint(colour) for colour in colours]
-    links = None
-    if config.link_width_m is not None:
-        links = ArmLinks(camera, poses, arms, config.link_width_m)
-    fingers = None
-    if config.finger_width_m is not None:
-        fingers = ArmLinks(camera, poses, motion.fingers, config.finger_width_m)
+    links = _lines(camera, poses, arms, config.link_width_m)
+    fingers = _lines(camera, poses, motion.fingers, config.finger_width_m)
     white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
@@ -224,9 +220,19 @@ def _draw_view(
                 box = cores[arm].draw(core, k, motion.closed[arm, k])
                 white.lay(frames[k], core, box)
                 region(core, box)[...] = 0
-            if fingers is not None:
-                for side, colour in enumerate(_FINGER_COLOURS):
-                    fingers.draw(frames[k], 2 * arm + side, k, colour)
+            _draw_fingers(fingers, frames[k], arm, k)
+
+
+def _lines(
+    camera: CameraModel, poses: FloatArray, points: Sequence[FloatArray], width_m: float | None
+) -> ArmLinks | None:
+    return None if width_m is None else ArmLinks(camera, poses, points, width_m)
+
+
+def _draw_fingers(fingers: ArmLinks | None, image: ByteArray, arm: int, frame: int) -> None:
+    if fingers is not None:
+        for side, colour in enumerate(_FINGER_COLOURS):
+            fingers.draw(image, 2 * arm + side, frame, colour)
 
 
 def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:

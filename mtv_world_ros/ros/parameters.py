@@ -17,8 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.ros.observation_buffer import FreshnessLimits
-from mtv_world_ros.success.segmenter_choice import SEGMENTERS
+from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
 
 MODES = ('observe', 'imagine')
 STAMP_MODES = ('target', 'source')
@@ -203,15 +202,6 @@ class Settings:
     jpeg_quality: int
     publish_trajectory_video: bool
     publish_masks: bool
-
-
-def freshness(settings: Settings) -> FreshnessLimits:
-    """What of the inputs is too old."""
-    return FreshnessLimits(
-        image_age=settings.max_image_age_s,
-        joint_state_age=settings.max_joint_state_age_s,
-        view_skew=settings.max_view_skew_s,
-    )
 
 
 def declare(node: Node, table: Sequence[Entry] = TABLE) -> None:

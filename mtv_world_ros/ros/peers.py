@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.ros.conversions import values_of
+from mtv_world_ros.ros.messages.conversions import values_of
 
 #: a service that does not answer within this long is gone [s]
 _ANSWER_S = 30.0

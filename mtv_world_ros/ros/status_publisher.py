@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Header
 
-from mtv_world_ros.ros.conversions import to_diagnostics, to_status
-from mtv_world_ros.ros.stamps import make_header
-from mtv_world_ros.ros.view_publisher import create_publisher
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.ros.messages.conversions import to_diagnostics, to_status
+from mtv_world_ros.ros.messages.stamps import make_header
 
 #: a fault shows as a warning for this long [s]
 _WARN_S = 5.0
@@ -72,3 +77,20 @@ class StatusPublisher:
 
     def _header(self) -> Header:
         return make_header(self._node.get_clock().now().nanoseconds)
+
+
+def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Publisher:
+    """Returns a reliable publisher whose QoS can be overridden by parameters.
+
+    Raises:
+        ConfigError: an override is not one of the middleware's words.
+    """
+    try:
+        return node.create_publisher(
+            kind,
+            topic,
+            QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+    except (RuntimeError, InvalidParameterTypeException) as error:
+        raise ConfigError(f"QoS override of '{topic}': {error}") from error

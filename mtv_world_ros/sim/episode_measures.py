@@ -9,7 +9,7 @@ import numpy as np
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data_types import BoolArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.success.jaccard import mean_of_known, moves, persistence_scores
+from mtv_world_ros.vision.jaccard import mean_of_known, moves, persistence_scores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

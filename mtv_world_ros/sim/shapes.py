@@ -10,7 +10,7 @@ import numpy as np
 from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.sim import shape_geoms
 from mtv_world_ros.sim.shape_geoms import Rgb, RIM_M, Size
-from mtv_world_ros.success.palette import PALETTE
+from mtv_world_ros.vision.colour_words import PALETTE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

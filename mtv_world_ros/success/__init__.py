@@ -1,1 +1,1 @@
-"""Object masks, the Jaccard index and the success estimate."""
+"""Relations, tasks, evidence and the success estimate."""

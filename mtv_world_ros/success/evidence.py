@@ -9,15 +9,15 @@ from math import isfinite, nan
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.success.jaccard import mean_of_known
+from mtv_world_ros.success.goal_pictures import PictureMasks
+from mtv_world_ros.success.imagined_scene import Placed
 from mtv_world_ros.success.pictured import AsPictured, InRegion
-from mtv_world_ros.success.pictures import PictureMasks
-from mtv_world_ros.success.placed import Placed
 from mtv_world_ros.success.relations import Inside, Relation, Within
 from mtv_world_ros.success.rollout_memory import Grasp
 from mtv_world_ros.success.situation import Margin
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
+from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: margins are clipped to this many softness lengths
 MAX_MARGIN = 3.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from mtv_world_ros.success.pictures import Picture
+from mtv_world_ros.success.goal_pictures import Picture
 from mtv_world_ros.success.situation import Goal, Margin, Situation
 
 #: a J, or a share of an area, that counts as one in the margins

@@ -11,8 +11,8 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.success.footage import Footage
-from mtv_world_ros.success.localise import centroids, locate
 
 #: frames whose places are kept; the start is kept whatever follows
 MAX_FRAMES = 2000

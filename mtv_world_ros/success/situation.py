@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, TYPE_CHECKING
 from mtv_world_ros.data_types import FloatArray
 
 if TYPE_CHECKING:
-    from mtv_world_ros.success.pictures import Picture
+    from mtv_world_ros.success.goal_pictures import Picture
 
 #: a placeholder, and where the centre (3,) of its object should be [m]
 Goal = tuple[str, FloatArray]

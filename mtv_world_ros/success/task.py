@@ -8,11 +8,11 @@ from pathlib import Path
 import re
 from typing import Any
 
-from mtv_world_ros.config_values import check_keys, number, read_yaml
+from mtv_world_ros.config import check_keys, number, read_yaml
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.success.describer import ends_phrase
-from mtv_world_ros.success.pictures import load_pictures, load_regions, Picture
+from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.relations import KINDS, Relation, roles_of
+from mtv_world_ros.vision.describers.describer import ends_phrase
 
 GRIPPERS = ('open', 'any')
 #: keys of relations whose values are picture files by view, and what reads them

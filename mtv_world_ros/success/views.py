@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.geometry.mask_geometry import centroids, locate, Location, moved_mask
 from mtv_world_ros.success.footage import Footage
-from mtv_world_ros.success.jaccard import jaccard
-from mtv_world_ros.success.localise import centroids, locate, Location, moved_mask
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.situation import CannotTell
+from mtv_world_ros.vision.jaccard import jaccard
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.encoding import Encoders

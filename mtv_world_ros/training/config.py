@@ -8,14 +8,14 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.config_values import check_keys, read_yaml
+from mtv_world_ros.config import check_keys, read_yaml
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.history_settings import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import share_path
 from mtv_world_ros.training.optimizer_config import LoraSettings, OptimizerConfig
 
 _SIGMA_WEIGHTINGS = ('uniform', 'middle')
@@ -128,7 +128,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HistoryConfig(HistorySettings):
-    """How clips are shown what came before them; see `history.py`.
+    """How clips are shown what came before them; see `clips/past.py`.
 
     Attributes:
         max_noise: noise levels are drawn from 0 up to this; serving has `noise_level`.

@@ -20,9 +20,10 @@ from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, flow_of
-from mtv_world_ros.model.transformer import copy_of
+from mtv_world_ros.model.transformer.transformer import copy_of
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import LoraSettings, TrainingConfig, VideoConfig
 from mtv_world_ros.training.distill_objective import (
     as_predicted,
@@ -31,7 +32,6 @@ from mtv_world_ros.training.distill_objective import (
     straight_flows,
     straight_scheduler,
 )
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import encode_batch, Encoders
 from mtv_world_ros.training.objective import Loss, sample_loss
 from mtv_world_ros.training.run import train

@@ -13,10 +13,10 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from mtv_world_ros.model.action_features import EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
-from mtv_world_ros.model.context import NUM_TEXT_TOKENS
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import TrainingConfig
 
 #: bytes of a float32 number: trained weights, their averages, gradients, Adam's two moments

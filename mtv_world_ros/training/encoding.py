@@ -18,13 +18,13 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     encode_chunk,
 )
-from mtv_world_ros.model.history import with_anchor, with_history
 from mtv_world_ros.model.history_settings import HistorySettings
+from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.image_encoder import ImageEncoder
 from mtv_world_ros.model.parts import Autoencoder
-from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.objective import latent_weights, pixel_weights, pooled_weights
 
 

@@ -13,10 +13,10 @@ from mtv_world_ros.model.card import OPTIONAL_KEYS
 from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_scheduler
+from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.encoding import Encoders
-from mtv_world_ros.training.weights import Weights
 
 
 def export_adapter(

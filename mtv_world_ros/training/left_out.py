@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from mtv_world_ros.data.clips import clip_starts, Recording
+from mtv_world_ros.data.recording import clip_starts, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import EpisodeError
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.model.action_features import EE_MLP
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.objective import (
     add_noise,

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 import torch.nn.functional as F
 
+from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.config import ObjectiveConfig
-from mtv_world_ros.training.draws import Draws
 
 #: RGB difference (of 255) from which a pixel counts as changed
 CHANGE_THRESHOLD = 24

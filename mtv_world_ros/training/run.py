@@ -9,27 +9,27 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from mtv_world_ros.data.clips import Recording
-from mtv_world_ros.data.mcap_reader import list_episodes
+from mtv_world_ros.data.episode_reader import list_episodes
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recording_cache import cached_recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import CARD
-from mtv_world_ros.success.segmenter import Segmenter
-from mtv_world_ros.training.actions import kept_actions
 from mtv_world_ros.training.base import load_base, needs_base
-from mtv_world_ros.training.batches import BatchSource
-from mtv_world_ros.training.cached_batches import CachedSource
+from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.fit_actions import kept_actions
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.held_out import HeldOut
-from mtv_world_ros.training.latent_run import cached
+from mtv_world_ros.training.latent_cache.cached_batches import CachedSource
+from mtv_world_ros.training.latent_cache.latent_run import cached
 from mtv_world_ros.training.left_out import check_clips, counted, num_dropped
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.resume import disk_errors_named, DiskError
 from mtv_world_ros.training.speed import ideal_seconds, measured_peak
-from mtv_world_ros.training.state import disk_errors_named, DiskError
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
 def find_episodes(dataset: Path) -> list[Path]:

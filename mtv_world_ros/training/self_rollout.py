@@ -20,18 +20,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from mtv_world_ros.data.clips import chunk_of
+from mtv_world_ros.data.recording import chunk_of
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import collate
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import Scheduler
 from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.batches import Batch
-from mtv_world_ros.training.controls import ControlMaker
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.clips.batches import Batch
+from mtv_world_ros.training.clips.clip_controls import ControlMaker
+from mtv_world_ros.training.clips.leads import Lead
 from mtv_world_ros.training.encoding import condition_batch, Encoders
-from mtv_world_ros.training.leads import Lead
 
 
 class SelfRollout:

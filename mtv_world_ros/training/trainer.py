@@ -15,24 +15,24 @@ import torch
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.checkpoint import load_checkpoint
-from mtv_world_ros.model.history import check_history
+from mtv_world_ros.model.history_tokens import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.actions import transformer_arguments
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.base import Base
-from mtv_world_ros.training.batches import Batch, BatchSource
-from mtv_world_ros.training.cached_batches import CachedSource
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.batches import Batch, BatchSource
+from mtv_world_ros.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.encoding import EncodedBatch, Encoders
 from mtv_world_ros.training.export import export_adapter, export_checkpoint
+from mtv_world_ros.training.latent_cache.cached_batches import CachedSource
 from mtv_world_ros.training.loss import batch_loss
 from mtv_world_ros.training.objective import Loss
 from mtv_world_ros.training.processes import memory_errors_named, Processes
+from mtv_world_ros.training.resume import check_card, load_state, read_card, save_state, STATE
 from mtv_world_ros.training.self_rollout import SelfRollout
-from mtv_world_ros.training.state import check_card, load_state, read_card, save_state, STATE
-from mtv_world_ros.training.weights import Weights
 
 #: losses averaged for the progress bar and the log
 _WINDOW = 50

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.mcap_writer import EpisodeWriter
+from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import CameraModel, JointTrajectory
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 8

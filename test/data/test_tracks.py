@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mtv_world_ros.data import messages
+from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.tracks import in_order, LazyFrames, merge_joint_states
 from mtv_world_ros.errors import EpisodeError
 

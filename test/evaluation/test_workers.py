@@ -6,7 +6,7 @@ from mtv_world_ros.assembly import assemble
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.evaluation.evaluate import evaluate, make_jobs, Parallel
-from mtv_world_ros.evaluation.tables import plain
+from mtv_world_ros.files import plain
 
 QUIET = {'show_progress': False, 'num_resamples': 50}
 CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.mirror import mirrored
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
 
 FLIP = np.diag([-1.0, 1.0, 1.0])
 

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
 
-from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError, ConfigError
 from mtv_world_ros.importing.camera_parameters import camera_model, parse_camera
 from mtv_world_ros.importing.run import import_dataset

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.importing.run import import_dataset
 
@@ -104,7 +104,7 @@ def test_a_calibration_file_is_scaled_to_the_video(datasets, make_mapping, tmp_p
 
 
 def test_training_reads_what_was_imported(datasets, make_mapping, tmp_path):
-    from mtv_world_ros.data.clips import clip_starts, cut_clip, load_recording
+    from mtv_world_ros.data.recording import clip_starts, cut_clip, load_recording
     from mtv_world_ros.data_types import WorldModelSpec
     from mtv_world_ros.geometry.robot_file import load_robot
 

@@ -5,6 +5,7 @@ import pytest
 
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.inspection.clocks import (
     check_commands,
@@ -15,7 +16,6 @@ from mtv_world_ros.inspection.clocks import (
     response,
 )
 from mtv_world_ros.inspection.joint_track import JointTrack
-from mtv_world_ros.resources import share_path
 
 CONFIG = ClockConfig()
 START = 1_700_000_000_000_000_000

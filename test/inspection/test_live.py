@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
 
-from mtv_world_ros.data.mcap_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.inspection.live import record_topics
-from mtv_world_ros.resources import share_path
 
 
 @pytest.fixture
@@ -24,7 +24,14 @@ def private_domain(monkeypatch):
 @pytest.fixture
 def player(private_domain):
     episode = str(share_path('resource', 'demo_episode'))
-    command = [sys.executable, '-m', 'mtv_world_ros.ros.player', episode, '--loop', '--no-wait']
+    command = [
+        sys.executable,
+        '-m',
+        'mtv_world_ros.ros.bags.player',
+        episode,
+        '--loop',
+        '--no-wait',
+    ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     yield
     process.send_signal(signal.SIGINT)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 SMALL = {
     'patch_size': (1, 4, 4),

@@ -17,7 +17,7 @@ from mtv_world_ros.history import History
 from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.history_settings import history_settings
-from mtv_world_ros.model.positions import MultiViewRotaryPosEmbed
+from mtv_world_ros.model.transformer.positions import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}

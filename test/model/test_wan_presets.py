@@ -8,7 +8,7 @@ import pytest
 import torch
 from wan_reference import video_tensors
 
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import load_training_config
 
 #: the published configurations of Wan2.1-Fun-V1.1-Control: width, ffn, blocks, heads

@@ -14,8 +14,8 @@ pytest.importorskip('google.protobuf', reason='protobuf is not installed')
 from mtv_world_ros.assembly import assemble_policy, robot_path
 from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
 
 SERVER = Path(__file__).with_name('lerobot_server.py')
 ROBOT = load_robot(robot_path('yam_bimanual'))

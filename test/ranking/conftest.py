@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.ranking.result import Judged, Result
+from mtv_world_ros.ranking.jobs import Judged, Result
 from mtv_world_ros.ranking.runner import RolloutConfig, RolloutRunner
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.episode import SimEpisode
-from mtv_world_ros.sim.expert import Expert
-from mtv_world_ros.sim.opengl import missing_opengl
-from mtv_world_ros.sim.scripted_policy import scripted_policy
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.world.opengl import missing_opengl
+from mtv_world_ros.sim.world.simulator import SimEpisode
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5, num_frames=16, width=192, height=144, robot='yam_bimanual'

@@ -5,10 +5,10 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.page import write_ranking
-from mtv_world_ros.ranking.result import Result
+from mtv_world_ros.ranking.report import markdown, remarks
 from mtv_world_ros.ranking.summary import Summary
-from mtv_world_ros.ranking.words import markdown, remarks
 
 #: (policy, true outcomes, imagined probabilities) of four episodes
 POLICIES = (

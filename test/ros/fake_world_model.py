@@ -10,13 +10,13 @@ import numpy as np
 
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.errors import ModelMemoryError, RolloutPreempted
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.ros.node import main
+from mtv_world_ros.ros.world_model.node import main
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 VIEWS = ('low', 'high')
 WIDTH, HEIGHT, FPS, NUM_FRAMES = 48, 36, 5.0, 4

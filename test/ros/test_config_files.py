@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 from mtv_world_ros.ros.parameters import Settings, TABLE
 
 

@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 
 
 @pytest.mark.native_ros

@@ -1,9 +1,9 @@
 import pytest
 
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.expert import Expert
-from mtv_world_ros.sim.opengl import missing_opengl
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.world.opengl import missing_opengl
 
 
 @pytest.fixture(scope='session')

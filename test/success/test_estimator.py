@@ -6,10 +6,10 @@ import pytest
 
 from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
 from mtv_world_ros.success.calibration import Calibration
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def judge(shown, instruction=LEFT, task=None):

@@ -6,10 +6,10 @@ from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, path, POSES, RED, 
 import numpy as np
 import pytest
 
-from mtv_world_ros.resources import share_path
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.swings import count_reversals
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.rollout_memory import MAX_FRAMES, remember
-from mtv_world_ros.success.swings import count_reversals
 
 HOME = np.array([0.25, 0.15, 0.15])
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)

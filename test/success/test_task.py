@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.sim.predicates import History
-from mtv_world_ros.sim.randomize import draw_scene, instruction_of
-from mtv_world_ros.sim.scene import rotation_of
-from mtv_world_ros.sim.tasks import task_named, tasks_named
-from mtv_world_ros.success.describer import objects_from_instruction
+from mtv_world_ros.files import share_path
+from mtv_world_ros.sim.tasks.predicates import History
+from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
+from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of
+from mtv_world_ros.sim.world.scene import rotation_of
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
 LEFT = """
 name: left

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from sources import make_source
 
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 
 TINY = {

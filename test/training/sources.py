@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def with_batch_size(config: TrainingConfig, batch_size: int) -> TrainingConfig:

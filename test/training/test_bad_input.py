@@ -15,19 +15,19 @@ import pytest
 from sources import make_source
 import torch
 
-from mtv_world_ros.data import messages
-from mtv_world_ros.data.bag_reader import BagMessage, iter_messages
-from mtv_world_ros.data.bag_writer import BagWriter
-from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagMessage, iter_messages
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.run import train
-from mtv_world_ros.training.state import DiskError
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 Change = Callable[[BagMessage], list[bytes]]
 

@@ -13,18 +13,18 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.clips import clip_starts, cut_clip, Recording
+from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.actions import fit_actions
+from mtv_world_ros.training.clip_noise import Draws
+from mtv_world_ros.training.clips.fit_actions import fit_actions
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.draws import Draws
 from mtv_world_ros.training.loss import _kept
 from mtv_world_ros.training.objective import pooled_weights
 from mtv_world_ros.training.run import train
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']
 

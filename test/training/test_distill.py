@@ -12,12 +12,11 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import HistoryConfig, TrainingConfig
 from mtv_world_ros.training.distill import (
     distill,
@@ -26,6 +25,7 @@ from mtv_world_ros.training.distill import (
     student_config,
 )
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 @pytest.fixture(scope='module')

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.model.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.dry_run import step_cost
 

@@ -13,10 +13,10 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.video_file import decode_video
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.held_out import HeldOut, Judged
 from mtv_world_ros.training.run import train
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def test_the_best_checkpoint_by_the_judge_is_kept(

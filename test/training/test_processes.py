@@ -18,7 +18,7 @@ import torch
 import yaml
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.trainer import Trainer

@@ -10,7 +10,7 @@ import pytest
 from sources import make_source
 import torch
 
-from mtv_world_ros.data.clips import frame_indices, Recording
+from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.robot import RobotModel
@@ -18,9 +18,8 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.success.estimator import SuccessEstimator
-from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training import self_rollout
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import (
     HistoryConfig,
     load_training_config,
@@ -28,6 +27,7 @@ from mtv_world_ros.training.config import (
     TrainingConfig,
 )
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 @pytest.fixture

@@ -12,14 +12,14 @@ from sources import make_source
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.data.clips import Recording
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, OptimizerConfig, TrainingConfig
 from mtv_world_ros.training.run import find_episodes, train
 from mtv_world_ros.training.trainer import learning_rate, Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def make(config: TrainingConfig, folder: Path, seed: int = 0, device: str = 'cpu') -> Trainer:

@@ -14,17 +14,17 @@ import torch
 from wan_base import make_base, tiny_preset
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.clips import load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.errors import CheckpointError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.success.segmenter import ColourSegmenter
 from mtv_world_ros.training.base import load_base
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 CPU = torch.device('cpu')
 

@@ -12,13 +12,13 @@ import sys
 from safetensors.torch import save_file
 import torch
 
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.resources import share_path
-from mtv_world_ros.success.segmenter import ColourSegmenter
-from mtv_world_ros.training.batches import Batch
+from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def record(out: Path) -> None:

@@ -1,0 +1,185 @@
+"""Writes an episode as a rosbag2 MCAP folder, field by field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.metadata import LATCHED
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.episode import (
+    CALIBRATION_FILE,
+    camera_info_topic,
+    check_outcome,
+    dump_info,
+    EpisodeInfo,
+    image_topic,
+    INSTRUCTION,
+    JOINT_STATES,
+    JOINT_TRAJECTORY,
+    mask_topic,
+    METADATA_NAME,
+    OBJECT_POSES,
+    optical_frame,
+)
+from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.geometry.calibration_file import save_calibration
+
+
+class EpisodeWriter(BagWriter):
+    """Records an episode: frames, joint states, commands, masks and what they show.
+
+    Log times equal the headers' stamps. Set `outcome` before the block ends.
+
+    Args:
+        path: folder to make.
+        task: name of the task.
+        instruction: what the robot is told; `write_instruction` records it as a topic.
+        robot: name of the robot.
+        cameras: calibrated views; go into calibration.yaml beside the record.
+        seed: seed the episode is made from.
+        objects: names of the objects; masks number them from 1.
+        metadata: further text by key.
+        jpeg_quality: 1 to 100.
+        overwrite: replace an existing folder.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        task: str,
+        instruction: str,
+        robot: str,
+        cameras: Sequence[CameraModel] = (),
+        seed: int | None = None,
+        objects: Sequence[str] = (),
+        metadata: Mapping[str, str] | None = None,
+        jpeg_quality: int = 90,
+        overwrite: bool = False,
+    ) -> None:
+        super().__init__(path, overwrite=overwrite)
+        self.task, self.instruction, self.robot = task, instruction, robot
+        self.seed, self.objects = seed, tuple(objects)
+        self.outcome = 'unknown'
+        self.metadata: dict[str, str] = dict(metadata or {})
+        self._jpeg_quality = jpeg_quality
+        if cameras:
+            save_calibration(
+                self.folder / CALIBRATION_FILE, {camera.view: camera for camera in cameras}
+            )
+
+    def write_image(
+        self, view: str, stamp_ns: int, rgb: ByteArray, *, compressed: bool = True
+    ) -> None:
+        """Records a frame, (H, W, 3) uint8 RGB, as JPEG or raw rgb8."""
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise EpisodeError(
+                f"view '{view}': frame is {rgb.shape} {rgb.dtype}, expected (H, W, 3) uint8"
+            )
+        if compressed:
+            data = messages.encode_jpeg(rgb, self._jpeg_quality)
+            self._write_compressed(
+                f'{image_topic(view)}/compressed',
+                view,
+                stamp_ns,
+                'rgb8; jpeg compressed bgr8',
+                data,
+            )
+            return
+        height, width, _ = rgb.shape
+        message = messages.make(
+            messages.IMAGE,
+            header=messages.make_header(stamp_ns, optical_frame(view)),
+            height=height,
+            width=width,
+            encoding='rgb8',
+            is_bigendian=0,
+            step=3 * width,
+            data=np.ascontiguousarray(rgb).ravel(),
+        )
+        self._write(image_topic(view), messages.IMAGE, stamp_ns, message)
+
+    def write_mask(self, view: str, stamp_ns: int, ids: ByteArray) -> None:
+        """Records object masks, (H, W) uint8: 0 = none, i + 1 = objects[i]."""
+        if ids.dtype != np.uint8 or ids.ndim != 2:
+            raise EpisodeError(
+                f"view '{view}': mask is {ids.shape} {ids.dtype}, expected (H, W) uint8"
+            )
+        data = messages.encode_png(ids)
+        self._write_compressed(
+            mask_topic(view), view, stamp_ns, 'mono8; png compressed mono8', data
+        )
+
+    def write_camera_info(self, view: str, stamp_ns: int, camera: CameraModel) -> None:
+        """Records the view's intrinsics."""
+        message = messages.make_camera_info(stamp_ns, camera, optical_frame(view))
+        self._write(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
+
+    def write_joint_states(
+        self,
+        stamp_ns: int,
+        names: Sequence[str],
+        positions: ArrayLike,
+        velocities: ArrayLike | None = None,
+    ) -> None:
+        """Records measured positions (J,) [rad or m] and, if known, velocities (J,)."""
+        message = messages.make_joint_state(stamp_ns, names, positions, velocities)
+        self._write(JOINT_STATES, messages.JOINT_STATE, stamp_ns, message)
+
+    def write_trajectory(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
+        """Records what the policy commands; the trajectory starts at `stamp_ns`."""
+        message = messages.make_joint_trajectory(stamp_ns, trajectory)
+        self._write(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
+
+    def write_object_poses(self, stamp_ns: int, T_base_object: ArrayLike) -> None:
+        """Records where the objects are, (O, 4, 4) in the order of their names [m]."""
+        message = messages.make_pose_array(stamp_ns, 'base_link', T_base_object)
+        self._write(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
+
+    def write_instruction(self, stamp_ns: int, text: str | None = None) -> None:
+        """Records the instruction (latched); by default the episode's own."""
+        self.declare(INSTRUCTION, messages.STRING, LATCHED)
+        message = messages.make(messages.STRING, data=self.instruction if text is None else text)
+        self._write(INSTRUCTION, messages.STRING, stamp_ns, message)
+
+    def close(self) -> None:
+        """Finishes the record; raises EpisodeError where `outcome` is not a known word."""
+        try:
+            self._describe()
+        except BaseException:
+            self.abort()
+            raise
+        super().close()
+
+    def _describe(self) -> None:
+        info = EpisodeInfo(
+            path=self.path,
+            task=self.task,
+            outcome=check_outcome(self.outcome),
+            seed=self.seed,
+            objects=self.objects,
+            instruction=self.instruction,
+            robot=self.robot,
+            metadata=self.metadata,
+        )
+        self.set_metadata(METADATA_NAME, dump_info(info))
+
+    def _write_compressed(
+        self, topic: str, view: str, stamp_ns: int, layout: str, data: bytes
+    ) -> None:
+        message = messages.make(
+            messages.COMPRESSED_IMAGE,
+            header=messages.make_header(stamp_ns, optical_frame(view)),
+            format=layout,
+            data=np.frombuffer(data, np.uint8),
+        )
+        self._write(topic, messages.COMPRESSED_IMAGE, stamp_ns, message)
+
+    def _write(self, topic: str, msgtype: str, stamp_ns: int, message: object) -> None:
+        self.write_raw(topic, msgtype, stamp_ns, messages.serialize(msgtype, message))

@@ -1,0 +1,342 @@
+"""Training windows: recorded frames and the commands they answer, on the model's clock.
+
+V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data_types import (
+    ByteArray,
+    CameraModel,
+    FloatArray,
+    JointTrajectory,
+    WorldModelSpec,
+)
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.rendering.resize import resize_frames, resize_labels
+
+#: a frame stands for a wanted time if it is at most this share of the model's period away
+MAX_FRAME_OFFSET = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """One episode at the model's size, all views on the first view's clock.
+
+    Attributes:
+        path: folder of the episode.
+        task: its name.
+        outcome: `success`, `failure` or `unknown`.
+        instruction: what the robot was told.
+        objects: names of the objects.
+        cameras: V cameras at the model's size.
+        times: (N,) [s] since the first frame, increasing.
+        frames: (V, N, H, W, 3) uint8 RGB.
+        object_ids: (V, N, H, W) uint8, 0 = none, i + 1 = objects[i]; None where not recorded.
+        positions: (N, J) measured joint positions at `times`.
+        commands: what the policy commanded; times on the same clock.
+        stamp_ns: stamp of the first frame.
+        object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
+        warnings: what was wrong with it and how the reader dealt with that.
+    """
+
+    path: Path
+    task: str
+    outcome: str
+    instruction: str
+    objects: tuple[str, ...]
+    cameras: tuple[CameraModel, ...]
+    times: FloatArray
+    frames: ByteArray
+    object_ids: ByteArray | None
+    positions: FloatArray
+    commands: JointTrajectory
+    stamp_ns: int
+    object_poses: FloatArray | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clip:
+    """One chunk: the observed frame and the T frames that follow, with their commands.
+
+    Attributes:
+        cameras: V cameras at the model's size.
+        objects: names of the objects.
+        times: (1 + T,) [s] since the clip's start.
+        frames: (V, 1 + T, H, W, 3) uint8 RGB.
+        object_ids: (V, 1 + T, H, W) uint8 or None.
+        positions: (1 + T, J); row 0 measured, row k the command of frame k.
+        object_poses: (1 + T, O, 4, 4) T_base_object [m], or None.
+        origin: the episode's first frame; None where object poses are not known.
+    """
+
+    cameras: tuple[CameraModel, ...]
+    objects: tuple[str, ...]
+    times: FloatArray
+    frames: ByteArray
+    object_ids: ByteArray | None
+    positions: FloatArray
+    object_poses: FloatArray | None = None
+    origin: Origin | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """The frame in which the objects of a clip were found.
+
+    Attributes:
+        frames: (V, H, W, 3) uint8 RGB.
+        positions: (J,) measured joint positions.
+        object_poses: (O, 4, 4) T_base_object [m].
+    """
+
+    frames: ByteArray
+    positions: FloatArray
+    object_poses: FloatArray
+
+
+def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) -> JointTrajectory:
+    """Joins trajectory messages into one; each counts until the next one starts.
+
+    Args:
+        trajectories: (start stamp [ns], trajectory) with equal joint names, in any order.
+        origin_ns: zero of the result's clock.
+
+    Raises:
+        EpisodeError: there is none.
+    """
+    if not trajectories:
+        raise EpisodeError('the episode has no joint_trajectory message')
+    ordered = sorted(trajectories, key=lambda item: item[0])
+    times, positions, velocities = [], [], []
+    for index, (stamp, trajectory) in enumerate(ordered):
+        starts = (stamp - origin_ns) * 1e-9
+        last = index + 1 == len(ordered)
+        ends = np.inf if last else (ordered[index + 1][0] - origin_ns) * 1e-9
+        absolute = trajectory.times + starts
+        begins = times[-1][-1] if times else -np.inf
+        kept = (absolute <= ends + 1e-9) & (absolute > begins + 1e-6)
+        if not kept.any():
+            continue
+        times.append(absolute[kept])
+        positions.append(trajectory.positions[kept])
+        if trajectory.velocities is not None:
+            velocities.append(trajectory.velocities[kept])
+    whole = len(velocities) == len(times)
+    return JointTrajectory(
+        joint_names=ordered[0][1].joint_names,
+        times=np.concatenate(times),
+        positions=np.concatenate(positions),
+        velocities=np.concatenate(velocities) if whole else None,
+    )
+
+
+def load_recording(
+    path: Path, spec: WorldModelSpec, robot: RobotModel, *, calibration: Path | None = None
+) -> Recording:
+    """Reads an episode at the model's size.
+
+    Raises:
+        EpisodeError: it lacks a view, joint states or commands.
+        TrajectoryError: its joints are not the robot's.
+    """
+    episode = read_episode(path, views=spec.views, calibration=calibration)
+    stamps = episode.images[spec.views[0]][0]
+    if len(stamps) == 0:
+        raise EpisodeError(f"episode '{path}' has no frames of view '{spec.views[0]}'")
+    frames = [_on_clock(episode, view, stamps, spec) for view in spec.views]
+    origin = int(stamps[0])
+    matched = [(s, match_joints(t, robot, None)) for s, t in episode.trajectories]
+    return Recording(
+        path=Path(path),
+        task=episode.info.task,
+        outcome=episode.info.outcome,
+        instruction=episode.info.instruction,
+        objects=episode.info.objects,
+        cameras=tuple(
+            scaled(episode.cameras[view], spec.width, spec.height) for view in spec.views
+        ),
+        times=np.asarray((stamps - origin) * 1e-9, np.float64),
+        frames=np.stack(frames),
+        object_ids=_object_ids(episode, stamps, spec),
+        positions=_measured(episode, robot, stamps),
+        commands=stitch(matched, origin),
+        stamp_ns=origin,
+        object_poses=_object_poses(episode, stamps),
+        warnings=episode.warnings,
+    )
+
+
+def _nearest(have_ns: np.ndarray, want_ns: np.ndarray) -> np.ndarray:
+    """Index of the nearest of `have_ns` (sorted) for each of `want_ns`."""
+    right = np.clip(np.searchsorted(have_ns, want_ns), 1, max(len(have_ns) - 1, 1))
+    right = np.minimum(right, len(have_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(want_ns - have_ns[left] <= have_ns[right] - want_ns, left, right)
+
+
+def _on_clock(episode: Episode, view: str, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray:
+    own_stamps, frames = episode.images[view]
+    if len(own_stamps) == 0:
+        raise EpisodeError(f"episode '{episode.info.path}' has no frames of view '{view}'")
+    index = _nearest(np.asarray(own_stamps), stamps)
+    return resize_frames(np.asarray(frames), spec.width, spec.height)[index]
+
+
+def _object_ids(episode: Episode, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray | None:
+    if not episode.masks or any(view not in episode.masks for view in spec.views):
+        return None
+    rows = []
+    for view in spec.views:
+        own_stamps, ids = episode.masks[view]
+        small = resize_labels(np.asarray(ids), spec.width, spec.height)
+        rows.append(small[_nearest(np.asarray(own_stamps), stamps)])
+    return np.stack(rows)
+
+
+def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
+    """(N, O, 4, 4) of the instants nearest to the frames."""
+    found = episode.object_poses
+    if found is None or len(found.stamps_ns) == 0:
+        return None
+    return found.T_base_object[_nearest(found.stamps_ns, stamps)]
+
+
+def _measured(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
+    states = episode.joint_states
+    if states is None or len(states.stamps_ns) == 0:
+        raise EpisodeError(f"episode '{episode.info.path}' has no joint_states")
+    seconds = (np.asarray(states.stamps_ns) - stamps[0]) * 1e-9
+    seconds, first = np.unique(seconds, return_index=True)
+    track = JointTrajectory(
+        joint_names=states.joint_names, times=seconds, positions=states.positions[first]
+    )
+    matched = match_joints(track, robot, None)
+    wanted = (stamps - stamps[0]) * 1e-9
+    columns = [np.interp(wanted, matched.times, column) for column in matched.positions.T]
+    return np.stack(columns, axis=1)
+
+
+def frame_indices(
+    recording: Recording, start: int, spec: WorldModelSpec, num_frames: int | None = None
+) -> np.ndarray | None:
+    """Recorded frames that stand for the model's clock from frame `start` on.
+
+    Returns:
+        (1 + T,) indices, or None where the recording ends or has a gap.
+    """
+    count = spec.num_frames if num_frames is None else num_frames
+    wanted = recording.times[start] + np.arange(count + 1) / spec.fps
+    index = _nearest(recording.times, wanted)
+    offset = np.abs(recording.times[index] - wanted)
+    return index if (offset <= MAX_FRAME_OFFSET / spec.fps).all() else None
+
+
+def clip_starts(recording: Recording, spec: WorldModelSpec) -> np.ndarray:
+    """Frames from which a whole clip can be cut."""
+    count = len(recording.times)
+    whole = [i for i in range(count) if frame_indices(recording, i, spec) is not None]
+    return np.array(whole, dtype=int)
+
+
+def cut_clip(
+    recording: Recording, start: int, spec: WorldModelSpec, num_frames: int | None = None
+) -> Clip:
+    """Cuts the clip that starts at recorded frame `start`.
+
+    Args:
+        recording: the episode.
+        start: recorded frame.
+        spec: of the model; its clock counts.
+        num_frames: frames that follow the first one; default: those of a chunk.
+
+    Raises:
+        EpisodeError: the recording ends or has a gap within the clip.
+    """
+    count = spec.num_frames if num_frames is None else num_frames
+    index = frame_indices(recording, start, spec, count)
+    if index is None:
+        raise EpisodeError(
+            f"'{recording.path}': no whole clip of {count} frames at {spec.fps} Hz "
+            f'starts at frame {start}'
+        )
+    times = np.arange(count + 1) / spec.fps
+    ids = recording.object_ids
+    return Clip(
+        cameras=recording.cameras,
+        objects=recording.objects,
+        times=times,
+        frames=recording.frames[:, index],
+        object_ids=None if ids is None else ids[:, index],
+        positions=commanded(recording, start, times),
+        object_poses=None if recording.object_poses is None else recording.object_poses[index],
+        origin=_origin(recording),
+    )
+
+
+def _origin(recording: Recording) -> Origin | None:
+    if recording.object_poses is None:
+        return None
+    return Origin(
+        frames=recording.frames[:, 0],
+        positions=recording.positions[0],
+        object_poses=recording.object_poses[0],
+    )
+
+
+def chunk_of(clip: Clip, chunk: int, num_frames: int) -> Clip:
+    """Returns chunk number `chunk` of a clip of several, with the frame before it.
+
+    Its first position is the command that was due then, as in a rollout of chained chunks.
+    """
+    first = chunk * num_frames
+    window = slice(first, first + num_frames + 1)
+    return replace(
+        clip,
+        times=clip.times[: num_frames + 1],
+        frames=clip.frames[:, window],
+        object_ids=None if clip.object_ids is None else clip.object_ids[:, window],
+        positions=clip.positions[window],
+        object_poses=None if clip.object_poses is None else clip.object_poses[window],
+    )
+
+
+def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray:
+    """(len(times), J) positions: measured at frame `start`, commanded after it.
+
+    Args:
+        recording: the episode.
+        start: recorded frame that is time zero.
+        times: [s] since that frame, from 0 on.
+    """
+    shifted = commands_from(recording, start)
+    positions = resample(shifted, recording.positions[start], times)
+    return np.concatenate([recording.positions[start][None], positions[1:]])
+
+
+def commands_from(recording: Recording, start: int) -> JointTrajectory:
+    """The commands that are due after frame `start`, counted from it."""
+    commands = recording.commands
+    times = commands.times - recording.times[start]
+    due = times > 1e-6
+    if not due.any():
+        due[-1] = True
+        times = np.where(due, 1e-3, times)
+    return JointTrajectory(
+        joint_names=commands.joint_names,
+        times=times[due],
+        positions=commands.positions[due],
+        velocities=None if commands.velocities is None else commands.velocities[due],
+    )

@@ -1,0 +1,103 @@
+"""Which episodes of a data set are scored, and what the model was not trained for in each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.data.episode_reader import list_episodes
+from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
+
+#: describes a data set; `mtv-world collect` writes it
+CARD_FILE = 'dataset.json'
+EVERY = 'all'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """Episodes to score.
+
+    Attributes:
+        paths: their folders.
+        split: that they are of; `all` where the data set has no splits.
+        zero_shot: by folder what the model was not trained for, where the data set says so.
+        num_in_dataset: how many episodes the data set holds.
+    """
+
+    paths: Sequence[Path]
+    split: str
+    zero_shot: Mapping[Path, str]
+    num_in_dataset: int
+
+    def __str__(self) -> str:
+        return f'{len(self.paths)} of {self.num_in_dataset} episodes, split {self.split}'
+
+
+def select(
+    dataset: Path, split: str | None = None, limit: int | None = None, *, default: str = 'test'
+) -> Selection:
+    """Returns the episodes of a split.
+
+    Args:
+        dataset: folder with episode folders in it; its `dataset.json`, if there is one, names the
+            splits and, per episode, `zero_shot`: `view`, `task` or `object`.
+        split: name of a split, or `all`; None = `default` where the data set has it, else `all`.
+        limit: only the first so many of them.
+        default: see `split`.
+
+    Raises:
+        EpisodeError: the folder holds no episodes, or no one of the split.
+        ConfigError: no such split, or the card cannot be read.
+    """
+    found = list_episodes(dataset)
+    if not found:
+        raise EpisodeError(
+            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
+            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
+        )
+    card = _card(dataset)
+    splits = card.get('splits', {})
+    if split is None:
+        split = default if splits.get(default) else EVERY
+    names = _names(dataset, splits, split)
+    paths = [path for path in found if names is None or path.name in names][:limit]
+    if not paths:
+        raise EpisodeError(f"split '{split}' of '{dataset}' has no episodes in the folder")
+    marks = {entry['name']: entry.get('zero_shot') or '' for entry in card.get('episodes', [])}
+    return Selection(
+        paths=paths,
+        split=split,
+        zero_shot={path: marks[path.name] for path in paths if marks.get(path.name)},
+        num_in_dataset=len(found),
+    )
+
+
+def _card(dataset: Path) -> dict[str, Any]:
+    file = dataset / CARD_FILE
+    if not file.is_file():
+        return {}
+    try:
+        card = json.loads(file.read_text(encoding='utf-8'))
+        splits = card.get('splits', {})
+        entries = card.get('episodes', [])
+        if not isinstance(splits, dict) or any('name' not in entry for entry in entries):
+            raise TypeError("'splits' or 'episodes' are not as 'mtv-world collect' writes them")
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"'{file}' is not a data set card: {error}") from error
+    return card
+
+
+def _names(dataset: Path, splits: Mapping[str, Any], split: str) -> set[str] | None:
+    """Names of a split's episodes; None = all."""
+    if split == EVERY:
+        return None
+    if split not in splits:
+        known = [*splits, EVERY]
+        raise ConfigError(
+            f"split '{split}'{nearest(split, known)} is not one of '{dataset}', which has "
+            f'{", ".join(known)}'
+        )
+    return set(splits[split])

@@ -1,0 +1,1 @@
+"""Fits the success probability to true outcomes."""

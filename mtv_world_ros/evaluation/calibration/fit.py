@@ -1,0 +1,194 @@
+"""Fits the success estimate to episodes of known outcome, and scores it on left-out tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite, nan
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.evaluation.calibration.logistic import fit_non_negative
+from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
+from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.success.calibration import Calibration, weighed
+from mtv_world_ros.success.estimator import capped, EstimatorConfig
+from mtv_world_ros.success.evidence import FEATURES
+
+#: fewer episodes of known outcome than this say nothing
+MIN_EPISODES = 8
+#: what the scores are called, in the order of the tables
+BEFORE, AFTER, FITTED = 'before', 'after', 'fitted'
+ALWAYS = 'always success'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """An imagined episode of known outcome.
+
+    Attributes:
+        episode: its name.
+        task: its name.
+        success: what really happened.
+        features: of the estimate by seed; empty where it abstained.
+        before: probabilities by seed with the stated weights; NaN = abstained.
+        reasons: of the first seed's estimate.
+    """
+
+    episode: str
+    task: str
+    success: bool
+    features: tuple[Mapping[str, float], ...]
+    before: tuple[float, ...]
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """A calibration and what it was judged by.
+
+    Attributes:
+        calibration: fitted on all samples.
+        samples: with known outcome.
+        judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it), `FITTED`
+            (on what it was fitted on: too good) -> one per sample.
+    """
+
+    calibration: Calibration
+    samples: tuple[Sample, ...]
+    judgements: Mapping[str, tuple[Judgement, ...]]
+
+
+def samples_of(runs: Sequence[Sequence[EpisodeResult]]) -> list[Sample]:
+    """Returns the episodes of known outcome; `runs` hold the same episodes, one run a seed."""
+    by_name = [{result.episode: result for result in run} for run in runs]
+    samples = []
+    for name, first in sorted(by_name[0].items()):
+        found = [run[name] for run in by_name if name in run]
+        if first.outcome in ('success', 'failure'):
+            samples.append(
+                Sample(
+                    episode=name,
+                    task=first.task,
+                    success=first.outcome == 'success',
+                    features=tuple(result.features for result in found),
+                    before=tuple(result.probability for result in found),
+                    reasons=first.reasons,
+                )
+            )
+    return samples
+
+
+def calibrate(
+    samples: Sequence[Sample],
+    *,
+    segmenter: str,
+    l2: float = 1.0,
+    made: Mapping[str, str] | None = None,
+) -> Calibrated:
+    """Fits the calibration and judges it.
+
+    Args:
+        samples: imagined episodes of known outcome.
+        segmenter: that found the masks.
+        l2: strength of the penalty.
+        made: command, date, machine.
+
+    Raises:
+        ConfigError: too few episodes, or all of one outcome.
+    """
+    _check(samples)
+    fitted = _fit(samples, segmenter, l2)
+    judgements = {
+        BEFORE: tuple(_judged(s, _mean_of(s.before)) for s in samples),
+        AFTER: _left_out(samples, segmenter, l2),
+        FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
+        ALWAYS: tuple(_judged(s, 1.0) for s in samples),
+    }
+    scores = {name: agreement(found) for name, found in judgements.items()}
+    calibration = Calibration(**fitted, scores=scores, made=dict(made or {}))
+    return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
+
+
+def _check(samples: Sequence[Sample]) -> None:
+    usable = [sample for sample in samples if any(sample.features)]
+    outcomes = {sample.success for sample in usable}
+    if len(usable) < MIN_EPISODES or len(outcomes) < 2:
+        raise ConfigError(
+            f'{len(samples)} episodes have a known outcome, of which {len(usable)} could be '
+            f'judged, {sum(s.success for s in usable)} of them successes; a calibration needs at '
+            f'least {MIN_EPISODES} and both outcomes: collect some with --failures-of-ten 5'
+        )
+
+
+def _left_out(samples: Sequence[Sample], segmenter: str, l2: float) -> tuple[Judgement, ...]:
+    """Every sample judged by a fit that has not seen its task."""
+    fits: dict[str, dict[str, Any] | None] = {}
+    for task in {sample.task for sample in samples}:
+        others = [sample for sample in samples if sample.task != task and any(sample.features)]
+        enough = len({sample.success for sample in others}) == 2
+        fits[task] = _fit(others, segmenter, l2) if enough else None
+    judged = []
+    for sample in samples:
+        fit = fits[sample.task]
+        judged.append(_judged(sample, nan if fit is None else _probability(fit, sample)))
+    return tuple(judged)
+
+
+def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:
+    """Fields of `Calibration`."""
+    rows, labels = _design(samples)
+    with np.errstate(invalid='ignore'):
+        known = np.isfinite(rows)
+        counts = np.maximum(known.sum(0), 1)
+        means = np.where(known, rows, 0.0).sum(0) / counts
+        spread = np.sqrt((np.where(known, rows - means, 0.0) ** 2).sum(0) / counts)
+    scales = np.where(spread > 1e-6, spread, 1.0)
+    standard = np.where(known, (rows - means) / scales, 0.0)
+    # imagination rarely shows what failed, as an object left behind: there, what was stated holds
+    stated = EstimatorConfig().weights
+    prior = scales * [stated.get(name, 0.0) for name in FEATURES]
+    logistic = fit_non_negative(standard, labels, l2=l2, prior=prior)
+    return {
+        'features': FEATURES,
+        'means': tuple(means.tolist()),
+        'scales': tuple(scales.tolist()),
+        'weights': tuple(logistic.weights.tolist()),
+        'bias': logistic.bias,
+        'segmenter': segmenter,
+        'tasks': tuple(sorted({sample.task for sample in samples})),
+        'num_episodes': len(samples),
+        'num_seeds': max(len(sample.before) for sample in samples),
+        'l2': l2,
+    }
+
+
+def _design(samples: Sequence[Sample]) -> tuple[FloatArray, BoolArray]:
+    """(N, F) features, NaN where one says nothing, and (N,) outcomes; abstentions are left out."""
+    pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
+    rows = [[weighed(features, name) for name in FEATURES] for features, _ in pairs]
+    return np.array(rows, np.float64), np.array([success for _, success in pairs], np.bool_)
+
+
+def _probability(fit: dict[str, Any], sample: Sample) -> float:
+    calibration = Calibration(**fit)
+    return _mean_of(
+        [
+            capped(calibration.probability(features), features) if features else nan
+            for features in sample.features
+        ]
+    )
+
+
+def _mean_of(probabilities: Sequence[float]) -> float:
+    """The mean over the seeds that know; NaN where most of them abstain."""
+    known = [value for value in probabilities if isfinite(value)]
+    return float(np.mean(known)) if 2 * len(known) > len(probabilities) else nan
+
+
+def _judged(sample: Sample, probability: float) -> Judgement:
+    outcome = 'success' if sample.success else 'failure'
+    return Judgement(probability=probability, outcome=outcome)

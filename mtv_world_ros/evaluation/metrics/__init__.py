@@ -1,0 +1,1 @@
+"""What is measured in predictions, and how certain it is."""

@@ -1,0 +1,1 @@
+"""Fréchet distances of images (FID) and videos (FVD)."""

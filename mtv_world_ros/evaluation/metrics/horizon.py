@@ -1,0 +1,124 @@
+"""J against how far ahead was imagined, with bootstrap bands over episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtv_world_ros.evaluation.metrics.scores import ScoreRow
+
+#: frames that fewer than this share of the rollouts reach are left out of pictures
+MIN_SHARE = 1 / 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curve:
+    """Mean J per predicted frame.
+
+    Attributes:
+        values: (T,) mean over rows of objects that move.
+        band: (T,) 2.5 and 97.5 percentiles over resampled episodes.
+    """
+
+    values: tuple[float, ...]
+    band: tuple[tuple[float, float], ...]
+
+
+def curve(
+    episodes: Sequence[Sequence[ScoreRow]],
+    view: str | None,
+    field: str,
+    *,
+    min_share: float = MIN_SHARE,
+    seed: int = 0,
+    num_resamples: int = 500,
+) -> Curve:
+    """Returns J of the moving objects of a view against the horizon; rows weigh equally.
+
+    Args:
+        episodes: rows of each episode.
+        view: its name; None = all.
+        field: one of `scores.FRAME_FIELDS`.
+        min_share: frames that fewer than this share of the rollouts reach are left out.
+        seed: of the resampling.
+        num_resamples: how often the episodes are drawn with replacement.
+    """
+    sums, counts = _sums(_moving(episodes, view, field))
+    total = counts.sum(0)
+    covered = int((total >= max(min_share * total.max(initial=0), 1)).sum())
+    return _resampled(sums[:, :covered], counts[:, :covered], seed, num_resamples)
+
+
+def by_chunk(
+    episodes: Sequence[Sequence[ScoreRow]],
+    view: str | None,
+    field: str,
+    num_frames: int,
+    *,
+    seed: int = 0,
+    num_resamples: int = 2000,
+) -> Curve:
+    """Returns J of the moving objects of a view for each chunk of its rollouts: how it drifts.
+
+    All frames of a chunk weigh equally; the other arguments are those of `curve`.
+
+    Args:
+        episodes: rows of each episode.
+        view: its name; None = all.
+        field: one of `scores.FRAME_FIELDS`.
+        num_frames: T, frames of a chunk.
+        seed: of the resampling.
+        num_resamples: how often the episodes are drawn with replacement.
+    """
+    sums, counts = _sums(_moving(episodes, view, field))
+    missing = -sums.shape[1] % num_frames
+    chunks = [
+        np.pad(of_frames, ((0, 0), (0, missing))).reshape(len(episodes), -1, num_frames).sum(2)
+        for of_frames in (sums, counts)
+    ]
+    return _resampled(chunks[0], chunks[1], seed, num_resamples)
+
+
+def _moving(
+    episodes: Sequence[Sequence[ScoreRow]], view: str | None, field: str
+) -> list[list[Sequence[float]]]:
+    """Values per frame of each episode's rows of objects that move."""
+    return [
+        [
+            getattr(row, field)
+            for row in rows
+            if row.name and row.moving and view in (None, row.view)
+        ]
+        for rows in episodes
+    ]
+
+
+def _resampled(sums: np.ndarray, counts: np.ndarray, seed: int, num_resamples: int) -> Curve:
+    """Means of (E, T) sums over so many values, and what they are with episodes drawn anew."""
+    num_episodes, length = sums.shape
+    if not length:
+        return Curve(values=(), band=())
+    share = np.full(num_episodes, 1 / num_episodes)
+    weights = np.random.default_rng(seed).multinomial(num_episodes, share, size=num_resamples)
+    with np.errstate(invalid='ignore'):
+        drawn = (weights @ sums) / (weights @ counts)
+        values = sums.sum(0) / counts.sum(0)
+    low, high = np.nanpercentile(drawn, [2.5, 97.5], axis=0)
+    return Curve(
+        values=tuple(values.tolist()),
+        band=tuple(zip(low.tolist(), high.tolist(), strict=True)),
+    )
+
+
+def _sums(episodes: Sequence[Sequence[Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
+    """(E, T) sums of the known values of each episode's rows, and how many they are."""
+    longest = max((len(frames) for rows in episodes for frames in rows), default=0)
+    sums, counts = np.zeros((len(episodes), longest)), np.zeros((len(episodes), longest))
+    for index, rows in enumerate(episodes):
+        for frames in rows:
+            known = np.isfinite(frames)
+            sums[index, : len(frames)] += np.where(known, frames, 0.0)
+            counts[index, : len(frames)] += known
+    return sums, counts

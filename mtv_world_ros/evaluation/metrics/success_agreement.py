@@ -1,0 +1,105 @@
+"""How well success estimates agree with what really happened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """The estimate at the end of an episode.
+
+    Attributes:
+        probability: NaN = abstained.
+        outcome: `success`, `failure` or `unknown`.
+    """
+
+    probability: float
+    outcome: str
+
+
+#: equally wide bins of the calibration error
+NUM_BINS = 10
+
+
+def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
+    """Returns counts and scores of the estimates; None = unknown.
+
+    All but `abstention_rate` are of those that did not abstain. The false-success rate is the
+    share of real failures that were called a success (above one half).
+    """
+    known = [item for item in judgements if item.outcome in ('success', 'failure')]
+    judged = [item for item in known if np.isfinite(item.probability)]
+    probability = np.array([item.probability for item in judged])
+    real = np.array([item.outcome == 'success' for item in judged], bool)
+    called = probability > 0.5
+    hit, avoided = _mean(called[real]), _mean(~called[~real])
+    balanced = None if hit is None or avoided is None else (hit + avoided) / 2
+    return {
+        'num_outcomes_known': len(known),
+        'num_abstained': len(known) - len(judged),
+        'abstention_rate': _mean(np.array([np.isnan(item.probability) for item in known])),
+        'real_success_rate': _mean(np.array([item.outcome == 'success' for item in known])),
+        'estimated_success_rate': _mean(probability),
+        'accuracy': _mean(called == real),
+        'balanced_accuracy': balanced,
+        'brier': _mean((probability - real) ** 2),
+        'ece': expected_calibration_error(probability, real) if len(judged) else None,
+        'auroc': area_under_roc(probability, real),
+        'false_success_rate': _mean(called[~real]),
+    }
+
+
+def expected_calibration_error(
+    probability: FloatArray, real: BoolArray, num_bins: int = NUM_BINS
+) -> float:
+    """Returns how far what was said is from what came true, over bins of what was said.
+
+    Bins weigh by how many (N,) estimates lie in them (Guo et al., 2017); what was said is the
+    probability of success, not of the likelier outcome.
+    """
+    place = np.minimum((probability * num_bins).astype(int), num_bins - 1)
+    gaps = [
+        (place == k).mean() * abs(probability[place == k].mean() - real[place == k].mean())
+        for k in range(num_bins)
+        if (place == k).any()
+    ]
+    return float(sum(gaps))
+
+
+def area_under_roc(probability: FloatArray, real: BoolArray) -> float | None:
+    """Returns how often a success was given more than a failure, ties half; None without both."""
+    gained, lost = probability[real], probability[~real]
+    if not len(gained) or not len(lost):
+        return None
+    above = (gained[:, None] > lost).mean()
+    return float(above + (gained[:, None] == lost).mean() / 2)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bin:
+    """What was said and what came true, of those that were said about the same.
+
+    Attributes:
+        middle: of the probabilities that belong here.
+        said: mean probability.
+        came_true: share.
+        interval: of that share.
+        count: how many.
+    """
+
+    middle: float
+    said: float
+    came_true: float
+    interval: tuple[float, float]
+    count: int

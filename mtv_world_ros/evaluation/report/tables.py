@@ -1,0 +1,124 @@
+"""Evaluation results as files: metrics.json, a CSV of rows, Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import csv
+import io
+import math
+from typing import Any
+
+from mtv_world_ros.evaluation.metrics.scores import FRAME_FIELDS, ScoreRow
+from mtv_world_ros.evaluation.metrics.statistics import Estimate
+
+#: columns of the Markdown tables: key -> heading
+COLUMNS = {
+    'j_object_mean': 'J objects',
+    'j_union': 'J union',
+    'j_moving': 'J moving',
+    'j_copy_moving': 'persistence',
+    'j_shuffled_moving': 'shuffled actions',
+    'margin_moving': 'margin over persistence',
+    'skill': 'skill',
+    'j_ceiling': 'ceiling',
+}
+#: rows of the table that shows whether the model obeys, and what could be reached at all
+CONTROLS = {
+    'j_self_moving': 'recorded frames',
+    'j_ceiling_moving': 'recorded frames through the autoencoder',
+    'j_moving': 'imagined, true actions',
+    'j_shuffled_moving': "imagined, another episode's actions",
+    'j_zero_moving': 'imagined, joints held',
+    'j_mirrored_moving': 'imagined, mirrored actions',
+    'j_copy_moving': 'first frame held (persistence)',
+    'margin_of_shuffled': 'shuffled actions - persistence',
+}
+NOT_MEASURED = Estimate(value=math.nan, interval=(math.nan, math.nan), num_episodes=0)
+QUALITY = {'fid': 'FID', 'fvd': 'FVD', 'psnr': 'PSNR [dB]', 'ssim': 'SSIM', 'lpips': 'LPIPS'}
+
+
+def estimates_json(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Returns the values by name, and `intervals` and `num_episodes_with` beside them.
+
+    `fid` and `fvd` are null where no weights of feature networks were named.
+    """
+    found = {**dict.fromkeys(('fid', 'fvd'), NOT_MEASURED), **estimates}
+    return {
+        **{name: estimate.value for name, estimate in found.items()},
+        'intervals': {name: estimate.interval for name, estimate in found.items()},
+        'num_episodes_with': {name: e.num_episodes for name, e in found.items()},
+    }
+
+
+def rows_csv(rows: Iterable[tuple[str, str, ScoreRow]]) -> str:
+    """Returns a CSV of (episode, task, row): one line per stretch, view and object."""
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for episode, task, row in rows:
+        values = {'episode': episode, 'task': task, **row.as_json()}
+        for field in FRAME_FIELDS:
+            values.pop(field)
+        values['name'] = row.name or '(union)'
+        if writer is None:
+            writer = csv.DictWriter(stream, list(values), lineterminator='\n')
+            writer.writeheader()
+        writer.writerow(values)
+    return stream.getvalue()
+
+
+def markdown_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]], first: str) -> str:
+    """Returns a table of (label, estimates) with 95 % intervals in brackets."""
+    head = [first, *COLUMNS.values()]
+    return grid(head, [[label, *(cell(found.get(k)) for k in COLUMNS)] for label, found in lines])
+
+
+def controls_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
+    """Returns J of moving objects by what was shown and view, as far as measured."""
+    head = ['J of objects that move', *(view for view, _ in lines)]
+    body = [
+        [words, *(cell(found.get(key)) for _, found in lines)] for key, words in CONTROLS.items()
+    ]
+    return grid(head, [row for row in body if set(row[1:]) != {cell(None)}])
+
+
+def quality_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
+    """Returns a table of pictures' quality by view; empty where nothing was measured."""
+    measured = [k for k in QUALITY if any(cell(found.get(k)) != cell(None) for _, found in lines)]
+    if not measured:
+        return ''
+    body = [[view, *(cell(found.get(key)) for key in measured)] for view, found in lines]
+    return grid(['view', *(QUALITY[key] for key in measured)], body)
+
+
+def status_table(views: Mapping[str, Mapping[str, int]]) -> str:
+    """Returns how often each status of an object in a stretch was met, by view."""
+    words = sorted({word for counts in views.values() for word in counts})
+    body = [[word, *(str(counts.get(word, 0)) for counts in views.values())] for word in words]
+    return grid(['objects by status', *views], body)
+
+
+def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Returns a Markdown table."""
+    widths = [max(len(row[i]) for row in [head, *body]) for i in range(len(head))]
+    rule = ['-' * width for width in widths]
+    return '\n'.join(
+        '| ' + ' | '.join(text.ljust(n) for text, n in zip(row, widths, strict=True)) + ' |'
+        for row in [head, rule, *body]
+    )
+
+
+def point(values: Sequence[float], band: Sequence[tuple[float, float]], index: int) -> str:
+    """Returns a value of a curve with its interval; a dash where the curve does not reach."""
+    if index >= len(values):
+        return cell(None)
+    return cell(Estimate(value=values[index], interval=band[index], num_episodes=0))
+
+
+def cell(estimate: Estimate | None, digits: int = 3) -> str:
+    """Returns a number with its interval; a dash where it was not measured."""
+    if estimate is None or not math.isfinite(estimate.value):
+        return '–'
+    low, high = estimate.interval
+    if not math.isfinite(low):
+        return f'{estimate.value:.{digits}f}'
+    return f'{estimate.value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]'

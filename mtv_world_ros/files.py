@@ -1,0 +1,80 @@
+"""Where files that are not code lie, and what tells one folder of them from another."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+import hashlib
+import json
+import math
+from pathlib import Path
+import sys
+from typing import Any
+
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.whole_files import write_whole
+
+PACKAGE = 'mtv_world_ros'
+
+
+def _candidates() -> list[Path]:
+    source = Path(__file__).resolve().parent.parent
+    roots = [source] if (source / 'package.xml').is_file() else []
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        roots.append(Path(get_package_share_directory(PACKAGE)))
+    except (ImportError, LookupError, OSError):
+        pass
+    return [*roots, Path(sys.prefix) / 'share' / PACKAGE]
+
+
+def share_path(*parts: str) -> Path:
+    """Returns the path of a bundled file or folder.
+
+    Looks in the source tree, then in the ament share folder, then in the pip prefix.
+
+    Raises:
+        ConfigError: none of them holds it.
+    """
+    roots = _candidates()
+    for root in roots:
+        path = root.joinpath(*parts)
+        if path.exists():
+            return path
+    searched = ', '.join(str(root) for root in roots)
+    wanted = '/'.join(parts)
+    raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")
+
+
+def content_digest(folder: Path, without: Collection[str] = ()) -> str:
+    """Returns the SHA-256 of a folder's files, or of one: other names or contents, another digest.
+
+    Args:
+        folder: is looked through with all folders in it; or a file.
+        without: names of files that do not count.
+    """
+    digest = hashlib.sha256()
+    paths = [folder] if folder.is_file() else folder.rglob('*')
+    files = (path for path in paths if path.is_file() and path.name not in without)
+    for file in sorted(files):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        with file.open('rb') as opened:
+            while block := opened.read(2**24):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Writes a JSON file; NaN becomes null."""
+    write_whole(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
+
+
+def plain(value: Any) -> Any:
+    """Returns what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value

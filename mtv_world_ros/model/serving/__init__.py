@@ -1,0 +1,1 @@
+"""What makes prediction fast: compilation, float8, several GPUs."""

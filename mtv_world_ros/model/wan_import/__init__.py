@@ -1,0 +1,1 @@
+"""Public Wan weights become checkpoints."""

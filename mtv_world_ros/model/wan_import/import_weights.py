@@ -1,0 +1,277 @@
+"""Public Wan 2.1 weights into a checkpoint folder, with every tensor accounted for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+import torch
+
+from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model import wan_keys
+from mtv_world_ros.model.card import CARD, check_card
+from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
+from mtv_world_ros.model.tensor_files import open_tensors, SHARD_BYTES, StoredTensor, write_tensors
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.wan_import import encoder_configs
+from mtv_world_ros.model.wan_import.import_sources import find_sources
+
+REPORT = 'import.json'
+#: tensors that public checkpoints lack; they start at zero and so change nothing
+NEW = ('view_embedding',)
+
+
+@dataclass(frozen=True, slots=True)
+class PartReport:
+    """What became of a part's tensors.
+
+    Attributes:
+        part: e.g. `transformer`.
+        source: file or folder they came from.
+        loaded: tensors written.
+        parameters: numbers in them.
+        dtypes: their number formats.
+        new: tensors that the source lacks, zero now.
+        unused: tensors that were left out, and why.
+    """
+
+    part: str
+    source: str
+    loaded: int
+    parameters: int
+    dtypes: tuple[str, ...]
+    new: tuple[str, ...]
+    unused: Mapping[str, str]
+
+
+def import_weights(
+    path: Path,
+    out: Path,
+    *,
+    transformer: Mapping[str, Any],
+    autoencoder: Mapping[str, Any],
+    scheduler: Mapping[str, Any],
+    card: Mapping[str, Any],
+    elsewhere: Mapping[str, Path | None] | None = None,
+    shard_bytes: int = SHARD_BYTES,
+) -> list[PartReport]:
+    """Writes a checkpoint folder from public weights, number formats kept.
+
+    No more than one shard is in memory at a time.
+
+    Args:
+        path: folder in VideoX-Fun's or diffusers' layout, or the transformer's file.
+        out: the checkpoint's folder; appears under its name only when it is whole.
+        transformer: arguments of `MultiViewWanTransformer`.
+        autoencoder: arguments of the autoencoder.
+        scheduler: arguments of the noise schedule.
+        card: `world_model.json`.
+        elsewhere: files or folders of parts that are not in `path`.
+        shard_bytes: size at which a new file is begun.
+
+    Raises:
+        CheckpointError: a part, shard or tensor is missing, unknown, of another model or a pickle.
+    """
+    check_card(card, out / CARD)
+    if out.exists():
+        raise CheckpointError(f"'{out}' exists; give --out a folder that does not")
+    sources = find_sources(Path(path), elsewhere or {})
+    partial = out.with_name(out.name + '.partial')
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        reports = _import_parts(sources, partial, transformer, autoencoder, shard_bytes)
+        shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
+        build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
+        (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
+        listed = [asdict(report) for report in reports]
+        (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return reports
+
+
+def _import_parts(
+    sources: Mapping[str, Path],
+    out: Path,
+    transformer: Mapping[str, Any],
+    autoencoder: Mapping[str, Any],
+    shard_bytes: int,
+) -> list[PartReport]:
+    reports = [
+        _import_transformer(sources['transformer'], out, transformer, shard_bytes),
+        _import_autoencoder(sources['autoencoder'], out, autoencoder, shard_bytes),
+    ]
+    for part, width in (('text_encoder', 'text_dim'), ('image_encoder', 'image_dim')):
+        reports.append(_import_encoder(part, sources[part], out, transformer[width], shard_bytes))
+    return reports
+
+
+def _import_transformer(
+    source: Path, out: Path, config: Mapping[str, Any], shard_bytes: int
+) -> PartReport:
+    tensors = open_tensors(source, 'diffusion_pytorch_model' if source.is_dir() else '')
+    keys = wan_keys.transformer_keys(tensors)
+    with torch.device('meta'):
+        model = MultiViewWanTransformer(**config)
+    _check_architecture(source, tensors, keys, model)
+    shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+    report = _write('transformer', source, tensors, keys, shapes, out, shard_bytes)
+    model.save_config(out / 'transformer')
+    return report
+
+
+def _check_architecture(
+    source: Path,
+    tensors: Mapping[str, StoredTensor],
+    keys: wan_keys.KeyMap,
+    model: MultiViewWanTransformer,
+) -> None:
+    """Says in words what the commonest wrong checkpoints are."""
+    config: Any = model.config
+    patch = keys.takes.get('patch_embedding.weight')
+    if patch is None or len(tensors[patch.source].shape) != 5:
+        raise CheckpointError(
+            f"'{source}' holds no Wan transformer (no 'patch_embedding.weight' of 5 axes); "
+            'expected the transformer of Wan2.1-Fun-V1.1-Control'
+        )
+    width, channels = tensors[patch.source].shape[:2]
+    expected = config['num_attention_heads'] * config['attention_head_dim']
+    if width != expected:
+        raise CheckpointError(
+            f"'{source}' has width {width}, the preset {expected}; Wan 2.1 has 1536 (--preset "
+            'wan-1.3b) or 5120 (--preset wan-14b)'
+        )
+    if channels != config['in_channels']:
+        raise CheckpointError(
+            f"'{source}' takes {channels} channels, expected {config['in_channels']} (noisy, "
+            'control and start image, 16 each): Wan2.1-Fun-V1.1-Control has 48, its text-to-video '
+            'and image-to-video siblings have 16 and 36'
+        )
+    if 'ref_conv.weight' not in keys.takes:
+        raise CheckpointError(
+            f"'{source}' has no 'ref_conv.weight', which takes the reference image: a Fun-Control "
+            'checkpoint of V1.0? Expected V1.1'
+        )
+    _check_heads(source, config['num_attention_heads'])
+
+
+def _check_heads(source: Path, expected: int) -> None:
+    """The number of heads shows in no tensor: the file beside them says it."""
+    file = (source if source.is_dir() else source.parent) / 'config.json'
+    if not file.is_file():
+        return
+    try:
+        config = json.loads(file.read_text())
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"'{file}' is not valid JSON: {error}") from error
+    heads = config.get('num_heads', config.get('num_attention_heads', expected))
+    if heads != expected:
+        raise CheckpointError(f"'{file}' says {heads} attention heads, the preset {expected}")
+
+
+def _import_autoencoder(
+    source: Path, out: Path, config: Mapping[str, Any], shard_bytes: int
+) -> PartReport:
+    tensors = open_tensors(source, 'diffusion_pytorch_model' if source.is_dir() else '')
+    with torch.device('meta'):
+        model: Any = build_autoencoder(config)
+    shapes = {name: tuple(value.shape) for name, value in model.vae.state_dict().items()}
+    keys = wan_keys.autoencoder_keys(tensors)
+    report = _write('autoencoder', source, tensors, keys, shapes, out, shard_bytes)
+    model.vae.save_config(out / 'autoencoder')
+    return report
+
+
+def _import_encoder(
+    part: str, source: Path, out: Path, width: int, shard_bytes: int
+) -> PartReport:
+    tensors = open_tensors(source, 'model' if source.is_dir() else '')
+    find_keys = {
+        'text_encoder': wan_keys.text_encoder_keys,
+        'image_encoder': wan_keys.image_encoder_keys,
+    }
+    keys = find_keys[part](tensors)
+    config, shapes = encoder_configs.describe(part, source, tensors, keys)
+    encoder_configs.check_width(part, source, config, width)
+    report = _write(part, source, tensors, keys, shapes, out, shard_bytes, stem='model')
+    (out / part / 'config.json').write_text(json.dumps(config, indent=2) + '\n')
+    return report
+
+
+def _write(
+    part: str,
+    source: Path,
+    tensors: Mapping[str, StoredTensor],
+    keys: wan_keys.KeyMap,
+    shapes: Mapping[str, tuple[int, ...]],
+    out: Path,
+    shard_bytes: int,
+    stem: str = 'diffusion_pytorch_model',
+) -> PartReport:
+    """Writes a part's tensors under our names; every one of the source and of ours is settled."""
+    unknown = sorted(set(keys.takes) - set(shapes))
+    if unknown:
+        names = [keys.takes[name].source for name in unknown]
+        raise CheckpointError(
+            f"{part} '{source}': {len(names)} tensors belong to another model: {_some(names)}"
+        )
+    missing = sorted(set(shapes) - set(keys.takes) - set(NEW))
+    if missing:
+        raise CheckpointError(
+            f"{part} '{source}': {len(missing)} tensors are missing: {_some(missing)}"
+        )
+    new = tuple(name for name in NEW if name in shapes and name not in keys.takes)
+    ours = {}
+    for name, shape in shapes.items():
+        if name in new:
+            ours[name] = _zeros(shape)
+        else:
+            ours[name] = _taken(part, source, tensors, keys.takes[name], shape)
+    write_tensors(ours, out / part, stem, shard_bytes=shard_bytes)
+    taken = [ours[name] for name in shapes if name not in new]
+    return PartReport(
+        part=part,
+        source=str(source),
+        loaded=len(taken),
+        parameters=sum(torch.Size(tensor.shape).numel() for tensor in taken),
+        dtypes=tuple(sorted({tensor.dtype for tensor in taken})),
+        new=new,
+        unused=keys.unused,
+    )
+
+
+def _taken(
+    part: str,
+    source: Path,
+    tensors: Mapping[str, StoredTensor],
+    take: wan_keys.Take,
+    shape: tuple[int, ...],
+) -> StoredTensor:
+    stored = tensors[take.source]
+    parts = (stored.shape[0] // take.num_parts, *stored.shape[1:]) if stored.shape else ()
+    # only axes of length 1 may come or go
+    if [n for n in parts if n != 1] != [n for n in shape if n != 1]:
+        raise CheckpointError(
+            f"{part} '{source}': tensor '{take.source}' has shape {list(stored.shape)}, expected "
+            f'{[shape[0] * take.num_parts, *shape[1:]] if shape else []}'
+        )
+
+    def read() -> torch.Tensor:
+        return stored.read().chunk(take.num_parts)[take.part].reshape(shape).clone()
+
+    return StoredTensor(shape, stored.dtype, read)
+
+
+def _zeros(shape: tuple[int, ...]) -> StoredTensor:
+    return StoredTensor(shape, 'F32', lambda: torch.zeros(shape))
+
+
+def _some(names: list[str]) -> str:
+    """The first names; all of them would fill the screen."""
+    return ', '.join(names[:8]) + (', ...' if len(names) > 8 else '')

@@ -1,0 +1,235 @@
+"""A ranking in tables and sentences, for Markdown and HTML alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import NamedTuple
+
+from mtv_world_ros.evaluation.report.tables import grid
+from mtv_world_ros.ranking.jobs import THRESHOLD
+from mtv_world_ros.ranking.summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
+
+TITLE = 'Policy ranking'
+_MEANING = (
+    'Success in the simulator is its predicate on object poses, held at the end. Success in '
+    'imagination is an estimate of at least {threshold} at the end of the imagined episode, '
+    'which starts from the same first pictures. The scripted policies go by time and do not look, '
+    'so what differs is the world that their commands meet.'
+)
+_CEILING = (
+    "'{seen}' is what imagination could reach at best: its errors are the estimator's, the rest "
+    "are the world model's."
+)
+_INTERVALS = (
+    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: bootstrap over episodes, each '
+    'drawn for all policies and both worlds at once. MMRV weighs a wrongly ranked pair by how far '
+    'its true rates lie apart; 0 is perfect.'
+)
+
+
+class Grid(NamedTuple):
+    """A table.
+
+    Attributes:
+        caption: what it shows.
+        head: headings.
+        rows: cells.
+    """
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def grids(summary: Summary) -> list[Grid]:
+    """Returns the ranking's tables."""
+    return [
+        _agreement(summary),
+        *(_rates(summary, task) for task in (None, *summary.tasks)),
+        _powered(summary),
+        _confusion(summary),
+        _speed(summary),
+    ]
+
+
+def remarks(summary: Summary) -> list[str]:
+    """Returns what has to be known to read the numbers."""
+    found = [
+        _MEANING.format(threshold=THRESHOLD),
+        _CEILING.format(seen=JUDGES['seen'].capitalize()),
+        _agreement_remark(summary),
+        _abstention_remark(summary),
+        _INTERVALS,
+    ]
+    if any('uncalibrated' in ' '.join(result.imagined.reasons) for result in summary.results):
+        found.append(
+            'The estimates are not calibrated: the threshold is a stated one, not a fitted one.'
+        )
+    cut = sum(not result.is_over for result in summary.results)
+    if cut:
+        found.append(f'{cut} rollouts were cut off by the limit of chunks.')
+    if summary.failed:
+        first, reason = next(iter(summary.failed.items()))
+        found.append(
+            f'{len(summary.failed)} rollouts have no result and count nowhere; the first, '
+            f'{first}: {reason}'
+        )
+    return [remark for remark in found if remark]
+
+
+def _agreement_remark(summary: Summary) -> str:
+    found = summary.agreement('imagined', None)['pearson']
+    if not isfinite(found.value):
+        return (
+            'r is not defined: less than two policies have an imagined rate, or all rates are '
+            'alike.'
+        )
+    if found.num_policies == 2:
+        return 'Of two policies r is 1 or -1 whatever they do: it says nothing here.'
+    low = found.interval[0]
+    if not low > 0:
+        return (
+            'The interval of r reaches zero: these episodes do not show that imagination ranks '
+            'these policies better than chance.'
+        )
+    return ''
+
+
+def _abstention_remark(summary: Summary) -> str:
+    rate = summary.abstained('imagined')
+    if not rate.hits:
+        return ''
+    per_task = {
+        task: sum(summary.judged_rate(p, task, 'imagined').num_abstained for p in summary.policies)
+        for task in summary.tasks
+    }
+    blind = [
+        task
+        for task in summary.tasks
+        if not any(summary.judged_rate(p, task, 'imagined').count for p in summary.policies)
+    ]
+    by_task = ', '.join(f'{task}: {count}' for task, count in per_task.items())
+    text = (
+        f'The estimator abstained in {rate.hits} of {rate.count} imagined episodes '
+        f'({by_task}). Rates, r and MMRV are of the others alone; if it abstains more on '
+        'failures, imagined rates are too high.'
+    )
+    if blind:
+        text += f' It judged nothing of {", ".join(blind)}; that task is in no imagined rate.'
+    return text
+
+
+def _rate(rate: Rate) -> str:
+    if not rate.count:
+        return f'– ({rate.num_abstained} abstained)' if rate.num_abstained else '–'
+    text = f'{rate.value:.2f} {_interval(rate.interval)} of {rate.count}'
+    return f'{text}, {rate.num_abstained} abstained' if rate.num_abstained else text
+
+
+def _interval(interval: tuple[float, float], digits: int = 2) -> str:
+    low, high = interval
+    return f'[{low:.{digits}f}, {high:.{digits}f}]' if isfinite(low) else '[not known]'
+
+
+def _rates(summary: Summary, task: str | None) -> Grid:
+    rows = [
+        [
+            policy,
+            _rate(summary.true_rate(policy, task)),
+            *(_rate(summary.judged_rate(policy, task, judge)) for judge in JUDGES),
+        ]
+        for policy in summary.policies
+    ]
+    head = ['policy', 'simulator', *JUDGES.values()]
+    return Grid(f'Success rates, {task or ALL_TASKS}', head, rows)
+
+
+def _agreement(summary: Summary) -> Grid:
+    rows = []
+    for label, task in {ALL_TASKS: None, **{name: name for name in summary.tasks}}.items():
+        found = {judge: summary.agreement(judge, task) for judge in JUDGES}
+        for judge, scores in found.items():
+            rows.append([label, JUDGES[judge], *_scores(scores)])
+    return Grid(
+        'Agreement with the simulator, over the policies',
+        ['task', 'judged on', "Pearson's r", 'MMRV', 'policies'],
+        rows,
+    )
+
+
+def _scores(found: Mapping[str, Agreement]) -> list[str]:
+    cells = [
+        f'{a.value:.3f} {_interval(a.interval, 3)}' if isfinite(a.value) else 'not defined'
+        for a in found.values()
+    ]
+    return [*cells, str(next(iter(found.values())).num_policies)]
+
+
+def _powered(summary: Summary) -> Grid:
+    rows = []
+    for policy in summary.policies:
+        found, true = summary.powered(policy), summary.true_rate(policy, None)
+        rows.append(
+            [
+                policy,
+                f'{found.value:.2f} {_interval(found.interval)}',
+                f'{found.weight:.2f}',
+                f'{found.num_true} + {found.num_more}',
+                f'{true.value:.2f} of {true.count}',
+            ]
+        )
+    return Grid(
+        f'Prediction-powered success rates: {summary.num_true} true episodes of each task, and '
+        'all imagined ones (the interval is for many true ones; an abstention counts as one half)',
+        ['policy', 'estimate', 'weight of imagination', 'true + imagined', 'all true ones'],
+        rows,
+    )
+
+
+def _confusion(summary: Summary) -> Grid:
+    rows = []
+    for judge, words in JUDGES.items():
+        counts = summary.confusion(judge)
+        failures = counts['success_failure'] + counts['failure_failure']
+        share = Rate(hits=counts['success_failure'], count=failures)
+        rows.append(
+            [
+                words,
+                *(str(count) for count in counts.values()),
+                str(summary.abstained(judge).hits),
+                f'{share.value:.2f} {_interval(share.interval)}' if failures else '–',
+            ]
+        )
+    return Grid(
+        'Single rollouts: what was said, and what was true',
+        [
+            'judged on', 'success, true', 'success, false', 'failure, false', 'failure, true',
+            'abstained', 'false-success rate',
+        ],
+        rows,
+    )  # fmt: skip
+
+
+def _speed(summary: Summary) -> Grid:
+    rows = [
+        [words, f'{value:.0f}' if 'hour' in words else f'{value:.3f}']
+        for words, value in summary.speed().items()
+    ]
+    return Grid('Speed of one process, wall time, means over the rollouts', ['', ''], rows)
+
+
+def console(summary: Summary) -> str:
+    """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
+    tables = [_agreement(summary), _rates(summary, None), _powered(summary), _speed(summary)]
+    parts = [f'{found.caption}\n\n{grid(found.head, found.rows)}' for found in tables]
+    return '\n\n'.join([*parts, *remarks(summary)[2:]])
+
+
+def markdown(summary: Summary) -> str:
+    """Returns the ranking as a page of Markdown."""
+    parts = [f'# {TITLE}', *remarks(summary)]
+    for found in grids(summary):
+        parts += [f'## {found.caption}', grid(found.head, found.rows)]
+    lines = [f'- {heading}: `{value}`' for heading, value in summary.provenance.items()]
+    return '\n\n'.join([*parts, '## How this was made', '\n'.join(lines)]) + '\n'

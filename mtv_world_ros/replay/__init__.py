@@ -1,0 +1,1 @@
+"""Recorded episodes replayed through the model without ROS: MCAP to MCAP."""

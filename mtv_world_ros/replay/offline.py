@@ -1,0 +1,249 @@
+"""Offline replay: a recorded episode in, predictions out, MCAP to MCAP, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
+from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
+from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.replay.prediction_writer import ERROR, OK, PredictionWriter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayLimits:
+    """Beyond these a trajectory is rejected, as by the node.
+
+    Attributes:
+        image_age_s: age of the newest frames at the trajectory's start [s].
+        joint_state_age_s: age of the newest joint states at the trajectory's start [s].
+        view_skew_s: time between the views' frames [s].
+    """
+
+    image_age_s: float = 0.5
+    joint_state_age_s: float = 0.5
+    view_skew_s: float = 0.05
+
+
+@dataclass(slots=True, kw_only=True)
+class ReplaySummary:
+    """What a replay did.
+
+    Attributes:
+        out: folder with the predictions.
+        num_trajectories: imagined.
+        num_chunks: imagined.
+        num_frames: frames a view written.
+        model_s: time spent in the pipeline [s].
+        video_s: time the written frames cover [s].
+        probabilities: success estimate at the end of each trajectory; NaN = abstains.
+        rejected: (stamp [ns], reason) of trajectories that were not imagined.
+        warnings: what was odd about the episode.
+    """
+
+    out: Path
+    num_trajectories: int = 0
+    num_chunks: int = 0
+    num_frames: int = 0
+    model_s: float = 0.0
+    video_s: float = 0.0
+    probabilities: list[float] = field(default_factory=list)
+    rejected: list[tuple[int, str]] = field(default_factory=list)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def real_time_factor(self) -> float:
+        """Seconds of video for a second of computing; NaN before the first chunk."""
+        return self.video_s / self.model_s if self.model_s else float('nan')
+
+    def __str__(self) -> str:
+        told = ', '.join(
+            'abstains' if np.isnan(value) else f'{value:.2f}' for value in self.probabilities
+        )
+        counts = f'{self.num_trajectories} trajectories, {self.num_chunks} chunks'
+        lines = [
+            f'{counts}, {self.num_frames} frames a view -> {self.out}',
+            f'{self.model_s:.1f} s of computing, real-time factor {self.real_time_factor:.2f}',
+            f'success estimates: {told}',
+            *(f'rejected at {stamp / 1e9:.3f} s: {why}' for stamp, why in self.rejected),
+            *(f'warning: {text}' for text in self.warnings),
+        ]
+        return '\n'.join(lines)
+
+
+def replay_offline(
+    pipeline: Pipeline,
+    episode_path: Path | str,
+    out: Path | str,
+    *,
+    calibration: Path | None = None,
+    seed: int = 0,
+    num_inference_steps: int = 0,
+    limits: ReplayLimits | None = None,
+    overwrite: bool = True,
+    show_progress: bool = True,
+) -> ReplaySummary:
+    """Imagines every joint trajectory of an episode from the newest frames before it.
+
+    Frames that the next trajectory supersedes are left out. What is wrong with one trajectory
+    rejects that one alone, with its reason in the summary and in `/world_model/report`.
+
+    Args:
+        pipeline: imagines.
+        episode_path: rosbag2 folder or .mcap file, also one that was cut off.
+        out: folder for the predictions; appears only when all is written.
+        calibration: camera calibration; default: the one in the episode's folder.
+        seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
+        limits: what is too old or out of sync.
+        overwrite: replace an existing folder of predictions.
+        show_progress: draw a progress bar.
+
+    Raises:
+        EpisodeError: the episode cannot be read, or none of its trajectories can be imagined.
+        CalibrationError: a view is not calibrated.
+    """
+    spec = pipeline.spec
+    episode = read_episode(
+        episode_path, views=spec.views, calibration=calibration, with_masks=False
+    )
+    if not episode.trajectories:
+        raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
+    summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
+    starts = [stamp for stamp, _ in episode.trajectories]
+    bar = tqdm(total=len(starts), unit='trajectory', disable=not show_progress)
+    with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
+        for index, (stamp, trajectory) in enumerate(episode.trajectories):
+            until = starts[index + 1] if index + 1 < len(starts) else None
+            try:
+                observation = observe(episode, pipeline, stamp, limits or ReplayLimits())
+                shifted = _shifted(trajectory, stamp, observation.stamp_ns)
+                chunks = pipeline.imagine(
+                    observation,
+                    shifted,
+                    instruction=instruction_at(episode, stamp),
+                    seed=seed + 1000 * index,
+                    num_inference_steps=num_inference_steps,
+                )
+                _write_rollout(writer, chunks, summary, until, spec.fps)
+            except MtvWorldError as error:
+                summary.rejected.append((stamp, str(error)))
+                writer.write_report(stamp, ERROR, f'rejected: {error}', {})
+            bar.update()
+        if not summary.num_chunks:
+            raise EpisodeError(
+                f"'{episode_path}': none of its {len(starts)} trajectories can be imagined; the "
+                f'first one: {summary.rejected[0][1]}'
+            )
+    return summary
+
+
+def _write_rollout(
+    writer: PredictionWriter,
+    chunks: Iterator[Prediction],
+    summary: ReplaySummary,
+    until: int | None,
+    fps: float,
+) -> None:
+    last: Prediction | None = None
+    for chunk in chunks:
+        summary.num_chunks += 1
+        summary.model_s += sum(chunk.seconds.values())
+        count = writer.write_chunk(chunk, until)
+        summary.num_frames += count
+        summary.video_s += count / fps
+        last = chunk
+        end_ns = chunk.stamp_ns + round(float(chunk.rollout.video.times[-1]) * 1e9)
+        writer.write_report(end_ns, OK, 'imagined', _chunk_values(chunk))
+        if until is not None and end_ns >= until:
+            break
+    if last is not None:
+        summary.num_trajectories += 1
+        summary.probabilities.append(last.success.probability)
+
+
+def _chunk_values(chunk: Prediction) -> dict[str, object]:
+    return {
+        'chunk': chunk.chunk,
+        'num_chunks': chunk.num_chunks,
+        'chunk_seed': chunk.rollout.seed,
+        'observation_stamp_ns': chunk.stamp_ns,
+        'success': chunk.success.probability,
+        'success_low': chunk.success.interval[0],
+        'success_high': chunk.success.interval[1],
+        'success_reasons': chunk.success.reasons,
+        **{f'stage_s.{stage}': seconds for stage, seconds in chunk.seconds.items()},
+    }
+
+
+def observe(
+    episode: Episode, pipeline: Pipeline, stamp_ns: int, limits: ReplayLimits
+) -> Observation:
+    """Returns what was seen last before a moment.
+
+    Raises:
+        ObservationError: nothing was seen yet, too long ago, or at different times by the views.
+    """
+    views = pipeline.spec.views
+    newest = [_last_before(episode.images[view].stamps_ns, stamp_ns) for view in views]
+    for view, index in zip(views, newest, strict=True):
+        if index < 0:
+            raise ObservationError(f"view '{view}' has no frame before the trajectory starts")
+    common = min(int(episode.images[v].stamps_ns[i]) for v, i in zip(views, newest, strict=True))
+    picked = [int(np.abs(episode.images[view].stamps_ns - common).argmin()) for view in views]
+    stamps = [int(episode.images[v].stamps_ns[i]) for v, i in zip(views, picked, strict=True)]
+    _check('the newest frames are', stamp_ns - min(stamps), limits.image_age_s, 'old')
+    _check('the views are', max(stamps) - min(stamps), limits.view_skew_s, 'apart')
+    return Observation(
+        cameras=tuple(episode.cameras[view] for view in views),
+        frames=np.stack([episode.images[v].frames[i] for v, i in zip(views, picked, strict=True)]),
+        positions=_positions(episode, pipeline, stamp_ns, limits),
+        stamp_ns=min(stamps),
+    )
+
+
+def _positions(
+    episode: Episode, pipeline: Pipeline, stamp_ns: int, limits: ReplayLimits
+) -> FloatArray:
+    states = episode.joint_states
+    index = -1 if states is None else _last_before(states.stamps_ns, stamp_ns)
+    if states is None or index < 0:
+        raise ObservationError('there are no joint_states before the trajectory starts')
+    age = stamp_ns - int(states.stamps_ns[index])
+    _check('the newest joint states are', age, limits.joint_state_age_s, 'old')
+    row = JointTrajectory(
+        joint_names=states.joint_names,
+        times=np.zeros(1),
+        positions=states.positions[index][None],
+    )
+    return match_joints(row, pipeline.robot, None).positions[0]
+
+
+def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:
+    """Index of the last stamp not after a moment, -1 if there is none."""
+    return int(np.searchsorted(stamps_ns, stamp_ns, side='right')) - 1
+
+
+def _check(what: str, value_ns: int, limit_s: float, how: str) -> None:
+    if value_ns > limit_s * 1e9:
+        raise ObservationError(f'{what} {value_ns / 1e9:.3f} s {how}; allowed are {limit_s:g} s')
+
+
+def _shifted(trajectory: JointTrajectory, stamp_ns: int, observation_ns: int) -> JointTrajectory:
+    """The trajectory with times from the observation's stamp."""
+    return replace(trajectory, times=trajectory.times + (stamp_ns - observation_ns) / 1e9)
+
+
+def instruction_at(episode: Episode, stamp_ns: int) -> str:
+    """Returns the instruction that held at a moment, or the episode's."""
+    before = [text for stamp, text in episode.instructions if stamp <= stamp_ns]
+    return before[-1] if before else episode.info.instruction

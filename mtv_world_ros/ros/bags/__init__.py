@@ -1,0 +1,1 @@
+"""Bags played and recorded over the middleware."""

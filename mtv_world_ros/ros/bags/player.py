@@ -1,0 +1,262 @@
+"""Plays an episode into ROS topics at its own timing."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp, with_stamp
+from mtv_world_ros.ros.bags.timeline import in_order, Timeline
+from mtv_world_ros.ros.messages.conversions import values_of
+from mtv_world_ros.ros.messages.stamps import NANO, to_stamp
+from mtv_world_ros.ros.peers import Peers
+from mtv_world_ros.ros.run_node import run
+
+TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
+#: topics whose last message late subscribers get
+_LATCHED = ('instruction', 'tf_static', 'robot_description')
+_CLOCK_PERIOD_NS = 10_000_000
+#: connections that do not change for this long are complete [s]
+_SETTLED_S = 0.5
+ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
+
+
+class Player(Node):
+    """Publishes what an episode holds.
+
+    Args:
+        options: of the command line, see `_parse`.
+
+    Raises:
+        EpisodeError: the episode cannot be read, or holds a type that is not installed.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__('player')
+        self._options = options
+        self._reader = BagReader(options.episode)
+        types = self._reader.topics()
+        self._outputs = {
+            topic: self._offer(types[topic], topic) for topic in _chosen(types, options)
+        }
+        self._clock_output = self.create_publisher(Clock, '/clock', 10) if options.clock else None
+        self._ends: list[dict[str, str]] = []
+        if options.lock_step:
+            self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._peers = Peers(self, lambda: self._executor.spin_once(timeout_sec=0.05))
+        self._counts: Counter[str] = Counter()
+        self._first_ns = 0
+
+    def play(self) -> None:
+        """Waits for subscribers and plays, once or in a loop.
+
+        Raises:
+            ConfigError: nobody subscribes.
+        """
+        if not self._options.no_wait:
+            self._wait_for_subscribers()
+        while True:
+            self._play_once()
+            cut = [f'played up to the cut: {self._reader.truncated}']
+            for problem in (cut if self._reader.truncated else []) + self._reader.problems:
+                self.get_logger().warning(problem)
+            if not self._options.loop:
+                break
+        self._flush()
+        counted = ', '.join(f'{number} {what}' for what, number in self._counts.items())
+        self.get_logger().info(f'played {counted or "nothing"}')
+
+    def _offer(self, msgtype: str, topic: str) -> Publisher:
+        latched = topic.rsplit('/', 1)[-1] in _LATCHED
+        profile = QoSProfile(
+            depth=1 if latched else 100,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return self.create_publisher(message_class(msgtype), topic, profile)
+
+    def _wait_for_subscribers(self) -> None:
+        needed = self._options.wait_for or [
+            publisher.topic_name
+            for publisher in self._outputs.values()
+            if publisher.msg_type is message_class(TRAJECTORY)
+        ]
+        end_s = time.monotonic() + self._options.wait_timeout
+        while lonely := self._lonely(needed):
+            if time.monotonic() > end_s:
+                raise ConfigError(
+                    f'nobody subscribes to {lonely} after {self._options.wait_timeout:g} s; is '
+                    'the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
+                )
+            self._executor.spin_once(timeout_sec=0.05)
+        self._wait_until_settled(end_s)
+
+    def _lonely(self, topics: list[str]) -> list[str]:
+        """Topics without subscriber, as far as the graph, or their publisher, can tell."""
+        lonely = [topic for topic in topics if not self.count_subscribers(topic)]
+        if self._options.lock_step and not lonely:
+            node = self._options.report_topic.split('/')[-2]
+            lonely = [] if self._peers.state(node) else [f'/diagnostics of {node}']
+        return lonely or self._peers.unconnected(topics)
+
+    def _wait_until_settled(self, end_s: float) -> None:
+        """Until all subscriptions that the graph knows are connected and none changes."""
+        known, since_s = self._connections(), time.monotonic()
+        while time.monotonic() < min(since_s + _SETTLED_S, end_s):
+            self._executor.spin_once(timeout_sec=0.05)
+            now = self._connections()
+            if now != known:
+                known, since_s = now, time.monotonic()
+
+    def _connections(self) -> list[tuple[int, int]]:
+        return [
+            (publisher.get_subscription_count(), self.count_subscribers(publisher.topic_name))
+            for publisher in self._outputs.values()
+        ]
+
+    def _play_once(self) -> None:
+        timeline: Timeline | None = None
+        for message in self._messages():
+            if timeline is None:
+                timeline = Timeline(self._first_ns, time.time_ns(), self._options.rate)
+            self._wait_until_due(timeline, message.stamp_ns)
+            stamp_ns = self._publish(timeline, message)
+            if self._options.lock_step and message.msgtype == TRAJECTORY:
+                self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
+
+    def _messages(self) -> Iterator[BagMessage]:
+        """Messages from start to end; latched ones also where they lie before the start."""
+        first_ns: int | None = None
+        for message in in_order(self._reader.messages(tuple(self._outputs))):
+            if first_ns is None:
+                first_ns = message.stamp_ns
+                self._first_ns = first_ns + round(self._options.start * NANO)
+            if (message.stamp_ns - self._first_ns) / NANO > self._options.duration:
+                return
+            if message.stamp_ns >= self._first_ns or self._is_latched(message.topic):
+                yield message
+
+    def _is_latched(self, topic: str) -> bool:
+        return self._outputs[topic].qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+    def _wait_until_due(self, timeline: Timeline, bag_ns: int) -> None:
+        due_ns = timeline.due(bag_ns)
+        while (now_ns := time.time_ns()) < due_ns:
+            self._publish_clock(min(bag_ns, timeline.bag_time(now_ns)))
+            pause_ns = min(due_ns - now_ns, _CLOCK_PERIOD_NS)
+            self._executor.spin_once(timeout_sec=pause_ns / NANO)
+        self._publish_clock(max(bag_ns, timeline.bag_ns))
+
+    def _publish(self, timeline: Timeline, message: BagMessage) -> int:
+        """Publishes a message; returns the stamp it then has, 0 = none [ns]."""
+        data, stamp_ns = message.data, 0
+        if has_header(message.msgtype):
+            stamp_ns = read_stamp(data)
+            if stamp_ns and self._clock_output is None:
+                stamp_ns += timeline.due(message.stamp_ns) - message.stamp_ns
+                data = with_stamp(data, stamp_ns)
+        self._outputs[message.topic].publish(data)
+        self._counts['messages'] += 1
+        self._counts['trajectories'] += message.msgtype == TRAJECTORY
+        return stamp_ns
+
+    def _flush(self) -> None:
+        """Waits until reliable subscribers have what was published (Fast DDS: up to 3 s)."""
+        for publisher in self._outputs.values():
+            if publisher.get_subscription_count():
+                publisher.wait_for_all_acked(Duration(seconds=4))
+
+    def _publish_clock(self, bag_ns: int) -> None:
+        if self._clock_output is not None:
+            self._clock_output.publish(Clock(clock=to_stamp(bag_ns)))
+
+    def _on_report(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = values_of(status)
+            if values.get('state') in ENDS:
+                self._ends.append(values)
+
+    def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
+        """Holds the bag until the node says how the trajectory ended."""
+        begin_ns, seen = time.time_ns(), len(self._ends)
+        end_s = time.monotonic() + self._options.answer_timeout
+        answer: dict[str, str] | None = None
+        while answer is None and time.monotonic() < end_s:
+            self._publish_clock(bag_ns)
+            self._executor.spin_once(timeout_sec=0.02)
+            answer = next(
+                (e for e in self._ends[seen:] if e.get('trajectory_stamp_ns') == str(stamp_ns)),
+                None,
+            )
+        timeline.pause(time.time_ns() - begin_ns)
+        state = 'unanswered' if answer is None else answer['state']
+        self._counts[state] += 1
+        if state != 'done':
+            text = '' if answer is None else answer.get('text', '')
+            self.get_logger().warning(f'trajectory at {stamp_ns} ns: {state} {text}')
+
+
+def _chosen(types: dict[str, str], options: argparse.Namespace) -> list[str]:
+    """Topics to play."""
+    unknown = [topic for topic in options.topics if topic not in types]
+    if unknown:
+        raise EpisodeError(f"'{options.episode}' has no topics {unknown}; it has {sorted(types)}")
+    return options.topics or [t for t in types if t not in ('/clock', '/parameter_events')]
+
+
+def _rate(text: str) -> float:
+    rate = float(text)
+    if not 0 < rate <= 1000:
+        raise argparse.ArgumentTypeError(f'{text} is not in (0, 1000]')
+    return rate
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog='mtv-world replay',
+        description=__doc__,
+        epilog='Topics are renamed by --ros-args -r /joint_trajectory:=/plan',
+    )
+    add = parser.add_argument
+    add('episode', type=Path, help='rosbag2 MCAP folder or .mcap file')
+    add('--rate', type=_rate, default=1.0, help='seconds of the episode a second')
+    add('--loop', action='store_true', help='start over at the end')
+    add('--clock', action='store_true', help='publish /clock; stamps stay as recorded')
+    add('--start', type=float, default=0.0, help='skip this much [s]')
+    add('--duration', type=float, default=float('inf'), help='play this much [s]')
+    add('--topics', nargs='+', default=[], metavar='TOPIC', help='play only these')
+    add('--wait-for', nargs='+', default=[], metavar='TOPIC', help='default: the trajectory')
+    add('--wait-timeout', type=float, default=60.0, help='wait for a subscriber this long [s]')
+    add('--no-wait', action='store_true', help='play whether or not anybody listens')
+    add('--lock-step', action='store_true', help='after each trajectory wait for the answer')
+    add('--answer-timeout', type=float, default=120.0, help='wait for an answer this long [s]')
+    add('--report-topic', default='/world_model/report', help='where answers are reported')
+    return parser.parse_args(arguments)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Plays an episode; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('player', *args))
+    options = _parse(remove_ros_args(arguments)[1:])
+    return run(lambda: Player(options), arguments, spin=Player.play)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,218 @@
+"""Records ROS topics, byte for byte, as a rosbag2 MCAP folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import signal
+import sys
+import time
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
+
+from mtv_world_ros.data.bag.metadata import Qos
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp
+from mtv_world_ros.ros.run_node import run
+
+#: messages kept while the disk is busy
+_DEPTH = 2000
+#: after a stop signal, silence for this long means that everything arrived [s]
+SILENCE_S = 0.5
+LONGEST_DRAIN_S = 10.0
+#: nodes say these as long as they live
+_ENDLESS = ('/diagnostics', '/clock')
+#: topics that are not there yet are looked for this often [s]
+_LOOK_PERIOD_S = 0.05
+
+
+class Recorder(Node):
+    """Subscribes to topics as their publishers offer them and writes what comes.
+
+    Args:
+        options: of the command line, see `parse`.
+        name: of the node.
+
+    Raises:
+        EpisodeError: the folder exists already or cannot be written.
+    """
+
+    def __init__(self, options: argparse.Namespace, name: str = 'recorder') -> None:
+        super().__init__(name)
+        self._options = options
+        self._pending = [self.resolve_topic_name(topic) for topic in options.topics]
+        self._optional = [self.resolve_topic_name(topic) for topic in options.if_published]
+        self._taken: list[Subscription] = []
+        self._declared: list[tuple[str, str, Qos]] = []
+        self._next_look_s = 0.0
+        self._end_s = float('inf')
+        self._is_announced = False
+        self._counts: Counter[str] = Counter()
+        self._last_stamp_ns = 0
+        self.last_message_s = 0.0
+        self._stopping = False
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._writer = self._open()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def record(self) -> None:
+        """Records for the wanted time, or until a signal comes and what was sent has arrived.
+
+        Raises:
+            ConfigError: a topic has no publisher in time.
+        """
+        begin_s = time.monotonic()
+        while not self._stopping and time.monotonic() < self._end_s:
+            self._connect()
+            self._check_patience(time.monotonic() - begin_s)
+            self._executor.spin_once(timeout_sec=0.05)
+            self._after_spin()
+        if self._stopping:
+            self._drain()
+        if self._writer is not None:
+            self._writer.close()
+        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
+        self.get_logger().info(f"recorded '{self._options.out}': {counted or 'nothing'}")
+
+    def close(self) -> None:
+        """Drops a record that was not finished, and ends the node."""
+        if self._writer is not None:
+            self._writer.abort()
+        self.destroy_node()
+
+    def _open(self) -> BagWriter | None:
+        """What is recorded into from the start."""
+        return BagWriter(self._options.out, overwrite=self._options.overwrite)
+
+    def _after_spin(self) -> None:
+        """What is to be done now and then."""
+
+    def _on_signal(self, *_: object) -> None:
+        self._stopping = True
+
+    def _connect(self) -> None:
+        if not self._pending:
+            self._announce()
+        if time.monotonic() < self._next_look_s or not (self._pending or self._optional):
+            return
+        self._next_look_s = time.monotonic() + _LOOK_PERIOD_S
+        types = dict(self.get_topic_names_and_types())
+        for waiting in (self._pending, self._optional):
+            for topic in [t for t in waiting if t in types and self.count_publishers(t)]:
+                self._subscribe(topic, types[topic][0])
+                waiting.remove(topic)
+
+    def _announce(self) -> None:
+        """Says so, once every subscription is connected."""
+        connected = (s.get_publisher_count() for s in self._taken)
+        if not self._is_announced and all(connected):
+            self._is_announced = True
+            self._end_s = time.monotonic() + self._options.duration
+            self.get_logger().info('recording')
+
+    def _check_patience(self, waited_s: float) -> None:
+        if self._pending and waited_s > self._options.wait_timeout:
+            raise ConfigError(
+                f'nobody publishes {self._pending} after {self._options.wait_timeout:g} s; '
+                'nothing was recorded'
+            )
+
+    def _subscribe(self, topic: str, msgtype: str) -> None:
+        offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        offered = Qos(
+            reliability=reliability.name.lower(),
+            durability=durability.name.lower(),
+            depth=offers[0].depth or 10,
+        )
+        self._declared.append((topic, msgtype, offered))
+        if self._writer is not None:
+            self._writer.declare(topic, msgtype, offered)
+        taken = self.create_subscription(
+            message_class(msgtype),
+            topic,
+            self._handler(topic, msgtype),
+            QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
+            raw=True,
+        )
+        self._taken.append(taken)
+
+    def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:
+        by_header = self._options.stamp == 'header'
+
+        def write(data: bytes) -> None:
+            if self._writer is None:
+                return
+            now_ns = self.get_clock().now().nanoseconds
+            stamp_ns = now_ns
+            if by_header:
+                if has_header(msgtype):
+                    self._last_stamp_ns = read_stamp(data) or now_ns
+                stamp_ns = self._last_stamp_ns or now_ns
+            self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
+            self._counts[topic] += 1
+            if topic not in _ENDLESS:
+                self.last_message_s = time.monotonic()
+
+        return write
+
+    def _drain(self) -> None:
+        end_s = time.monotonic() + LONGEST_DRAIN_S
+        self.last_message_s = time.monotonic()
+        while time.monotonic() < min(self.last_message_s + SILENCE_S, end_s):
+            self._executor.spin_once(timeout_sec=0.05)
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog='recorder', description=__doc__)
+    add = parser.add_argument
+    add('out', type=Path, help='folder to make; it appears when the record is complete')
+    add('topics', nargs='+', metavar='TOPIC')
+    add(
+        '--if-published',
+        nargs='+',
+        default=[],
+        metavar='TOPIC',
+        help='record these too from when somebody publishes them, without waiting for it',
+    )
+    add('--overwrite', action='store_true', help='replace an existing folder')
+    add(
+        '--stamp',
+        choices=('receive', 'header'),
+        default='receive',
+        help="log time of a message: when it came, or its header's stamp (predictions then lie "
+        'at the time they are about); messages without a header take the last header seen',
+    )
+    add('--wait-timeout', type=float, default=60.0, help='wait for publishers this long [s]')
+    add('--duration', type=float, default=float('inf'), help='end after this long [s]')
+    return parser.parse_args(arguments)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Records until SIGINT or SIGTERM; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('recorder', *args))
+    options = parse(remove_ros_args(arguments)[1:])
+    return run(
+        lambda: Recorder(options),
+        arguments,
+        spin=Recorder.record,
+        signals=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == '__main__':
+    sys.exit(main())

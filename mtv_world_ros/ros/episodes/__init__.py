@@ -1,0 +1,1 @@
+"""Runs and records episodes of a policy in the world model."""

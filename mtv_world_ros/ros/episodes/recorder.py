@@ -1,0 +1,78 @@
+"""Records one bag for each episode, from `~/begin` to `~/end`, without connecting anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import sys
+import time
+
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
+
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.ros.bags.recorder import LONGEST_DRAIN_S, parse, Recorder, SILENCE_S
+from mtv_world_ros.ros.run_node import run
+
+
+class EpisodeRecorder(Recorder):
+    """Writes `<out>/episode_00000` and so on; a bag appears there when it is complete."""
+
+    def _open(self) -> BagWriter | None:
+        self._number = 0
+        self._end_before_s = float('inf')
+        self.create_service(Trigger, '~/begin', self._on_begin)
+        self.create_service(Trigger, '~/end', self._on_end)
+        return None
+
+    def _on_begin(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Begins a bag; one that is still open is closed."""
+        self._close_bag()
+        path = self._options.out / f'episode_{self._number:05d}'
+        try:
+            writer = BagWriter(path, overwrite=self._options.overwrite)
+        except MtvWorldError as error:
+            response.message = str(error)
+            return response
+        self._number += 1
+        for topic, msgtype, qos in self._declared:
+            writer.declare(topic, msgtype, qos)
+        self._writer = writer
+        response.success, response.message = True, str(path)
+        return response
+
+    def _on_end(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """The bag is closed as soon as what was sent has arrived."""
+        now_s = time.monotonic()
+        self.last_message_s, self._end_before_s = now_s, now_s + LONGEST_DRAIN_S
+        response.success = True
+        return response
+
+    def _after_spin(self) -> None:
+        now_s = time.monotonic()
+        is_ending = self._end_before_s < float('inf')
+        if is_ending and now_s > min(self.last_message_s + SILENCE_S, self._end_before_s):
+            self._close_bag()
+
+    def _close_bag(self) -> None:
+        self._end_before_s = float('inf')
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Records until SIGINT or SIGTERM; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('episode_recorder', *args))
+    options = parse(remove_ros_args(arguments)[1:])
+    return run(
+        lambda: EpisodeRecorder(options, 'episode_recorder'),
+        arguments,
+        spin=Recorder.record,
+        signals=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == '__main__':
+    sys.exit(main())

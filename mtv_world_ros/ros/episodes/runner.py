@@ -1,0 +1,288 @@
+"""Runs imagined episodes one after the other: reset, start, wait, record, whatever happens."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_srvs.srv import SetBool, Trigger
+
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.ros.episodes.recorder_process import predicted_topics, Recording
+from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded_start
+from mtv_world_ros.ros.messages.conversions import values_of
+from mtv_world_ros.ros.peers import Peers
+from mtv_world_ros.ros.policy.loop import GOOD_ENDS
+from mtv_world_ros.ros.run_node import run
+from mtv_world_ros.ros.status_publisher import StatusPublisher
+
+#: topics of what an episode starts from lie under this name, apart from a robot's own
+START = 'start'
+_PERIOD_S = 0.5
+
+
+class EpisodeRunner(Node):
+    """Runs episodes.
+
+    Args:
+        options: of the command line, see `_parse`.
+
+    Raises:
+        ConfigError: a node is missing.
+        EpisodeError: a recorded episode cannot be used.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__('episode_runner')
+        self._options = options
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._status = StatusPublisher(self)
+        self._peers = Peers(self, self._spin_once)
+        self._ended: dict[str, str] | None = None
+        self._awaited = ''
+        self._recording = Recording(options.out, self._peers)
+        self._results: list[dict[str, Any]] = []
+        policy_report = f'{options.policy_node}/report'
+        self.create_subscription(DiagnosticArray, policy_report, self._on_report, 100)
+        self._outputs = {
+            topic: self._offer(kind, topic)
+            for topic, kind in {
+                'joint_states': JointState,
+                **{f'{view}/camera_info': CameraInfo for view in options.views},
+                **{f'{view}/image_raw': Image for view in options.views},
+            }.items()
+        }
+        self._live = LiveCameras(self, options.views) if options.live else None
+        self._next_status_s = 0.0
+
+    def run_all(self) -> None:
+        """Runs the episodes and writes `episodes.json`.
+
+        Raises:
+            ConfigError: a node is missing, or died.
+        """
+        options = self._options
+        options.out.mkdir(parents=True, exist_ok=True)
+        request, timeout = SetBool.Request(data=True), options.wait_timeout
+        self._peers.call(SetBool, f'{options.world_model}/imagine', request, timeout)
+        self._wait_for(
+            lambda: self._peers.silence_s(self._name(options.policy_node)) < timeout,
+            f"the node '{options.policy_node}'",
+        )
+        self._connect()
+        for number, start in enumerate(self._starts()):
+            result = self._run_one(number, start)
+            self._results.append(result)
+            text = json.dumps(self._results, indent=2)
+            (options.out / 'episodes.json').write_text(text + '\n', encoding='utf-8')
+            said = f': {result["text"]}' if result['text'] else ''
+            self.get_logger().info(f'episode {number}: {result["how"]}{said}')
+            if result['how'].endswith('_died'):
+                raise ConfigError(f'episode {number}: {result["how"]}; see its log')
+
+    def close(self) -> None:
+        """Closes the record of a running episode, and the node."""
+        self._recording.stop()
+        self.destroy_node()
+
+    # one episode
+
+    def _run_one(self, number: int, start: EpisodeStart) -> dict[str, Any]:
+        begin_s = time.monotonic()
+        bag = self._recording.begin()
+        result: dict[str, Any] = {'episode': number, 'start': start.source, 'bag': bag}
+        begun_s = time.monotonic()
+        try:
+            seen = self._live_out(number, start)
+            result['episode_s'] = round(time.monotonic() - begun_s, 3)
+        finally:
+            self._recording.end()
+        result['total_s'] = round(time.monotonic() - begin_s, 3)
+        how = seen['how']
+        self._status.counts[f'episodes_{how}'] += 1
+        if how not in (*GOOD_ENDS, 'max_seconds'):
+            self._status.fault(how, seen.get('text', ''))
+        kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
+        return {**result, **{key: seen.get(key, '') for key in kept}}
+
+    def _live_out(self, number: int, start: EpisodeStart) -> dict[str, str]:
+        """Starts an episode and waits for its end; returns what was reported of that."""
+        options, peers = self._options, self._peers
+        common = {'seed': options.seed + 1000 * number}
+        if start.calibration_file:
+            common['calibration_file'] = start.calibration_file
+        peers.set_parameters(options.world_model, common)
+        peers.set_parameters(
+            options.policy_node,
+            {
+                **common,
+                'max_chunks': options.max_chunks,
+                'task': start.task,
+                'scene_seed': start.scene_seed,
+                'instruction': options.instruction or start.instruction,
+            },
+        )
+        self._call_trigger(f'{options.world_model}/reset')
+        # ahead of the images: nothing orders the topics, and an answer needs both
+        self._show(start, only='camera_info')
+        self._ended = None
+        self._awaited = self._call_trigger(f'{options.policy_node}/start').split()[-1]
+        self._show(start)
+        return self._wait_for_end()
+
+    def _show(self, start: EpisodeStart, only: str = '') -> None:
+        """Publishes the start once, as cameras and joints would; `only` = the end of topics."""
+        for topic, message in start.stamped(self.get_clock().now().nanoseconds):
+            if topic.endswith(only):
+                self._outputs[topic].publish(message)
+
+    def _wait_for_end(self) -> dict[str, str]:
+        options = self._options
+        end_s = time.monotonic() + options.max_seconds
+        while self._ended is None:
+            self._spin_once()
+            for name, how in (
+                (options.policy_node, 'policy_died'),
+                (options.world_model, 'world_model_died'),
+            ):
+                silence_s = self._peers.silence_s(self._name(name))
+                if silence_s > options.heartbeat_timeout:
+                    return {'how': how, 'text': f"'{name}' has been silent for {silence_s:.1f} s"}
+            if time.monotonic() > end_s:
+                self._call_trigger(f'{options.policy_node}/stop')
+                self._wait_for(lambda: self._ended is not None, 'the end of the episode')
+                return {**(self._ended or {}), 'how': 'max_seconds'}
+        return self._ended
+
+    def _dead(self) -> dict[str, str]:
+        """How the episode ends if one of its nodes has died, else nothing."""
+        options = self._options
+        nodes = {'policy_died': options.policy_node, 'world_model_died': options.world_model}
+        for how, node in nodes.items():
+            silence_s = self._peers.silence_s(self._name(node))
+            if silence_s > options.heartbeat_timeout:
+                return {'how': how, 'text': f"'{node}' has been silent for {silence_s:.1f} s"}
+        return {}
+
+    def _starts(self) -> Iterator[EpisodeStart]:
+        options = self._options
+        sources = options.episodes or ['live']
+        for number in range(options.count or len(sources)):
+            path = sources[number % len(sources)]
+            if self._live is None:
+                yield recorded_start(Path(path), options.views, options.start)
+            else:
+                yield self._live_start(self._live)
+
+    def _live_start(self, live: LiveCameras) -> EpisodeStart:
+        live.clear()
+        self._wait_for(lambda: not live.missing(), 'images, camera_infos and joint states')
+        return live.start(self._options.instruction)
+
+    def _connect(self) -> None:
+        """Starts the recorder and waits until everything that is published will reach it."""
+        options = self._options
+        shown = [output.topic_name for output in self._outputs.values()]
+        least = 2  # the world model and the policy
+        if not options.no_record:
+            predicted = predicted_topics(options.world_model, options.views)
+            others = [*shown, 'joint_trajectory', 'instruction', '/diagnostics']
+            others += [f'{node}/report' for node in (options.world_model, options.policy_node)]
+            self._recording.start([*predicted, *others])
+            self._peers.forget(self._name(options.world_model))
+            self._wait_for(lambda: self._are_recorded(predicted), 'connections to the recorder')
+            least = 3
+        outputs = self._outputs.values()
+        self._wait_for(
+            lambda: min(o.get_subscription_count() for o in outputs) >= least,
+            f'{least} subscribers of {shown}',
+        )
+
+    def _are_recorded(self, topics: Sequence[str]) -> bool:
+        is_heard = bool(self._peers.state(self._name(self._options.world_model)))
+        # the policy sees these too
+        shared = [t for t in topics if t.endswith(('/image_raw', '/joint_states'))]
+        lonely = self._peers.unconnected(topics) + self._peers.unconnected(shared, least=2)
+        return is_heard and not lonely
+
+    # plumbing
+
+    def _offer(self, kind: Any, topic: str) -> Publisher:
+        profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+        return self.create_publisher(kind, f'{START}/{topic}', profile)
+
+    def _on_report(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = values_of(status)
+            if values.get('state') == 'ended' and values.get('episode') == self._awaited:
+                self._ended = values
+
+    def _call_trigger(self, name: str) -> str:
+        answer = self._peers.call(Trigger, name, Trigger.Request())
+        if not answer.success:
+            raise ConfigError(f"'{name}': {answer.message}")
+        return answer.message
+
+    def _wait_for(self, condition: Any, what: str) -> None:
+        self._peers.wait(condition, what, self._options.wait_timeout)
+
+    def _spin_once(self) -> None:
+        self._executor.spin_once(timeout_sec=0.05)
+        if time.monotonic() > self._next_status_s:
+            self._next_status_s = time.monotonic() + _PERIOD_S
+            self._status.publish_diagnostics({'episodes': len(self._results)})
+            if self._live is not None:
+                self._live.refresh()
+
+    @staticmethod
+    def _name(node: str) -> str:
+        """Name of a node without its namespace, as diagnostics have it."""
+        return node.rsplit('/', 1)[-1]
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='episode_runner', description=__doc__)
+    add = parser.add_argument
+    add('out', type=Path, help='folder for the records and episodes.json')
+    add('--episodes', nargs='+', default=[], help='recorded episodes to start from, in turn')
+    add('--live', action='store_true', help='start from what the cameras show')
+    add('--views', nargs='+', required=True, help="the world model's")
+    add('--count', type=int, default=0, help='default: one for each recorded episode, or one')
+    add('--start', type=float, default=0.0, help='time of the recorded frame to start from [s]')
+    add('--seed', type=int, default=0, help='episode k uses seed + 1000 k')
+    add('--max-chunks', type=int, default=0, help='0 = until the policy says it is over')
+    add('--max-seconds', type=float, default=3600.0, help='of an episode, on the wall [s]')
+    add('--instruction', default='', help="default: the recorded episode's")
+    add('--no-record', action='store_true', help='no bags')
+    add('--world-model', default='/world_model', help='name of the node')
+    add('--policy-node', default='/policy', help='name of the node')
+    add('--wait-timeout', type=float, default=120.0, help='wait for nodes this long [s]')
+    add('--heartbeat-timeout', type=float, default=10.0, help='a node this silent is dead [s]')
+    options = parser.parse_args(arguments)
+    if bool(options.episodes) == options.live:
+        parser.error('give either --episodes or --live')
+    return options
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs episodes; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('episode_runner', *args))
+    options = _parse(remove_ros_args(arguments)[1:])
+    return run(lambda: EpisodeRunner(options), arguments, spin=EpisodeRunner.run_all)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

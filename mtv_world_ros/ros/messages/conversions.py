@@ -1,0 +1,151 @@
+"""Joint, instruction, estimate and diagnostic messages to and from data types."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping, Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiArrayLayout
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
+from trajectory_msgs.msg import JointTrajectoryPoint
+
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.messages.stamps import NANO, to_ns
+
+
+def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
+    """Returns the trajectory; its times count from the message's stamp.
+
+    Velocities are kept where every point has them.
+
+    Raises:
+        Rejection: empty, names repeated, points of the wrong length, NaN, times not increasing.
+    """
+    names = list(message.joint_names)
+    if not names or not message.points:
+        raise Rejection(
+            Reason.TRAJECTORY_EMPTY,
+            f'the trajectory has {len(names)} joint names and {len(message.points)} points; it '
+            'needs at least one of each',
+        )
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise Rejection(Reason.JOINT_NAMES, f'joint names {repeated} occur more than once')
+    positions = _rows(message, 'positions')
+    velocities = None
+    if all(len(point.velocities) for point in message.points):
+        velocities = _rows(message, 'velocities')
+    times = np.array([to_ns(point.time_from_start) / NANO for point in message.points])
+    with rejected_as(Reason.TRAJECTORY_TIMES):
+        return JointTrajectory(
+            joint_names=tuple(names), times=times, positions=positions, velocities=velocities
+        )
+
+
+def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
+    """Message of a trajectory whose times count from the header's stamp; inverse of the above."""
+    points = []
+    for row, seconds in enumerate(trajectory.times):
+        point = JointTrajectoryPoint(positions=array('d', trajectory.positions[row].tolist()))
+        if trajectory.velocities is not None:
+            point.velocities = array('d', trajectory.velocities[row].tolist())
+        after = point.time_from_start
+        after.sec, after.nanosec = divmod(round(float(seconds) * NANO), NANO)
+        points.append(point)
+    names = list(trajectory.joint_names)
+    return JointTrajectoryMsg(header=header, joint_names=names, points=points)
+
+
+def _rows(message: JointTrajectoryMsg, field: str) -> FloatArray:
+    """One field of all points, (T, J), checked."""
+    names = list(message.joint_names)
+    rows = [getattr(point, field) for point in message.points]
+    for index, row in enumerate(rows):
+        if len(row) != len(names):
+            raise Rejection(
+                Reason.TRAJECTORY_MALFORMED,
+                f'point {index} has {len(row)} {field} for {len(names)} joints',
+            )
+    values = np.array(rows, np.float64)
+    if not np.isfinite(values).all():
+        point, joint = np.argwhere(~np.isfinite(values))[0]
+        raise Rejection(
+            Reason.TRAJECTORY_NOT_FINITE,
+            f"joint '{names[joint]}' has {field} {values[point, joint]} at point {point}; every "
+            'value must be finite',
+        )
+    return values
+
+
+def to_positions(message: JointState) -> dict[str, float]:
+    """Returns position by joint name [rad or m].
+
+    Raises:
+        Rejection: no positions, not one a name, or not finite.
+    """
+    if not message.position or len(message.position) != len(message.name):
+        raise Rejection(
+            Reason.JOINT_STATE_INVALID,
+            f'the joint state has {len(message.name)} names and {len(message.position)} '
+            'positions; it needs one position a name',
+        )
+    positions = dict(zip(message.name, message.position, strict=True))
+    wrong = [name for name, value in positions.items() if not np.isfinite(value)]
+    if wrong:
+        raise Rejection(
+            Reason.JOINT_STATE_INVALID, f'the positions of joints {wrong} are not finite'
+        )
+    return positions
+
+
+def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) -> JointState:
+    """JointState of (J,) positions [rad or m]."""
+    return JointState(header=header, name=list(names), position=array('d', positions.tolist()))
+
+
+def to_multi_array(values: FloatArray, labels: Sequence[str]) -> Float32MultiArray:
+    """Row-major array, one label a dimension."""
+    dimensions = [
+        MultiArrayDimension(
+            label=label, size=values.shape[axis], stride=int(np.prod(values.shape[axis:]))
+        )
+        for axis, label in enumerate(labels)
+    ]
+    data = array('f', np.ravel(values).tolist())
+    return Float32MultiArray(layout=MultiArrayLayout(dim=dimensions), data=data)
+
+
+def to_text(value: object) -> str:
+    """A value as diagnostics show it: numbers short, lists joined by commas."""
+    if isinstance(value, float):
+        return f'{value:.6g}'
+    if isinstance(value, (list, tuple)):
+        return ', '.join(to_text(part) for part in value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def to_status(
+    name: str, hardware_id: str, level: bytes, message: str, values: Mapping[str, object]
+) -> DiagnosticStatus:
+    """A diagnostic status with every value as text."""
+    return DiagnosticStatus(
+        level=level,
+        name=name,
+        message=message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=to_text(value)) for key, value in values.items()],
+    )
+
+
+def to_diagnostics(header: Header, *statuses: DiagnosticStatus) -> DiagnosticArray:
+    """A diagnostic array of some statuses."""
+    return DiagnosticArray(header=header, status=list(statuses))
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """The key-value pairs of a status."""
+    return {pair.key: pair.value for pair in status.values}

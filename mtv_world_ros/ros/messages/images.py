@@ -1,0 +1,133 @@
+"""Image messages to and from arrays; every image is (H, W, 3) uint8 RGB inside the package."""
+
+from __future__ import annotations
+
+from array import array
+
+import cv2
+import numpy as np
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
+
+from mtv_world_ros.data.bag import images
+from mtv_world_ros.data_types import ByteArray, CameraModel
+from mtv_world_ros.geometry.camera import with_camera_info
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
+
+#: words in the `format` of compressed images that can be read
+_FORMATS = ('jpeg', 'jpg', 'png')
+
+
+def check(message: Image | CompressedImage) -> None:
+    """Refuses an image that cannot be read by its fields and first bytes, without decoding it.
+
+    Raises:
+        Rejection: unsupported encoding or format, wrong `step`, short data.
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    if isinstance(message, CompressedImage):
+        known = any(word in message.format.lower() for word in _FORMATS)
+        with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
+            images.check_compressed(message.format, data)
+        return
+    known = message.encoding in images.ENCODINGS
+    with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
+        images.check_raw(
+            encoding=message.encoding,
+            height=message.height,
+            width=message.width,
+            step=message.step,
+            num_bytes=len(data),
+        )
+
+
+def to_rgb(message: Image | CompressedImage) -> ByteArray:
+    """Returns (H, W, 3) uint8 RGB; padding at the rows' ends is dropped.
+
+    Raises:
+        Rejection: see `check`; or a compressed image is damaged.
+    """
+    check(message)
+    data = np.frombuffer(message.data, np.uint8)
+    with rejected_as(Reason.IMAGE_DATA):
+        if isinstance(message, CompressedImage):
+            return images.compressed_to_rgb(message.format, data)
+        return images.raw_to_rgb(
+            data,
+            encoding=message.encoding,
+            height=message.height,
+            width=message.width,
+            step=message.step,
+        )
+
+
+def _bytes(pixels: ByteArray) -> array[int]:
+    """The fastest thing rclpy takes as `data`: assigning an ndarray is a thousand times slower."""
+    data = array('B')
+    data.frombytes(np.ascontiguousarray(pixels).data)
+    return data
+
+
+def to_image(pixels: ByteArray, header: Header) -> Image:
+    """Image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
+    channels = 3 if pixels.ndim == 3 else 1
+    return Image(
+        header=header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding='rgb8' if channels == 3 else 'mono8',
+        is_bigendian=0,
+        step=pixels.shape[1] * channels,
+        data=_bytes(pixels),
+    )
+
+
+def to_compressed(rgb: ByteArray, header: Header, quality: int) -> CompressedImage:
+    """JPEG of (H, W, 3) uint8 RGB, with the `format` that image_transport writes."""
+    bgr = np.ascontiguousarray(rgb[..., ::-1])
+    _, data = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return CompressedImage(
+        header=header, format='rgb8; jpeg compressed bgr8', data=_bytes(np.asarray(data).ravel())
+    )
+
+
+def camera_from_info(calibrated: CameraModel, info: CameraInfo) -> CameraModel:
+    """Returns the camera with the intrinsics of `info` and the pose of `calibrated`.
+
+    Raises:
+        Rejection: `info` is not calibrated, or contradicts itself or the calibration.
+    """
+    with rejected_as(Reason.CAMERA_INFO_INVALID):
+        return with_camera_info(
+            calibrated,
+            width=info.width,
+            height=info.height,
+            K=np.reshape(info.k, (3, 3)),
+            distortion_model=info.distortion_model,
+            distortion=list(info.d),
+        )
+
+
+def scale_camera_info(info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:
+    """Returns `info` for the image resized to width x height: K, P and ROI rescaled, D and R kept.
+
+    As image_proc's resize node does, with the half pixel of `geometry.camera.scaled`.
+    """
+    sx, sy = width / info.width, height / info.height
+    resize = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+    scaled = CameraInfo(
+        header=header,
+        width=width,
+        height=height,
+        distortion_model=info.distortion_model,
+        d=info.d,
+        k=(resize @ np.reshape(info.k, (3, 3))).ravel(),
+        r=info.r,
+        p=(resize @ np.reshape(info.p, (3, 4))).ravel(),
+    )
+    scaled.roi.x_offset = round(info.roi.x_offset * sx)
+    scaled.roi.y_offset = round(info.roi.y_offset * sy)
+    scaled.roi.width = round(info.roi.width * sx)
+    scaled.roi.height = round(info.roi.height * sy)
+    scaled.roi.do_rectify = info.roi.do_rectify
+    return scaled

@@ -1,0 +1,278 @@
+"""An episode of a policy: observe, ask, imagine, observe what was imagined, on a strict clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+import time
+from typing import Protocol
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
+from mtv_world_ros.policies.execution import first_part
+from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.ros.bags.player import ENDS
+from mtv_world_ros.ros.messages.rejection import Rejection
+from mtv_world_ros.ros.policy.parameters import PolicySettings
+from mtv_world_ros.ros.policy.policy_thread import Actor, Answer
+from mtv_world_ros.ros.policy.predicted_frames import chunk_stamps, PredictedFrames
+
+#: ends of an episode that are no fault
+GOOD_ENDS = ('done', 'max_chunks', 'stopped')
+#: what an episode waits for, and how it ends where that does not come
+_OVERDUE = {
+    'resetting': 'late',
+    'acting': 'late',
+    'observing': 'no_observation',
+    'imagining': 'unanswered',
+    'collecting': 'frames_missing',
+}
+
+
+class Outputs(Protocol):
+    """What the loop does to the world."""
+
+    def send(self, trajectory: JointTrajectory, stamp_ns: int) -> None:
+        """Publishes an answer under the stamp of the observation that it answers."""
+        ...
+
+    def report(self, state: str, values: Mapping[str, object]) -> None:
+        """Tells of a chunk, or of the episode's begin or end."""
+        ...
+
+    def fault(self, kind: str, text: str) -> None:
+        """Counts a fault."""
+        ...
+
+    def observe(self) -> Observation:
+        """Returns a real observation.
+
+        Raises:
+            Rejection: there is none.
+        """
+        ...
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """One turn of the loop: times [s] of `time.monotonic`, and what the world model said."""
+
+    begin_s: float
+    policy_s: float = 0.0
+    sent_s: float = 0.0
+    said: Mapping[str, str] | None = None
+
+
+class PolicyLoop:
+    """Runs one episode after the other; everything happens in the caller's thread.
+
+    Args:
+        spec: of the world model.
+        joint_names: J names, in the robot's order.
+        actor: asks the policy.
+        frames: gets what the world model publishes.
+        outputs: see there.
+    """
+
+    def __init__(
+        self,
+        spec: WorldModelSpec,
+        joint_names: Sequence[str],
+        actor: Actor,
+        frames: PredictedFrames,
+        outputs: Outputs,
+    ) -> None:
+        self._joint_names = tuple(joint_names)
+        self._spec, self._actor, self._frames, self._out = spec, actor, frames, outputs
+        self.phase = 'idle'
+        self.episode = 0
+        self.num_chunks = 0
+        self._ticket = 0
+        self._sent: set[str] = set()
+        self._deadline_s = float('inf')
+        self._why_waiting = ''
+        self._observation: Observation | None = None
+
+    def start(self, make: Callable[[], Policy], settings: PolicySettings) -> None:
+        """Begins an episode; one that runs ends.
+
+        Args:
+            make: returns the policy, in the actor's thread.
+            settings: hold for the whole episode.
+        """
+        if self.phase != 'idle':
+            self.end('stopped', 'another episode begins')
+        self._settings = settings
+        self._policy: Policy | None = None
+        self.episode += 1
+        self.num_chunks = 0
+        self._observation = None
+        self._frames.clear()
+
+        def reset() -> None:
+            self._policy = make()
+            self._policy.reset(seed=settings.seed)
+
+        self._out.report('started', self._values())
+        self._ask('resetting', reset)
+
+    def end(self, how: str, text: str = '') -> None:
+        """Ends the episode, if one runs."""
+        if self.phase == 'idle':
+            return
+        if how not in GOOD_ENDS:
+            self._out.fault(how, text)
+        self.phase = 'idle'
+        self._ticket += 1  # what the policy still answers is too late
+        self._out.report('ended', {**self._values(), 'how': how, 'text': text})
+
+    def on_answers(self) -> None:
+        """Takes what the policy said."""
+        for answer in self._actor.take():
+            if answer.ticket != self._ticket:
+                self._out.fault('late_answer', 'an answer came after its episode had ended')
+            elif answer.error:
+                self.end('policy_failed', answer.error)
+            elif self.phase == 'resetting':
+                self._wait('observing', self._settings.observation_timeout_s)
+            else:
+                self._execute(answer)
+
+    def on_report(self, values: Mapping[str, str]) -> None:
+        """Takes what the world model said of a rollout."""
+        state, stamp = values.get('state', ''), values.get('trajectory_stamp_ns', '')
+        if self.phase == 'idle':
+            return
+        if stamp not in self._sent:
+            if state in ('chunk', 'done'):
+                self.end('another_policy', f'a trajectory stamped {stamp} ns was imagined')
+        elif self.phase == 'imagining' and self._is_mine(stamp):
+            if state == 'chunk':
+                self._chunk.said = values
+            elif state == 'done':
+                self._wait('collecting', self._settings.frames_timeout_s)
+                self.tick()
+            elif state in ENDS:
+                reason = values.get('reason', '')
+                self.end(state, f'{reason}: {values["text"]}' if reason else 'by somebody else')
+
+    def tick(self) -> None:
+        """Goes on where what it waits for is there; to be called now and then."""
+        if self.phase == 'observing':
+            self._observe()
+        elif self.phase == 'collecting':
+            self._collect()
+        if self.phase != 'idle' and time.monotonic() > self._deadline_s:
+            self.end(_OVERDUE[self.phase], self._why_waiting or f'while {self.phase}')
+
+    def _is_mine(self, stamp: str) -> bool:
+        return self._observation is not None and stamp == str(self._observation.stamp_ns)
+
+    def _wait(self, phase: str, seconds: float) -> None:
+        self.phase, self._why_waiting = phase, ''
+        self._deadline_s = time.monotonic() + seconds
+
+    def _ask(self, phase: str, question: Callable[[], JointTrajectory | None]) -> None:
+        self._ticket += 1
+        self._wait(phase, self._settings.answer_timeout_s)
+        self._actor.ask(self._ticket, question)
+
+    def _observe(self) -> None:
+        try:
+            observation = self._out.observe()
+        except Rejection as error:
+            self._why_waiting = f'{error.reason}: {error}'
+            return
+        if self._observation is None or observation.stamp_ns > self._observation.stamp_ns:
+            self._act(observation)
+
+    def _act(self, observation: Observation) -> None:
+        self._observation = observation
+        policy, instruction = self._policy, self._settings.instruction
+        assert policy is not None
+        self._chunk = _Chunk(time.monotonic())
+        self._ask('acting', lambda: policy.act(observation, instruction))
+
+    def _execute(self, answer: Answer) -> None:
+        assert self._observation is not None
+        if answer.trajectory is None:
+            self.end('done')
+            return
+        seconds = self._settings.execute_s or self._spec.num_frames / self._spec.fps
+        start = self._start_of(answer.trajectory, self._observation)
+        stamp_ns = self._observation.stamp_ns
+        self._chunk.policy_s = answer.seconds
+        self._chunk.sent_s = time.monotonic()
+        self._frames.clear()
+        self._sent.add(str(stamp_ns))
+        self._wait('imagining', self._settings.rollout_timeout_s)
+        self._out.send(first_part(answer.trajectory, start, seconds), stamp_ns)
+
+    def _start_of(self, trajectory: JointTrajectory, observation: Observation) -> FloatArray:
+        """Where the trajectory's joints are when it starts; those of other robots at its begin."""
+        seen = dict(zip(self._joint_names, observation.positions, strict=True))
+        named = zip(trajectory.joint_names, trajectory.positions[0], strict=True)
+        return np.array([seen.get(name, first) for name, first in named])
+
+    def _collect(self) -> None:
+        said, before = self._chunk.said, self._observation
+        assert before is not None
+        if said is None:
+            self._why_waiting = 'the rollout is done, but of its chunk there was no report'
+            return
+        num_frames = int(said['frames'])
+        # beside a real robot the world model starts from frames newer than those answered
+        is_strict = self._settings.mode == 'imagine'
+        start_ns = before.stamp_ns if is_strict else int(said['observation_stamp_ns'])
+        stamps = chunk_stamps(start_ns, num_frames, self._spec.fps)
+        missing = self._frames.missing(stamps)
+        unexpected = self._frames.unexpected(stamps)
+        if unexpected:
+            text = f'frames at {unexpected} ns, expected {stamps[0]} to {stamps[-1]} ns'
+            self.end('off_clock', text)
+            return
+        if missing:
+            self._why_waiting = f'{len(missing)} frames, the first of {missing[0]}'
+            return
+        self.num_chunks += 1
+        self._report_chunk(said, num_frames)
+        self._go_on(stamps[-1], before)
+
+    def _go_on(self, stamp_ns: int, before: Observation) -> None:
+        if 0 < self._settings.max_chunks <= self.num_chunks:
+            self.end('max_chunks')
+        elif self._settings.mode == 'observe':
+            self._wait('observing', self._settings.observation_timeout_s)
+        else:
+            self._act(self._frames.observation(stamp_ns, before))
+
+    def _report_chunk(self, said: Mapping[str, str], num_frames: int) -> None:
+        now_s, chunk = time.monotonic(), self._chunk
+        stages = {key: value for key, value in said.items() if key.startswith('stage_s.')}
+        values = {
+            **self._values(),
+            'first_stamp_ns': said['first_stamp_ns'],
+            'last_stamp_ns': said['last_stamp_ns'],
+            'frames': num_frames,
+            'loop_s': now_s - chunk.begin_s,
+            'policy_s': chunk.policy_s,
+            'rollout_s': now_s - chunk.sent_s,
+            'latency_s': said['latency_s'],
+            **stages,
+            'success': said.get('success', 'nan'),
+        }
+        self._out.report('chunk', values)
+
+    def _values(self) -> dict[str, object]:
+        settings = self._settings
+        return {
+            'episode': self.episode,
+            'num_chunks': self.num_chunks,
+            'policy': self._policy.name if self._policy is not None else settings.policy,
+            'seed': settings.seed,
+            'task': settings.task,
+            'scene_seed': settings.scene_seed,
+            'instruction': settings.instruction,
+            'mode': settings.mode,
+        }

@@ -1,0 +1,223 @@
+"""The node `policy`: lets a policy live in the world model, or beside it on the real robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+import sys
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
+
+from mtv_world_ros.assembly import PolicyMaker
+from mtv_world_ros.data_types import JointTrajectory, Observation
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of
+from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import make_header
+from mtv_world_ros.ros.parameters import declare
+from mtv_world_ros.ros.policy import parameters
+from mtv_world_ros.ros.policy.loading import load_named_policy, load_named_robot
+from mtv_world_ros.ros.policy.loop import PolicyLoop
+from mtv_world_ros.ros.policy.parameters import PolicySettings
+from mtv_world_ros.ros.policy.policy_thread import Actor
+from mtv_world_ros.ros.policy.predicted_frames import PredictedFrames
+from mtv_world_ros.ros.run_node import run
+from mtv_world_ros.ros.sensing.observations import FreshnessLimits, ObservationBuffer
+from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
+from mtv_world_ros.ros.status_publisher import StatusPublisher
+from mtv_world_ros.ros.world_model.loading import load_spec, reload_cameras
+
+Load = Callable[[PolicySettings], PolicyMaker]
+_TICK_S = 0.02
+
+
+class PolicyNode(Node):
+    """Callbacks store; the policy is asked in a thread of its own.
+
+    Args:
+        load: finds out from the parameters how the policy is made.
+
+    Raises:
+        MtvWorldError: a parameter or a file it names cannot be used.
+    """
+
+    def __init__(self, load: Load = load_named_policy) -> None:
+        super().__init__('policy')
+        declare(self, parameters.TABLE)
+        settings = parameters.read(self)
+        self._make_policy = load(settings)
+        self._spec = load_spec(settings.checkpoint)
+        joint_names = load_named_robot(settings).joint_names
+        self._status = StatusPublisher(self)
+        self._buffer = ObservationBuffer(
+            cameras=reload_cameras(settings, self._spec),
+            joint_names=joint_names,
+            width=self._spec.width,
+            height=self._spec.height,
+            limits=self._freshness,
+        )
+        frames = PredictedFrames(self._spec.views, joint_names)
+        self._actor = Actor(lambda: self._answers.trigger())
+        self._loop = PolicyLoop(self._spec, joint_names, self._actor, frames, self)
+        self._answers = self.create_guard_condition(self._guarded(self._loop.on_answers))
+        self._cameras = subscribe_observations(
+            self,
+            self._spec.views,
+            compressed=settings.compressed_input,
+            buffer=self._buffer,
+            guarded=self._guarded,
+        )
+        self._subscribe_predictions(settings.world_model, frames)
+        latched = QoSProfile(
+            depth=1,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        self._plans = self.create_publisher(JointTrajectoryMsg, 'joint_trajectory', 10)
+        self._instruction = self.create_publisher(String, 'instruction', latched)
+        self.create_service(Trigger, '~/start', self._on_start)
+        self.create_service(Trigger, '~/stop', self._on_stop)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_TICK_S, self._guarded(self._loop.tick), clock=steady)
+        self.create_timer(settings.diagnostics_period_s, self._on_period, clock=steady)
+        self.get_logger().info(f"ready: policy '{settings.policy}'")
+
+    def close(self) -> None:
+        """Ends a running episode and the node."""
+        if self.context.ok():
+            self._loop.end('stopped', 'the policy node ends')
+        self._actor.close()
+        self.destroy_node()
+
+    # what the loop does to the world
+
+    def send(self, trajectory: JointTrajectory, stamp_ns: int) -> None:
+        """Publishes an answer under the stamp of the observation that it answers."""
+        self._plans.publish(to_trajectory_message(trajectory, make_header(stamp_ns)))
+
+    def report(self, state: str, values: Mapping[str, object]) -> None:
+        """Publishes a report and counts it."""
+        kind = f'episodes_{values["how"]}' if state == 'ended' else f'{state}s'
+        self._status.counts[kind] += 1
+        self._status.report(state, values)
+
+    def fault(self, kind: str, text: str) -> None:
+        """Counts a fault and says it in `/diagnostics` at once."""
+        self._status.fault(kind, text)
+        self._publish_diagnostics()
+
+    def observe(self) -> Observation:
+        """Returns the newest real observation.
+
+        Raises:
+            Rejection: there is none.
+        """
+        if self._lonely():
+            raise Rejection(
+                Reason.WORLD_MODEL_MISSING,
+                f'nobody is connected to {self._lonely()}; is the world model running, and does '
+                "the parameter 'world_model' name it?",
+            )
+        return self._buffer.observe(self.get_clock().now().nanoseconds).observation
+
+    # what reaches it
+
+    def _subscribe_predictions(self, world_model: str, frames: PredictedFrames) -> None:
+        profile = QoSProfile(
+            depth=4 * self._spec.num_frames, reliability=ReliabilityPolicy.RELIABLE
+        )
+        topics: list[tuple[Any, str, Callable[[Any], None]]] = [
+            (Image, f'{view}/predicted/image_raw', partial(frames.add_image, view))
+            for view in self._spec.views
+        ]
+        topics += [
+            (JointState, 'predicted/joint_states', frames.add_joint_state),
+            (DiagnosticArray, 'report', self._on_report),
+        ]
+        self._predictions = [
+            self.create_subscription(
+                kind, f'{world_model}/{topic}', self._guarded(handle), profile
+            )
+            for kind, topic, handle in topics
+        ]
+
+    def _lonely(self) -> list[str]:
+        """Topics that the world model is not connected to: what goes over them is lost."""
+        lonely = [s.topic_name for s in self._predictions if not s.get_publisher_count()]
+        return lonely + ([] if self._plans.get_subscription_count() else [self._plans.topic_name])
+
+    def _on_report(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._loop.on_report(values_of(status))
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        settings = parameters.read(self)
+        try:
+            self._buffer.accept_cameras(reload_cameras(settings, self._spec))
+        except MtvWorldError as error:
+            response.message = f'not started: {error}'
+            return response
+        self._buffer.clear()
+        if settings.instruction:
+            self._instruction.publish(String(data=settings.instruction))
+        self._loop.start(partial(self._make_policy, settings.task, settings.scene_seed), settings)
+        response.success, response.message = True, f'episode {self._loop.episode}'
+        return response
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._loop.end('stopped')
+        response.success = True
+        return response
+
+    def _on_period(self) -> None:
+        for subscription in self._cameras:
+            subscription.refresh()
+        self._publish_diagnostics()
+
+    def _publish_diagnostics(self) -> None:
+        num_policies = self.count_publishers(self._plans.topic_name)
+        state = {
+            'phase': self._loop.phase,
+            'episode': self._loop.episode,
+            'num_chunks': self._loop.num_chunks,
+            'policies': num_policies,
+        }
+        others = f'{num_policies} publishers of joint trajectories, this should be the only one'
+        self._status.publish_diagnostics(state, others if num_policies > 1 else '')
+
+    def _guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
+        def callback(*arguments: Any) -> None:
+            try:
+                handle(*arguments)
+            except Rejection as error:
+                self._status.fault(error.reason, str(error))
+            except Exception as error:  # the node never dies of a message
+                if self.context.ok():
+                    self._loop.end('policy_failed', f'{type(error).__name__}: {error}')
+
+        return callback
+
+    def _freshness(self) -> FreshnessLimits:
+        settings = parameters.read(self)
+        return FreshnessLimits(
+            image_age=settings.max_image_age_s,
+            joint_state_age=settings.max_joint_state_age_s,
+            view_skew=settings.max_view_skew_s,
+        )
+
+
+def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:
+    """Runs the node; returns the exit status."""
+    return run(lambda: PolicyNode(load), args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

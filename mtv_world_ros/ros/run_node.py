@@ -1,0 +1,105 @@
+"""Runs a node until it is told to stop, and shuts down without a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import ctypes
+import os
+import signal
+import sys
+from typing import TypeVar
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.processes import PARENT_VARIABLE
+
+_PR_SET_PDEATHSIG = 1
+AnyNode = TypeVar('AnyNode', bound=Node)
+
+
+def end_with_parent() -> None:
+    """Lets this process get SIGINT when the one that started it is gone, even if it was killed.
+
+    Only where that one asks for it (`child_processes`), and only on Linux.
+    """
+    parent = os.environ.pop(PARENT_VARIABLE, '')
+    if not parent or not sys.platform.startswith('linux'):
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    if os.getppid() != int(parent):  # gone before that was said
+        sys.exit(1)
+
+
+class _Interrupt:
+    """What Python does on SIGINT, beside rclpy's own handler, which shuts ROS down.
+
+    It raises only while a node is made: that can take long, and asks nobody whether ROS is still
+    up. Afterwards the executor ends by itself, and an exception between any two lines of it
+    would leave objects half made, whose ends print tracebacks.
+    """
+
+    raises = True
+
+    def __call__(self, *_: object) -> None:
+        if self.raises:
+            raise KeyboardInterrupt
+
+
+def spin_forever(node: Node) -> None:
+    """Handles callbacks one after the other until ROS shuts down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+def run(
+    make: Callable[[], AnyNode],
+    args: Sequence[str] | None = None,
+    *,
+    spin: Callable[[AnyNode], None] = spin_forever,
+    signals: SignalHandlerOptions = SignalHandlerOptions.ALL,
+) -> int:
+    """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
+
+    Args:
+        make: makes the node; where it has `close()`, that ends it.
+        args: command line with the program's name; default: the process' own.
+        spin: what the node does.
+        signals: which signals end it; NO = it has its own handlers.
+
+    Returns:
+        The exit status: 1 after a user error, whose text goes to stderr, else 0.
+    """
+    end_with_parent()
+    interrupt = _Interrupt()
+    signal.signal(signal.SIGINT, interrupt)
+    rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
+    node: AnyNode | None = None
+    try:
+        node = make()
+        interrupt.raises = False
+        spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except MtvWorldError as error:
+        sys.stderr.write(f'{type(error).__name__}: {error}\n')
+        return 1
+    except Exception:
+        if rclpy.ok():
+            raise
+    finally:
+        _shut_down(node)
+    return 0
+
+
+def _shut_down(node: Node | None) -> None:
+    """Ends the node; a second Ctrl-C (a launcher sends one too) does not disturb it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if node is not None:
+        close = getattr(node, 'close', node.destroy_node)
+        close()
+    rclpy.try_shutdown()

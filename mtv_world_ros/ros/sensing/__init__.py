@@ -1,0 +1,1 @@
+"""Images, camera infos and joint states become observations."""

@@ -1,0 +1,250 @@
+"""The newest images, camera infos and joint states, and the observation they make up."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+
+from mtv_world_ros.data_types import CameraModel, FloatArray, Observation
+from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.history import History
+from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.ros.messages import images as image_messages
+from mtv_world_ros.ros.messages.conversions import to_positions
+from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import NANO, to_ns
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.sensing.intrinsics import Intrinsics
+
+#: images kept a view, so that views which arrive one after the other still find their partner
+_NUM_IMAGES = 3
+#: joint samples kept a joint; at 1 kHz this reaches back a quarter of a second
+_NUM_SAMPLES = 256
+_AGE_LIMITS = {
+    Reason.IMAGE_STALE: 'max_image_age_s',
+    Reason.JOINT_STATE_STALE: 'max_joint_state_age_s',
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreshnessLimits:
+    """Limits [s] beyond which no observation is made."""
+
+    image_age: float
+    joint_state_age: float
+    view_skew: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """An observation and where it came from.
+
+    Attributes:
+        observation: frames and cameras at the model's size, positions in the robot's order.
+        camera_infos: CameraInfo of each view as received, with the image's frame_id.
+        source_stamp_ns: stamp of the real frames that it goes back to [ns].
+        history: what was imagined before it; None = the frames are real.
+    """
+
+    observation: Observation
+    camera_infos: tuple[CameraInfo, ...]
+    source_stamp_ns: int
+    history: History | None = None
+
+
+class ObservationBuffer:
+    """Keeps what came in last and makes an observation of it, or says why it cannot.
+
+    Args:
+        cameras: calibrated cameras of the V views, in the model's order.
+        joint_names: J names, in the robot's order.
+        width: width of the model's frames [px].
+        height: height of the model's frames [px].
+        limits: asked at every observation, so that they may change.
+        on_image: also gets every image that is stored.
+    """
+
+    def __init__(
+        self,
+        *,
+        cameras: Sequence[CameraModel],
+        joint_names: Sequence[str],
+        width: int,
+        height: int,
+        limits: Callable[[], FreshnessLimits],
+        on_image: Callable[[str, Image | CompressedImage], None] | None = None,
+    ) -> None:
+        self._intrinsics = Intrinsics(cameras)
+        self._size = (width, height)
+        self._limits, self._on_image = limits, on_image
+        self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
+            camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
+        }
+        self._joints: dict[str, deque[tuple[int, float]]] = {
+            name: deque(maxlen=_NUM_SAMPLES) for name in joint_names
+        }
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views, in the model's order."""
+        return tuple(self._images)
+
+    def add_image(self, view: str, message: Image | CompressedImage) -> None:
+        """Stores an image.
+
+        Raises:
+            Rejection: it cannot be read.
+        """
+        image_messages.check(message)
+        self._images[view].append((to_ns(message.header.stamp), message))
+        if self._on_image is not None:
+            self._on_image(view, message)
+
+    def add_camera_info(self, view: str, message: CameraInfo) -> None:
+        """Stores the first CameraInfo of a view and watches the later ones.
+
+        Raises:
+            Rejection: it is not calibrated, or it just changed.
+        """
+        self._intrinsics.add(view, message)
+
+    def add_joint_state(self, message: JointState) -> None:
+        """Stores positions; several publishers may each give some of the joints.
+
+        Raises:
+            Rejection: no positions, not one a name, or not finite.
+        """
+        stamp_ns = to_ns(message.header.stamp)
+        for name, position in to_positions(message).items():
+            if name in self._joints:
+                self._joints[name].append((stamp_ns, position))
+
+    def clear(self) -> None:
+        """Forgets images and joint states (the clock jumped); camera infos stay."""
+        for samples in (*self._images.values(), *self._joints.values()):
+            samples.clear()
+
+    def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
+        """Takes changed camera infos as the valid ones from now on.
+
+        Args:
+            cameras: calibrated cameras of the V views.
+
+        Raises:
+            Rejection: a new one is not calibrated.
+        """
+        self._intrinsics.accept(cameras)
+
+    def ages(self, now_ns: int) -> Mapping[str, float]:
+        """Age [s] of the newest image of each view and of the oldest joint; NaN = none yet."""
+        ages = {
+            f'image_age_s.{view}': _age(images, now_ns) for view, images in self._images.items()
+        }
+        ages['joint_state_age_s'] = float(
+            np.max([_age(samples, now_ns) for samples in self._joints.values()])
+        )
+        return ages
+
+    def observe(self, now_ns: int) -> Scene:
+        """Makes an observation of the newest images that belong together.
+
+        Raises:
+            Rejection: something is missing, stale, out of sync or changed.
+        """
+        limits = self._limits()
+        images = self._pick_images(now_ns, limits)
+        stamp_ns = min(stamp for stamp, _ in images)
+        cameras, frames = [], []
+        for view, (_, message) in zip(self.views, images, strict=True):
+            frame = image_messages.to_rgb(message)
+            camera = self._intrinsics.camera(view, width=frame.shape[1], height=frame.shape[0])
+            cameras.append(scaled(camera, *self._size))
+            frames.append(resize_frames(frame[None], *self._size)[0])
+        observation = Observation(
+            cameras=tuple(cameras),
+            frames=np.stack(frames),
+            positions=self._positions(stamp_ns, now_ns, limits),
+            stamp_ns=stamp_ns,
+        )
+        infos = tuple(
+            self._intrinsics.info(view, message.header.frame_id)
+            for view, (_, message) in zip(self.views, images, strict=True)
+        )
+        return Scene(observation=observation, camera_infos=infos, source_stamp_ns=stamp_ns)
+
+    def _pick_images(
+        self, now_ns: int, limits: FreshnessLimits
+    ) -> list[tuple[int, Image | CompressedImage]]:
+        """Per view the image nearest to the newest moment that every view has seen."""
+        for view, images in self._images.items():
+            if not images:
+                raise Rejection(
+                    Reason.IMAGE_MISSING,
+                    f"no image of view '{view}' was received; is its camera running, and does "
+                    f"the parameter 'camera_topics.{view}' name it?",
+                )
+        newest = {view: images[-1][0] for view, images in self._images.items()}
+        for view, stamp in newest.items():
+            what = f"the newest image of view '{view}'"
+            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.image_age)
+        common = min(newest.values())
+        picked = [min(i, key=lambda image: abs(image[0] - common)) for i in self._images.values()]
+        stamps = [stamp for stamp, _ in picked]
+        skew = (max(stamps) - min(stamps)) / NANO
+        if skew > limits.view_skew:
+            apart = ', '.join(
+                f'{view} {(stamp - min(stamps)) / NANO:.3f} s'
+                for view, stamp in zip(self.views, stamps, strict=True)
+            )
+            raise Rejection(
+                Reason.VIEWS_OUT_OF_SYNC,
+                f'the views are {skew:.3f} s apart ({apart} after the oldest); '
+                f"'max_view_skew_s' allows {limits.view_skew:g} s",
+            )
+        return picked
+
+    def _positions(self, stamp_ns: int, now_ns: int, limits: FreshnessLimits) -> FloatArray:
+        """(J,) positions nearest in time to the images."""
+        missing = [name for name, samples in self._joints.items() if not samples]
+        if missing:
+            raise Rejection(
+                Reason.JOINT_STATE_MISSING, f'no joint state of {missing} was received'
+            )
+        for name, samples in self._joints.items():
+            what, limit = f"the newest state of joint '{name}'", limits.joint_state_age
+            _check_age(Reason.JOINT_STATE_STALE, what, samples[-1][0], now_ns, limit)
+        return np.array(
+            [
+                min(samples, key=lambda sample: abs(sample[0] - stamp_ns))[1]
+                for samples in self._joints.values()
+            ]
+        )
+
+
+def _age(samples: Sequence[tuple[int, object]], now_ns: int) -> float:
+    return (now_ns - samples[-1][0]) / NANO if samples else float('nan')
+
+
+def _check_age(reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float) -> None:
+    age = (now_ns - stamp_ns) / NANO
+    if abs(age) <= limit:
+        return
+    when = f'{age:.3f} s old' if age > 0 else f'stamped {-age:.3f} s in the future'
+    raise Rejection(
+        reason,
+        f"{what} is {when}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for recorded data at its "
+        "own time set 'use_sim_time' and play with a clock)",
+    )
+
+
+def freshness(settings: Settings) -> FreshnessLimits:
+    """What of the inputs is too old."""
+    return FreshnessLimits(
+        image_age=settings.max_image_age_s,
+        joint_state_age=settings.max_joint_state_age_s,
+        view_skew=settings.max_view_skew_s,
+    )

@@ -1,0 +1,237 @@
+"""Live fidelity: what was imagined against the real frames that arrive for the same times."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from threading import Condition, Thread
+
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Float32MultiArray
+
+from mtv_world_ros.data_types import ByteArray, ObjectMasks
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.ros.messages import images as image_messages
+from mtv_world_ros.ros.messages.conversions import to_multi_array
+from mtv_world_ros.ros.messages.rejection import Rejection
+from mtv_world_ros.ros.messages.stamps import NANO, to_ns
+from mtv_world_ros.ros.status_publisher import create_publisher
+from mtv_world_ros.ros.world_model.fidelity import compare_masks, Fidelity
+from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
+
+#: chunks that wait for their real frames; the oldest is given up for a newer one
+MAX_CHUNKS = 8
+#: images that wait to be looked at; the oldest is dropped
+MAX_WAITING = 32
+#: real frames of each view that are kept, at the model's size
+MAX_FRAMES = 256
+#: chunks whose scores are kept
+MAX_KEPT = 1000
+#: a real frame stands for an imagined one if it is at most this share of a period away
+MAX_OFFSET = 0.3
+
+
+@dataclass(slots=True)
+class Expected:
+    """A chunk and the frames of it that still may come true: those before the next plan."""
+
+    chunk: Chunk
+    stamps: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        prediction = self.chunk.prediction
+        self.stamps = [
+            prediction.stamp_ns + round(float(t) * NANO) for t in prediction.rollout.video.times
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scored:
+    """A chunk that was compared."""
+
+    chunk: Chunk
+    fidelity: Fidelity
+
+
+class LiveFidelity:
+    """Compares in a thread of its own; publishes `~/fidelity` from the executor.
+
+    Chunks of imagine mode are not compared: nobody executes them.
+
+    Args:
+        node: owner of the publisher.
+        pipeline: its segmenter finds the objects in real frames, too.
+        on_scored: called from the executor with every chunk that was compared.
+        on_error: called from the executor with what went wrong.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        pipeline: Pipeline,
+        on_scored: Callable[[Scored], None],
+        on_error: Callable[[Exception], None],
+    ) -> None:
+        self._spec, self._segmenter = pipeline.spec, pipeline.segmenter
+        self._on_scored, self._on_error = on_scored, on_error
+        self._tolerance_ns = round(MAX_OFFSET / self._spec.fps * NANO)
+        self._changed = Condition()
+        self._images: deque[tuple[str, Image | CompressedImage]] = deque(maxlen=MAX_WAITING)
+        self._expected: deque[Expected] = deque(maxlen=MAX_CHUNKS)
+        self._frames = {view: deque(maxlen=MAX_FRAMES) for view in self._spec.views}
+        self._last: tuple[int, int, ByteArray, ObjectMasks] | None = None
+        self._results: deque[Scored | Exception] = deque(maxlen=MAX_CHUNKS)
+        self._kept: deque[float] = deque(maxlen=MAX_KEPT)
+        self._num_missed, self._closing = 0, False
+        self._publisher = create_publisher(node, Float32MultiArray, '~/fidelity', 10)
+        self._done = node.create_guard_condition(self._publish)
+        self._thread = Thread(target=self._run, name='fidelity')
+
+    def replan(self, request: Request) -> Request:
+        """Returns the request; what was imagined for later than its start is not executed."""
+        starts_ns = request.stamp_ns or request.scene.observation.stamp_ns
+        with self._changed:
+            for expected in self._expected:
+                expected.stamps = [stamp for stamp in expected.stamps if stamp <= starts_ns]
+        return request
+
+    def expect(self, result: Result) -> None:
+        """Remembers a chunk until its real frames are here."""
+        if isinstance(result, Chunk) and not result.request.imagine:
+            with self._changed:
+                self._num_missed += len(self._expected) == MAX_CHUNKS
+                self._expected.append(Expected(result))
+                self._changed.notify_all()
+            # not before: a node that fails at its start would wait for the thread
+            if self._thread.ident is None:
+                self._thread.start()
+
+    def see(self, view: str, message: Image | CompressedImage) -> None:
+        """Takes a real image; it is looked at in the thread."""
+        with self._changed:
+            self._images.append((view, message))
+            self._changed.notify_all()
+
+    def reset(self) -> None:
+        """Forgets chunks and frames: reset, or the clock went back."""
+        with self._changed:
+            self._expected.clear()
+            self._images.clear()
+            for frames in self._frames.values():
+                frames.clear()
+
+    def close(self) -> None:
+        """Ends the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def values(self) -> dict[str, object]:
+        """What `/diagnostics` shows: chunks compared and not, mean J of those that are kept."""
+        kept = [value for value in self._kept if np.isfinite(value)]
+        return {
+            'fidelity_chunks': len(self._kept),
+            'fidelity_missed': self._num_missed,
+            'fidelity_jaccard': float(np.mean(kept)) if kept else float('nan'),
+        }
+
+    def _publish(self) -> None:
+        while self._results:
+            result = self._results.popleft()
+            if isinstance(result, Exception):
+                self._on_error(result)
+                continue
+            self._kept.append(result.fidelity.mean)
+            self._publisher.publish(to_multi_array(result.fidelity.jaccard, ('view', 'object')))
+            self._on_scored(result)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._images or self._due())
+                if self._closing:
+                    return
+                images = list(self._images)
+                self._images.clear()
+            try:
+                for view, message in images:
+                    self._keep(view, message)
+                while (expected := self._next_due()) is not None:
+                    self._score(expected)
+            except Exception as error:  # the node outlives whatever a segmenter raises
+                self._results.append(error)
+                self._done.trigger()
+
+    def _keep(self, view: str, message: Image | CompressedImage) -> None:
+        """Stores a real frame at the model's size; not more of them than can be told apart."""
+        stamp_ns = to_ns(message.header.stamp)
+        frames = self._frames[view]
+        if frames and stamp_ns - frames[-1][0] < self._tolerance_ns / 4:
+            return
+        try:
+            frame = image_messages.to_rgb(message)
+        except Rejection:
+            return  # counted where it came in
+        small = resize_frames(frame[None], self._spec.width, self._spec.height)[0]
+        with self._changed:
+            frames.append((stamp_ns, small))
+
+    def _due(self) -> Expected | None:
+        """A chunk whose last frame every view has passed."""
+        newest = [frames[-1][0] if frames else -1 for frames in self._frames.values()]
+        for expected in self._expected:
+            if not expected.stamps or min(newest) >= expected.stamps[-1]:
+                return expected
+        return None
+
+    def _next_due(self) -> Expected | None:
+        with self._changed:
+            expected = self._due()
+            if expected is not None:
+                self._expected.remove(expected)
+            return expected
+
+    def _score(self, expected: Expected) -> None:
+        prediction = expected.chunk.prediction
+        indices, frames = self._matched(expected.stamps)
+        if not indices or not prediction.masks.names:
+            self._num_missed += 1
+            return
+        rollout, chunk = expected.chunk.request.rollout, prediction.chunk
+        first_frames, first_masks = prediction.rollout.start_frame, prediction.start_masks
+        if self._last is not None and self._last[:2] == (rollout, chunk):
+            first_frames, first_masks = self._last[2:]
+        found = compare_masks(
+            self._segmenter,
+            prediction.masks,
+            indices,
+            frames,
+            first_frames=first_frames,
+            first_masks=first_masks,
+        )
+        ends = ObjectMasks(
+            names=found.names, masks=found.masks.masks[:, :, -1:], status=found.masks.status
+        )
+        self._last = (rollout, chunk + 1, frames[:, -1], ends)
+        self._results.append(Scored(chunk=expected.chunk, fidelity=found))
+        self._done.trigger()
+
+    def _matched(self, stamps: Sequence[int]) -> tuple[list[int], ByteArray]:
+        """Imagined frames that every view has a real one for, and those (V, N, H, W, 3)."""
+        indices, rows = [], []
+        for index, stamp in enumerate(stamps):
+            row = []
+            for frames in self._frames.values():
+                near = min(frames, key=lambda item: abs(item[0] - stamp), default=None)
+                if near is not None and abs(near[0] - stamp) <= self._tolerance_ns:
+                    row.append(near[1])
+            if len(row) == len(self._frames):
+                indices.append(index)
+                rows.append(np.stack(row))
+        return indices, np.stack(rows, axis=1) if rows else np.zeros((0, 0), np.uint8)

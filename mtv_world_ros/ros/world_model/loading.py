@@ -1,0 +1,71 @@
+"""What the parameters name: the pipeline and the calibrated cameras of its views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mtv_world_ros.assembly import (
+    checkpoint_path,
+    load_pipeline,
+)
+from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.policy.parameters import PolicySettings
+
+
+def load_named_pipeline(settings: Settings) -> Pipeline:
+    """Loads the checkpoint, on the device and for the robot and task that are set."""
+    return load_pipeline(
+        settings.checkpoint,
+        robot=settings.robot_file or None,
+        task=settings.task or None,
+        device=settings.device,
+        num_threads=settings.num_threads,
+        segmenter=settings.segmenter,
+        serving=settings.serving,
+    )
+
+
+def load_cameras(
+    settings: Settings | PolicySettings, spec: WorldModelSpec
+) -> tuple[CameraModel, ...]:
+    """Loads the calibrated camera of every view, in the model's order.
+
+    Raises:
+        CalibrationError: the file is wrong or lacks a view.
+    """
+    if settings.calibration_file:
+        path = Path(settings.calibration_file)
+    else:
+        path = share_path('config', 'cameras', f'{spec.robot}.yaml')
+    cameras = load_calibration(path)
+    missing = [view for view in spec.views if view not in cameras]
+    if missing:
+        raise CalibrationError(
+            f"'{path}' lacks the views {missing} of the checkpoint; it has {sorted(cameras)}. Add "
+            "them, or set 'calibration_file' to a file that has them"
+        )
+    return tuple(cameras[view] for view in spec.views)
+
+
+def reload_cameras(
+    settings: Settings | PolicySettings, spec: WorldModelSpec
+) -> tuple[CameraModel, ...]:
+    """The same while the node runs.
+
+    Raises:
+        Rejection: the file is wrong or lacks a view.
+    """
+    with rejected_as(Reason.CAMERA_INFO_INVALID):
+        return load_cameras(settings, spec)
+
+
+def load_spec(checkpoint: str) -> WorldModelSpec:
+    """Returns what a checkpoint takes and gives, without loading it."""
+    return spec_of(read_card(checkpoint_path(checkpoint)))

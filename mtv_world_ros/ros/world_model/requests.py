@@ -1,0 +1,93 @@
+"""Turns a trajectory message into a request for the worker, or says why it is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from trajectory_msgs.msg import JointTrajectory
+
+from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.ros.messages.conversions import to_trajectory
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.messages.stamps import to_ns
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
+from mtv_world_ros.ros.world_model.timing import from_observation, TimeLimits
+from mtv_world_ros.ros.world_model.worker import Request
+
+
+class RequestMaker:
+    """Checks trajectories and gives each what it is imagined with.
+
+    Attributes:
+        imagine: whether rollouts go on from the last predicted frames.
+        instruction: what the robot is told.
+
+    Args:
+        robot: whose joints trajectories move.
+        buffer: where real observations come from.
+        settings: the present parameters.
+        last_scene: the last predicted frames; None = there are none yet.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        buffer: ObservationBuffer,
+        settings: Callable[[], Settings],
+        last_scene: Callable[[], Scene | None],
+    ) -> None:
+        self._robot, self._buffer = robot, buffer
+        self._settings, self._last_scene = settings, last_scene
+        self._count = 0
+        self.imagine = settings().mode == 'imagine'
+        self.instruction: str | None = None
+
+    def make(self, message: JointTrajectory, now_ns: int, received_s: float) -> Request:
+        """Returns the request.
+
+        Args:
+            message: the policy's plan.
+            now_ns: the node's time [ns].
+            received_s: when it came in [s], of `time.monotonic`.
+
+        Raises:
+            Rejection: the trajectory or the present observation cannot be used.
+        """
+        settings = self._settings()
+        trajectory = to_trajectory(message)
+        with rejected_as(Reason.JOINT_NAMES):
+            trajectory = match_joints(trajectory, self._robot)
+        with rejected_as(Reason.JOINT_LIMITS):
+            check_positions(self._robot, trajectory.positions, tolerance=settings.limit_tolerance)
+        stamp_ns = to_ns(message.header.stamp)
+        limits = TimeLimits(
+            trajectory_age=settings.max_trajectory_age_s, horizon=settings.max_horizon_s
+        )
+        last = self._last_scene() if self.imagine else None
+        scene = last or self._real_scene(now_ns)
+        from_observation(trajectory, stamp_ns, scene.observation.stamp_ns, limits)
+        self._count += 1
+        return Request(
+            rollout=self._count,
+            trajectory=trajectory,
+            stamp_ns=stamp_ns,
+            scene=scene,
+            imagine=self.imagine,
+            instruction=settings.instruction if self.instruction is None else self.instruction,
+            objects=settings.objects,
+            seed=settings.seed,
+            num_seeds=settings.num_seeds,
+            num_inference_steps=settings.num_inference_steps,
+            limits=limits,
+            received_s=received_s,
+            limit_tolerance=settings.limit_tolerance,
+        )
+
+    def _real_scene(self, now_ns: int) -> Scene:
+        if now_ns == 0:
+            raise Rejection(
+                Reason.NO_CLOCK, "'use_sim_time' is set but nothing was received on /clock"
+            )
+        return self._buffer.observe(now_ns)

@@ -1,0 +1,1 @@
+"""Records datasets of simulated episodes."""

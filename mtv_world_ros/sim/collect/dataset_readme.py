@@ -1,0 +1,281 @@
+"""The card of a data set as text: README.md, from its card and from a written episode."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode import METADATA_NAME
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.sim.collect.contact_sheet import SHEET_FILE
+from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, ZERO_SHOT_SET
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+from mtv_world_ros.sim.collect.files import write_file
+from mtv_world_ros.sim.tasks.tasks import TASKS
+
+README_FILE = 'README.md'
+KEYS = {
+    'task': 'name of the task',
+    'instruction': 'what the robot is told, also on `/instruction`',
+    'objects': 'JSON list of names; masks number them from 1',
+    'outcome': '`success`: the predicate held at some frame and in the last five; else `failure`',
+    'ever': 'the predicate held at some frame',
+    'final': 'it held in each of the last five frames',
+    'seed': 'of the episode; it alone reproduces the scene and the motion',
+    'attempt': 'seeds dropped before this one',
+    'index': 'number within the task',
+    'policy': 'what acted in place of the expert',
+    'robot': 'name of the robot, `config/robots/`',
+    'zero_shot': '`view`, `task` or `object`: what no training or test episode shows',
+}
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join('| ' + ' | '.join(map(str, line)) + ' |' for line in lines)
+
+
+def _number(count: int, noun: str) -> str:
+    return f'{count} {noun}{"" if count == 1 else "s"}'
+
+
+def _counts(
+    first: str, groups: Mapping[str, Mapping[str, Any]], *, is_filtered: bool = True
+) -> str:
+    head = (first, 'episodes', 'success', 'failure', 'expert success before filtering', 'length')
+    rows = []
+    for name, counts in groups.items():
+        rate, attempts = counts['expert_success_rate'], counts['success_attempts']
+        rows.append(
+            (
+                name, counts['episodes'], counts['success'], counts['failure'],
+                '-' if rate is None or not is_filtered else f'{100 * rate:.0f} % of {attempts}',
+                f'{counts["mean_duration_s"]:.1f} s, {counts["mean_frames"]:.0f} frames',
+            )
+        )  # fmt: skip
+    return _table(head, rows)
+
+
+def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[str]:
+    """Returns the commands that make the data set again; several where tasks differ in number."""
+    size = card['config']['randomization']
+    plain = CollectConfig().randomization
+    options = ''.join(
+        f' --{side} {size[side]}'
+        for side in ('width', 'height')
+        if size[side] != getattr(plain, side)
+    )
+    if share := card['config']['moved_share']:
+        options += f' --moved-cameras {share}'
+    if policies := card['config']['policies']:
+        options += f' --policies {",".join(policies)}'
+    end = f'--seed {card["seed"]}{options} --out DIR'
+    if card['kind'] == ZERO_SHOT_SET:
+        return [f'mtv-world collect --zero-shot {kinds} --episodes {number} {end}'
+                for kinds, number in _zero_shot_numbers(card['zero_shot'])]  # fmt: skip
+    numbers: dict[int, list[str]] = {}
+    for task in card['tasks']:
+        highest = max(entry.index for entry in entries if entry.task == task)
+        numbers.setdefault(highest + 1, []).append(task)
+    ordinary = {name for name, task in TASKS.items() if not task.zero_shot}
+    return [
+        f'mtv-world collect --task {"all" if set(names) == ordinary else ",".join(names)} '
+        f'--episodes {number} {end}'
+        for number, names in numbers.items()
+    ]
+
+
+def _zero_shot_numbers(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, int]]:
+    """One command where the kinds took turns, else one for each kind."""
+    kinds = sorted(groups, key=lambda kind: -groups[kind]['episodes'])
+    numbers = [groups[kind]['episodes'] for kind in kinds]
+    if max(numbers) - min(numbers) <= 1:
+        return [(','.join(kinds), sum(numbers))]
+    return list(zip(kinds, numbers, strict=True))
+
+
+def _other_configuration(config: Mapping[str, Any]) -> str:
+    """A line where a command alone does not make the set again."""
+    usual = json.loads(json.dumps(asdict(CollectConfig())))
+    for side in ('width', 'height'):
+        usual['randomization'][side] = config['randomization'][side]
+    for key in ('moved_share', 'policies'):
+        usual[key] = config[key]
+    if config == usual:
+        return ''
+    return (
+        '\nThe set was made from Python (`mtv_world_ros.sim.collect`) with a configuration of its '
+        'own: `config` in `dataset.json`.\n'
+    )
+
+
+def _cameras(cameras: Mapping[str, CameraModel], config: Mapping[str, Any]) -> str:
+    rows = []
+    for view, camera in cameras.items():
+        place = ', '.join(f'{value:.2f}' for value in camera.T_mount_camera[:3, 3])
+        ahead = camera.T_mount_camera[:3, 2]
+        down = np.rad2deg(np.arcsin(-ahead[2]))
+        rows.append(
+            (view, f'{camera.width} x {camera.height} px', f'{camera.K[0, 0]:.0f} px',
+             f'({place}) m', f'{down:.0f} deg')
+        )  # fmt: skip
+    jitter, share = config['randomization']['jitter'], config['moved_share']
+    moved = (
+        f' In {100 * share:.0f} % of the episodes all cameras stand elsewhere.' if share else ''
+    )
+    return (
+        _table(('view', 'image', 'focal length', 'position', 'looking down'), rows)
+        + f'\n\nOf the first episode; every episode moves target (+-{jitter["target_m"]} m), '
+        f'distance (+-{jitter["distance_m"]} m) and angles (+-{jitter["angle_deg"]} deg). Exact '
+        "intrinsics are on `camera_info`, poses in each episode's `calibration.yaml`." + moved
+    )
+
+
+def _topics(path: Path) -> tuple[str, dict[str, str]]:
+    """Topics of a written episode, and its metadata record."""
+    bag = BagReader(path)
+    found = Counter((message.topic, message.msgtype) for message in bag.messages())
+    rows = [(f'`{topic}`', f'`{kind}`', count) for (topic, kind), count in sorted(found.items())]
+    return _table(('topic', 'type', 'messages'), rows), bag.metadata[METADATA_NAME]
+
+
+def _objects(entries: Iterable[EpisodeEntry]) -> str:
+    """Nouns and colours of all objects, by how often they occur."""
+    nouns: Counter[str] = Counter()
+    colours: dict[str, set[str]] = {}
+    for entry in entries:
+        for name in entry.objects:
+            colour, _, noun = name.partition(' ')
+            nouns[noun] += 1
+            colours.setdefault(noun, set()).add(colour)
+    # by number, then by name: episodes may have been finished in any order
+    listed = sorted(nouns.items(), key=lambda item: (-item[1], item[0]))
+    rows = [(noun, count, ', '.join(sorted(colours[noun]))) for noun, count in listed]
+    return _table(('object', 'times', 'colours'), rows)
+
+
+def _splits(card: Mapping[str, Any]) -> str:
+    if card['kind'] == ZERO_SHOT_SET:
+        return (
+            'All episodes are for testing (`test`).\n\n'
+            + _counts('zero-shot set', card['zero_shot'])
+            + '\n\n`view`: the tasks from new camera positions and orientations; `task`: an '
+            'unseen task, random pick-and-place; `object`: half of the movable objects are of '
+            'shapes that no task uses.'
+        )
+    train, test = (len(card['splits'][split]) for split in ('train', 'test'))
+    return (
+        f'{train} train, {test} test: by the parity of the index within the task, so 5:5'
+        f'{_misses(card)}. Zero-shot sets are made on their own '
+        '(`mtv-world collect --zero-shot view,task,object`).'
+    )
+
+
+def _misses(card: Mapping[str, Any]) -> str:
+    return '' if card['config']['policies'] else '; two misses in ten, one of either parity'
+
+
+def _who(card: Mapping[str, Any]) -> str:
+    policies = card['config']['policies']
+    if not policies:
+        return 'a scripted expert'
+    return f'scripted policies that take turns: {", ".join(f"`{name}`" for name in policies)}'
+
+
+def _how(card: Mapping[str, Any]) -> str:
+    if card['config']['policies']:
+        return 'their faults were too large'
+    return 'a grasp misses and the motion goes on'
+
+
+def _filtering(card: Mapping[str, Any]) -> str:
+    if card['config']['policies']:
+        return (
+            'Whatever comes of it is kept; a scene that cannot be built, or in which the policy '
+            'finds no plan, is dropped and the next seed is tried.'
+        )
+    return (
+        "An expert's attempt that fails is dropped and the next seed is tried, scenes that cannot "
+        'be built\nincluded; "before filtering" is the share of attempts that succeeded, of the '
+        'episodes that were to\nsucceed.'
+    )
+
+
+def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> str:
+    """Returns the text of the card.
+
+    Args:
+        out: folder of the data set.
+        card: see `card_of`.
+        entries: its episodes, at least one.
+    """
+    first = out / min(entry.name for entry in entries)
+    topics, metadata = _topics(first)
+    what = 'Zero-shot set' if card['kind'] == ZERO_SHOT_SET else 'Simulated benchmark'
+    outcomes = Counter(entry.outcome for entry in entries)
+    keys = _table(
+        ('key', 'meaning', 'first episode'),
+        [(f'`{key}`', KEYS.get(key, ''), f'`{text}`') for key, text in metadata.items()],
+    )
+    again = '\n'.join(commands(card, entries))
+    size = f'{_number(len(entries), "episode")} of {_number(len(card["tasks"]), "task")}'
+    return f"""# {what}: {size}
+
+Two YAM arms in MuJoCo and {_who(card)}. {_number(outcomes['success'], 'episode')} with
+success; in the other {outcomes['failure']} {_how(card)}. Each episode
+is a rosbag2 MCAP folder like a robot's recording; `dataset.json` says the same, and more, as data.
+
+![a success and a failure of every task]({SHEET_FILE})
+
+## Make it again
+
+```
+{again}
+```
+
+The same command gives the same episodes, whatever `--workers` is; an interrupted one goes on
+where it stopped.
+{_other_configuration(card['config'])}
+## Tasks
+
+{_counts('task', card['tasks'], is_filtered=not card['config']['policies'])}
+
+{_filtering(card)}
+
+## Splits
+
+{_splits(card)}
+
+## Cameras
+
+{_cameras(read_episode(first, with_masks=False).cameras, card['config'])}
+
+## Objects
+
+{_objects(entries)}
+
+## Topics
+
+Of `{first.name}`; log times are the headers' stamps.
+
+{topics}
+
+## Metadata
+
+MCAP metadata record `{METADATA_NAME}`, also `custom_data` in `metadata.yaml`:
+
+{keys}
+"""
+
+
+def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> None:
+    """Writes `README.md`, whole or not at all."""
+    write_file(out / README_FILE, readme(out, card, entries).encode())

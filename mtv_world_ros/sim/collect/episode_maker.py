@@ -1,0 +1,156 @@
+"""Makes one episode of a data set after the other: attempts until one is as wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import time
+
+import numpy as np
+
+from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.sim.collect.files import GO_ON
+from mtv_world_ros.sim.collect.jobs import episode_seed, Job
+from mtv_world_ros.sim.collect.record import RecordConfig, simulate, Take, write_take
+from mtv_world_ros.sim.expert.expert import Expert, ExpertConfig
+from mtv_world_ros.sim.expert.faults import draw_variant, parse_variant, PolicyVariant
+from mtv_world_ros.sim.tasks.tasks import task_named
+from mtv_world_ros.sim.world.cameras import CameraMoves, TRAINING_MOVES
+from mtv_world_ros.sim.world.randomize import RandomizationConfig
+from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.sim.world.zero_shot import variant, with_moved_cameras
+
+ROBOT_FILE = ('config', 'robots', 'yam_bimanual.yaml')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollectConfig:
+    """What is randomised, how the expert moves, how episodes are sampled.
+
+    Attributes:
+        randomization: objects, light, cameras and their jitter.
+        expert: heights, speeds and timing.
+        record: sampling and noise.
+        zero_shot: where the cameras of zero-shot views stand.
+        moved_share: share of ordinary episodes whose cameras stand elsewhere too.
+        moves: ranges that such an episode chooses from; they leave zero-shot views unseen.
+        policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
+            whose grasps miss.
+        kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
+    """
+
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    zero_shot: CameraMoves = CameraMoves()
+    moved_share: float = 0.0
+    moves: tuple[CameraMoves, ...] = TRAINING_MOVES
+    policies: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.moved_share <= 1:
+            raise SimulatorError(
+                f'the share of episodes with moved cameras is {self.moved_share}; it must be in '
+                '[0, 1]; set --moved-cameras'
+            )
+        for name in self.policies:
+            parse_variant(name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spent:
+    """CPU time that one episode took, dropped attempts included [s], and its frames."""
+
+    physics_s: float
+    rendering_s: float
+    writing_s: float
+    num_frames: int
+
+
+class EpisodeMaker:
+    """Makes episodes one after the other in one process."""
+
+    def __init__(self, config: CollectConfig) -> None:
+        self._robot = load_robot(share_path(*ROBOT_FILE))
+        self._config = config
+        self._expert = Expert(self._robot, config.expert)
+
+    def make(self, job: Job) -> Spent:
+        """Simulates attempts until one is as wanted, and writes it.
+
+        Raises:
+            SimulatorError: none of `max_attempts` seeds gave the wanted outcome, or the episode
+                cannot be written.
+        """
+        physics = rendering = 0.0
+        for attempt in range(self._config.record.max_attempts):
+            seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
+            sim, take = self._attempt(job, seed)
+            try:
+                if take is None:
+                    continue
+                physics, rendering = physics + take.physics_s, rendering + take.rendering_s
+                if take.is_as_wanted():
+                    writing = self._write(job, sim, take, seed, attempt)
+                    return Spent(
+                        physics_s=physics,
+                        rendering_s=rendering,
+                        writing_s=writing,
+                        num_frames=len(take.observations),
+                    )
+            finally:
+                sim.close()
+        raise SimulatorError(
+            f"episode {job.index} of task '{job.task}' (seed {job.seed}) was "
+            f'{"no clean miss" if job.miss else "no success"} in '
+            f'{self._config.record.max_attempts} attempts; see sim/expert/expert.py'
+        )
+
+    def _attempt(self, job: Job, seed: int) -> tuple[SimEpisode, Take | None]:
+        """The episode of a seed; no take where its scene or plan is impossible."""
+        config = self._config
+        task, randomization = variant(
+            job.zero_shot, task_named(job.task), seed, config.randomization, config.zero_shot
+        )
+        if job.zero_shot is None:
+            randomization = cameras_of(seed, config)
+        sim = SimEpisode(self._robot, self._expert.home, randomization)
+        faulty = self._policy(job, seed)
+        try:
+            return sim, simulate(
+                sim, self._expert, task, seed, config.record, miss=job.miss, variant=faulty
+            )
+        except (SimulatorError, PolicyError):
+            return sim, None
+
+    def _policy(self, job: Job, seed: int) -> PolicyVariant | None:
+        """What acts in place of the expert."""
+        if self._config.kinds:
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+            return draw_variant(self._config.kinds, rng)
+        return parse_variant(job.policy) if job.policy else None
+
+    def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
+        started = time.process_time()
+        extra = {'attempt': str(attempt), 'index': str(job.index)}
+        if job.zero_shot is not None:
+            extra['zero_shot'] = job.zero_shot
+        policy = self._policy(job, seed)
+        if policy is not None:
+            extra['policy'] = policy.name
+        try:
+            write_take(job.path, sim, take, seed, self._config.record, **extra)
+        except (OSError, EpisodeError) as error:
+            raise SimulatorError(f"cannot write '{job.path}': {error}; {GO_ON}") from error
+        return time.process_time() - started
+
+
+def cameras_of(seed: int, config: CollectConfig) -> RandomizationConfig:
+    """Returns the randomisation of an ordinary episode; some have their cameras moved."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
+    if rng.uniform() >= config.moved_share:
+        return config.randomization
+    moves = config.moves[rng.integers(len(config.moves))]
+    return with_moved_cameras(config.randomization, moves, rng)

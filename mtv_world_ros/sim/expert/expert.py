@@ -1,0 +1,287 @@
+"""The scripted expert: top-down pick and place as one joint trajectory, and misses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.sim.expert.kinematics import ArmSolver, top_down
+from mtv_world_ros.sim.expert.picking import (
+    miss_shift,
+    Pick,
+    pick_of,
+    PickingConfig,
+    tool_offset,
+    tool_yaw,
+)
+from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
+from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
+from mtv_world_ros.sim.world.placement import arm_of
+from mtv_world_ros.sim.world.scene import Place, Scene, SceneObject
+
+#: the tools' rest poses in the base frame [m], pointing down, in view of both cameras
+HOME_TOOL = {'left': (-0.2, 0.17, 0.13), 'right': (0.2, 0.17, 0.13)}
+_HOME_SEED = np.array([0.0, 1.5, 1.5, -1.4, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpertConfig:
+    """Heights, speeds and timing of the expert.
+
+    Attributes:
+        rate_hz: samples of the trajectory per second.
+        above_grasp: height of the pre-grasp over the grasp, range [m].
+        lift: height of the lift, range [m].
+        above_place: height of the pre-place over the place [m].
+        above_drop: the same over a container, where it is let go higher up [m].
+        drop: height of the lowest point over a container's wall, where it is let go [m].
+        retreat: rise after opening [m].
+        close_s: time to close the gripper.
+        open_s: time to open it.
+        swing_s: time of one swing of a shake.
+        speed: mean speed of the tool between way points [m/s], before scaling.
+        least_s: shortest move between way points, before scaling.
+        motion_s: time from first to last motion of a task of one move, range; scaled to it.
+        motions_s: the same for each move of a task of several.
+        overlap_s: how long before a move ends the other arm may start its own.
+        picking: gaps between fingers and objects.
+    """
+
+    rate_hz: float = 50.0
+    above_grasp: tuple[float, float] = (0.09, 0.10)
+    lift: tuple[float, float] = (0.07, 0.10)
+    above_place: float = 0.05
+    above_drop: float = 0.025
+    drop: float = 0.008
+    retreat: float = 0.07
+    close_s: float = 0.4
+    open_s: float = 0.3
+    swing_s: float = 0.45
+    speed: float = 0.22
+    least_s: float = 0.4
+    motion_s: tuple[float, float] = (6.0, 6.5)
+    motions_s: tuple[float, float] = (4.8, 5.2)
+    overlap_s: float = 2.2
+    picking: PickingConfig = PickingConfig()
+
+
+def home_positions(robot: RobotModel) -> FloatArray:
+    """Returns the joint positions (J,) of both arms at rest, grippers open."""
+    positions = np.zeros(len(robot.joint_names))
+    for tool in robot.tools:
+        solver = ArmSolver(robot, tool)
+        pose = top_down(np.asarray(HOME_TOOL[tool.arm]), 0.0)
+        positions[solver.indices] = solver.solve(pose, _HOME_SEED)
+        if tool.gripper_joint is not None:
+            positions[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
+    return positions
+
+
+def _rise(height: float) -> FloatArray:
+    return np.array([0.0, 0.0, height])
+
+
+def _missed_move(task: Task, rng: np.random.Generator) -> int:
+    return int(rng.integers(len(task.moves)))
+
+
+class Expert:
+    """Plans a task's moves for a scene, from the objects' true start poses."""
+
+    def __init__(self, robot: RobotModel, config: ExpertConfig | None = None) -> None:
+        self.robot = robot
+        self.home = home_positions(robot)
+        self._config = config or ExpertConfig()
+        self._solvers = {tool.arm: ArmSolver(robot, tool) for tool in robot.tools}
+        self._tools = {tool.arm: tool for tool in robot.tools}
+        self._max_gap = {
+            tool.arm: abs(tool.gripper_open - tool.gripper_closed) for tool in robot.tools
+        }
+
+    def plan(
+        self,
+        task: Task,
+        scene: Scene,
+        rng: np.random.Generator,
+        *,
+        miss: bool,
+        faults: WayPointFaults | None = None,
+    ) -> JointTrajectory:
+        """Returns the trajectory (T, J) with velocities that carries out the task's moves.
+
+        Two moves of different arms overlap: one arm reaches out while the other goes home.
+
+        Args:
+            task: what to do.
+            scene: where everything is at the start, and the goals.
+            rng: draws heights, tempo and the size of a miss.
+            miss: displace one grasp so that the gripper closes on nothing.
+            faults: what goes wrong with the way points of one move.
+
+        Raises:
+            SimulatorError: a way point is out of the arm's reach.
+        """
+        now = {item.role: item for item in scene.objects}
+        missed = _missed_move(task, rng) if miss else None
+        rate = self._config.rate_hz
+        positions, busy, last_arm = self.home[None], 1, ''
+        for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
+            pick = self._pick(now, move, rng, miss=number == missed)
+            stops = self._stops(pick, move, now, goal, rng)
+            if faults is not None and number == faults.move_of(len(task.moves)):
+                stops = faults.applied(stops, pick.yaw)
+            rows = self._follow(pick.arm, stops, rng, alone=len(task.moves) == 1)
+            overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
+            start = max(1, busy - overlap)
+            busy, last_arm = start + len(rows), pick.arm
+            positions = self._lay(positions, rows, start, pick.arm)
+            now[move.subject] = replace(now[move.subject], position=goal)
+        return JointTrajectory(
+            joint_names=self.robot.joint_names,
+            times=np.arange(len(positions)) / rate,
+            positions=positions,
+            velocities=np.gradient(positions, 1 / rate, axis=0),
+        )
+
+    @staticmethod
+    def missed_object(task: Task, rng: np.random.Generator) -> str:
+        """Returns the role that `plan` with the same generator misses."""
+        return task.moves[_missed_move(task, rng)].subject
+
+    def _lay(self, whole: FloatArray, rows: FloatArray, start: int, arm: str) -> FloatArray:
+        """Puts one arm's rows into the whole plan from `start` on; both arms rest at home."""
+        num = max(len(whole), start + len(rows))
+        longer = np.concatenate([whole, np.repeat(self.home[None], num - len(whole), axis=0)])
+        columns = self._columns(arm)
+        longer[start : start + len(rows), columns] = rows[:, columns]
+        return longer
+
+    def _columns(self, arm: str) -> list[int]:
+        gripper = self._tools[arm].gripper_joint
+        more = [] if gripper is None else [self.robot.joint_names.index(gripper)]
+        return [*self._solvers[arm].indices, *more]
+
+    def _pick(
+        self, now: dict[str, SceneObject], move: Move, rng: np.random.Generator, *, miss: bool
+    ) -> Pick:
+        subject, config = now[move.subject], self._config.picking
+        gap = self._max_gap[arm_of(subject)]
+        pick = pick_of(subject, gap, config)
+        if not miss:
+            return pick
+        others = [item for item in now.values() if item is not subject]
+        shift = miss_shift(subject, others, gap, config, rng)
+        return replace(pick, position=pick.position + shift)
+
+    def _stops(
+        self,
+        pick: Pick,
+        move: Move,
+        now: dict[str, SceneObject],
+        goal: Place,
+        rng: np.random.Generator,
+    ) -> list[WayPoint]:
+        config, place, yaw, wide = self._config, pick.position, pick.yaw, pick.opening
+        heights = config.lift if isinstance(move, PickPlace) else move.lift
+        above, lift = (_rise(rng.uniform(*r)) for r in (config.above_grasp, heights))
+        start = [
+            WayPoint('above', place + above, yaw, wide),
+            WayPoint('grasp', place, yaw, wide),
+            WayPoint('close', place, yaw, 0.0, config.close_s),
+        ]
+        if isinstance(move, Shake):
+            middle = self._swings(move, pick, place + lift)
+            down, turned = place + _rise(0.002), yaw
+        else:
+            down, turned = self._place(pick, move, now, goal)
+            pre_place = down + _rise(
+                config.above_place if move.rest != 'in' else config.above_drop
+            )
+            lifted = np.array([*place[:2], max(place[2] + lift[2], pre_place[2])])
+            middle = [
+                WayPoint('lift', lifted, yaw, 0.0),
+                WayPoint('carry', pre_place, turned, 0.0),
+            ]
+        home = np.asarray(HOME_TOOL[pick.arm])
+        return [
+            *start,
+            *middle,
+            WayPoint('lower', down, turned, 0.0),
+            WayPoint('open', down, turned, pick.released, config.open_s),
+            WayPoint('retreat', down + _rise(config.retreat), turned, 1.0),
+            WayPoint('home', home, 0.0, 1.0),
+        ]
+
+    def _swings(self, move: Shake, pick: Pick, lifted: FloatArray) -> list[WayPoint]:
+        inwards = 1.0 if pick.arm == 'left' else -1.0
+        upright = WayPoint('lift', lifted, pick.yaw, 0.0)
+        swings = [
+            replace(
+                upright,
+                phase='carry',
+                lean=inwards * move.lean[k % 2],
+                seconds=self._config.swing_s,
+            )
+            for k in range(move.num_swings)
+        ]
+        return [upright, *swings, replace(upright, phase='carry')]
+
+    def _place(
+        self, pick: Pick, move: PickPlace, now: dict[str, SceneObject], goal: Place
+    ) -> tuple[FloatArray, float]:
+        """Tool position and yaw at which the subject is let go."""
+        subject, turned, rest = now[move.subject], pick.yaw, np.asarray(goal)
+        if move.rest != 'table':
+            reference = now[move.reference]
+            turned = tool_yaw(reference)
+            if move.rest == 'in':
+                top = reference.position[2] + reference.size[2] / 2
+                rest = np.array([*goal[:2], top + self._config.drop + subject.size[2] / 2])
+        return rest + tool_offset(subject, turned) + _rise(0.002), turned
+
+    def _timed(self, stops: list[WayPoint], home: FloatArray) -> list[float]:
+        """Time of each segment before scaling [s]."""
+        seconds, before = [], home
+        for point in stops:
+            travel = float(np.linalg.norm(point.position - before))
+            seconds.append(point.seconds or max(travel / self._config.speed, self._config.least_s))
+            before = point.position
+        return seconds
+
+    def _follow(
+        self, arm: str, stops: list[WayPoint], rng: np.random.Generator, *, alone: bool
+    ) -> FloatArray:
+        """Minimum-jerk blends between way points, scaled to the drawn motion time."""
+        config = self._config
+        home = WayPoint('home', np.asarray(HOME_TOOL[arm]), 0.0, 1.0)
+        seconds = self._timed(stops, home.position)
+        wanted = rng.uniform(*(config.motion_s if alone else config.motions_s))
+        ends = np.cumsum([0.0, *seconds]) * wanted / sum(seconds)
+        points, solver = [home, *stops], self._solvers[arm]
+        rows, joints = [], self.home[solver.indices]
+        for time in np.arange(1, round(ends[-1] * config.rate_hz) + 1) / config.rate_hz:
+            k = min(int(np.searchsorted(ends[1:], time)), len(points) - 2)
+            share = np.clip((time - ends[k]) / (ends[k + 1] - ends[k]), 0.0, 1.0)
+            blend = share**3 * (10 - 15 * share + 6 * share**2)
+            a, b = points[k], points[k + 1]
+            pose = top_down(
+                a.position + blend * (b.position - a.position),
+                a.yaw + blend * (b.yaw - a.yaw),
+                a.lean + blend * (b.lean - a.lean),
+            )
+            joints = solver.solve(pose, joints)
+            row = self.home.copy()
+            row[solver.indices] = joints
+            self._set_gripper(row, arm, a.opening + blend * (b.opening - a.opening))
+            rows.append(row)
+        return np.asarray(rows)
+
+    def _set_gripper(self, row: FloatArray, arm: str, opening: float) -> None:
+        tool = self._tools[arm]
+        if tool.gripper_joint is not None:
+            row[self.robot.joint_names.index(tool.gripper_joint)] = (
+                tool.gripper_closed + opening * (tool.gripper_open - tool.gripper_closed)
+            )

@@ -1,0 +1,307 @@
+"""The fault catalogue: what can be wrong with a scripted policy, by how much, and who may see it.
+
+A policy's name says its faults and their sizes: `expert-noise-0.02`, `expert-high-0.03-late-0.3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+import re
+
+import numpy as np
+
+from mtv_world_ros.errors import nearest, PolicyError
+
+EXPERT = 'expert'
+#: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
+SPLITS = ('train', 'calibrate', 'test')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultKind:
+    """One way in which a policy fails.
+
+    Attributes:
+        family: what it is an error of.
+        split: `train`, `calibrate` or `test`.
+        typical: a size at which success and failure are about as frequent.
+        largest: largest size.
+        unit: of the size.
+        text: what the size means.
+        none: the size at which there is no fault.
+        contact: whether its failures are failures of contact, which do not show in the arm's path
+            alone.
+    """
+
+    family: str
+    split: str
+    typical: float
+    largest: float
+    unit: str
+    text: str
+    none: float = 0.0
+    contact: bool = True
+
+
+def _kind(
+    family: str,
+    split: str,
+    typical: float,
+    largest: float,
+    unit: str,
+    text: str,
+    *,
+    contact: bool = True,
+) -> FaultKind:
+    return FaultKind(
+        family=family,
+        split=split,
+        typical=typical,
+        largest=largest,
+        unit=unit,
+        text=text,
+        contact=contact,
+    )
+
+
+FAULTS: Mapping[str, FaultKind] = {
+    'noise': _kind(
+        'speed', 'train', 0.04, 0.5, 'rad', 'standard deviation of a slow error of every joint'
+    ),
+    'miss': _kind(
+        'lateral', 'train', 1, 1.0, '', 'probability of a grasp that closes beside its object'
+    ),
+    # timing
+    'late': _kind('timing', 'train', 0.6, 3.0, 's', 'the grippers follow this much later'),
+    'early': _kind('timing', 'test', 0.5, 2.0, 's', 'the grippers go this much ahead'),
+    'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
+    # height
+    'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
+    'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
+    # lateral
+    'shift': _kind(
+        'lateral',
+        'train',
+        0.015,
+        0.1,
+        'm',
+        'standard deviation, in x and y, of where objects are seen',
+    ),
+    'aside': _kind('lateral', 'train', 0.025, 0.08, 'm', 'a grasp is shifted across the fingers'),
+    'along': _kind(
+        'lateral', 'calibrate', 0.015, 0.08, 'm', "a grasp is shifted along the fingers' travel"
+    ),
+    # wrist
+    'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
+    'lean': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
+    # opening
+    'loose': _kind(
+        'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
+    ),
+    'narrow': _kind(
+        'opening', 'test', 0.5, 1.0, '', 'share of its opening that lacks before a grasp; 1 = shut'
+    ),
+    # release
+    'drops': _kind(
+        'release', 'train', 0.5, 1.0, '', 'share of the way to the goal that it is dropped before'
+    ),
+    'slack': _kind(
+        'release',
+        'calibrate',
+        0.4,
+        1.0,
+        '',
+        'share of its range that the gripper opens on the way',
+    ),
+    'blink': _kind(
+        'release', 'test', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
+    ),
+    # collision
+    'push': _kind(
+        'collision', 'train', 0.04, 0.15, 'm', 'it comes in low from the side, from this far'
+    ),
+    'low_carry': _kind('collision', 'calibrate', 0.04, 0.15, 'm', 'it carries this much lower'),
+    'sweep': _kind(
+        'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push the object before the grasp'
+    ),
+    # object and place
+    'wrong': _kind(
+        'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
+    ),
+    'place': _kind(
+        'place',
+        'train',
+        0.03,
+        0.1,
+        'm',
+        'standard deviation, in x and y, of where it is put down',
+        contact=False,
+    ),
+    'elsewhere': _kind(
+        'place', 'test', 0.05, 0.15, 'm', 'it is put down this far off', contact=False
+    ),
+    # speed
+    'slow': _kind(
+        'speed', 'train', 0.25, 3.0, '', 'it takes this share longer and is cut off', contact=False
+    ),
+    'stop': FaultKind(
+        family='speed',
+        split='train',
+        typical=0.5,
+        largest=1.0,
+        unit='',
+        text='share of the plan after which the arms stand still; 0 = they never move',
+        none=1.0,
+        contact=False,
+    ),
+    'fast': _kind('speed', 'calibrate', 1, 3.0, '', 'it is this share faster'),
+    'stall': _kind(
+        'speed', 'test', 0.8, 3.0, 's', 'the arms stand still for a while, the grippers do not'
+    ),
+    # regrasp
+    'retry': _kind(
+        'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
+    ),
+    'regrasp': _kind(
+        'regrasp',
+        'test',
+        0.02,
+        0.1,
+        'm',
+        'it puts the object down this far off and grasps where it was',
+    ),
+}
+
+
+def kinds_of(split: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split.
+
+    Raises:
+        PolicyError: no such split.
+    """
+    if split not in SPLITS:
+        raise PolicyError(
+            f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
+            f'{", ".join(SPLITS)}'
+        )
+    return tuple(name for name, kind in FAULTS.items() if kind.split == split)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyVariant:
+    """The expert's faults; none is the expert.
+
+    Attributes:
+        sizes: (kind, size), each kind once, in the catalogue's order.
+    """
+
+    sizes: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for fault, value in self.sizes:
+            largest = FAULTS[fault].largest
+            if not (isfinite(value) and 0 <= value <= largest):
+                raise PolicyError(
+                    f"policy fault '{fault}' is {value}; it must be 0 to {largest:g}"
+                )
+
+    @classmethod
+    def of(cls, sizes: Mapping[str, float]) -> PolicyVariant:
+        """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
+        return cls(
+            tuple(
+                (kind, float(sizes[kind]))
+                for kind, fault in FAULTS.items()
+                if kind in sizes and sizes[kind] != fault.none
+            )
+        )
+
+    def size(self, kind: str) -> float:
+        """Returns the size of one fault."""
+        return dict(self.sizes).get(kind, FAULTS[kind].none)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of its faults."""
+        return tuple(kind for kind, _ in self.sizes)
+
+    @property
+    def name(self) -> str:
+        """The name that `parse_variant` reads."""
+        return '-'.join([EXPERT, *(f'{kind}-{size:g}' for kind, size in self.sizes)])
+
+
+def parse_variant(text: str) -> PolicyVariant:
+    """Returns the variant of a name: `expert`, then any of its faults, each with its size.
+
+    Raises:
+        PolicyError: no such name, a fault twice or without a size, a size out of range.
+    """
+    name = text.strip()
+    if not re.fullmatch(rf'{EXPERT}(-[a-z_]+-\d*\.?\d+)*', name):
+        raise PolicyError(
+            f"'{text}' is no scripted policy{_near(name)}; they are called '{EXPERT}', followed "
+            f"by faults with their sizes, like '{EXPERT}-noise-0.02' or "
+            f"'{EXPERT}-late-0.3-miss-0.5'; faults are {', '.join(FAULTS)}"
+        )
+    sizes: dict[str, float] = {}
+    for fault, size in re.findall(r'-([a-z_]+)-([\d.]+)', name):
+        if fault not in FAULTS:
+            raise PolicyError(
+                f"policy '{text}': unknown fault '{fault}'{nearest(fault, FAULTS)}; known are "
+                f'{", ".join(FAULTS)}'
+            )
+        if fault in sizes:
+            raise PolicyError(f"policy '{text}': fault '{fault}' is given twice")
+        sizes[fault] = float(size)
+    PolicyVariant(tuple(sizes.items()))  # sizes that mean no fault are checked, too
+    return PolicyVariant.of(sizes)
+
+
+def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVariant:
+    """Returns a random policy: the expert, or one or two faults of sizes around the typical one.
+
+    Args:
+        kinds: to choose from.
+        rng: draws.
+    """
+    count = int(rng.choice([0, 1, 2], p=[0.15, 0.6, 0.25]))
+    chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
+    sizes = {}
+    for kind in map(str, chosen):
+        fault = FAULTS[kind]
+        size = min(fault.typical * 2 ** rng.normal(0.0, 0.9), fault.largest)
+        sizes[kind] = float(f'{size:.3g}')
+    return PolicyVariant.of(sizes)
+
+
+def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
+    """Refuses policies with faults of a split.
+
+    Args:
+        names: of policies.
+        split: whose kinds must not be there.
+        what: they are not for, in words.
+
+    Raises:
+        PolicyError: names the policies and their kinds.
+    """
+    found = {
+        name: bad
+        for name in names
+        if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == split])
+    }
+    if found:
+        told = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
+        raise PolicyError(
+            f'fault kinds of the split {split} are not for {what}: {told}; choose kinds of '
+            f'{", ".join(s for s in SPLITS if s != split)} (sim/expert/faults.py)'
+        )
+
+
+def _near(name: str) -> str:
+    """Of the first word alone: what follows may be right."""
+    first = name.split('-')[0]
+    return '' if first == EXPERT else nearest(first, [EXPERT])

@@ -1,0 +1,261 @@
+"""The expert's way points, and what faults of a policy make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.sim.expert.faults import PolicyVariant
+
+_GRASP = ('above', 'grasp', 'close')
+_HELD = ('lift', 'carry', 'lower')
+_PLACE = ('carry', 'lower', 'open', 'retreat')
+#: the lowest that a tool is carried over where it grasped [m]
+_LOWEST_M = 0.004
+#: how far a first grasp is raised before it lets go again [m]
+_TRY_LIFT_M = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class WayPoint:
+    """Where one arm's tool is at the end of a segment.
+
+    Attributes:
+        phase: `above`, `grasp`, `close`, `lift`, `carry`, `lower`, `open`, `retreat` or `home`.
+        position: (3,) of the tool [m].
+        yaw: of the tool [rad].
+        opening: of the gripper, 0..1.
+        seconds: that the segment takes; None = as the arm's speed has it.
+        lean: of the tool about its own x [rad].
+    """
+
+    phase: str
+    position: FloatArray
+    yaw: float
+    opening: float
+    seconds: float | None = None
+    lean: float = 0.0
+
+    def moved(self, way: FloatArray) -> WayPoint:
+        """Returns it shifted by (3,) [m]."""
+        return replace(self, position=self.position + way)
+
+
+Stops = list[WayPoint]
+
+
+class WayPointFaults:
+    """The faults of a variant that change the way points of one move.
+
+    Which move, and to which side, is drawn from a generator of its own: siblings of a scene differ
+    by the kind and the size of their fault alone.
+
+    Args:
+        variant: whose faults.
+        rng: draws move and side.
+    """
+
+    def __init__(self, variant: PolicyVariant, rng: np.random.Generator) -> None:
+        self._variant = variant
+        self._move, self._angle = float(rng.uniform()), float(rng.uniform(0, 2 * np.pi))
+        self._sign = float(rng.choice((-1.0, 1.0)))
+
+    def move_of(self, num_moves: int) -> int:
+        """Returns the number of the move that goes wrong."""
+        return int(self._move * num_moves)
+
+    def applied(self, stops: Stops, yaw: float) -> Stops:
+        """Returns the way points of a move with all faults, in the catalogue's order.
+
+        Args:
+            stops: of the expert.
+            yaw: of its grasp [rad]; the fingers travel along it.
+        """
+        for kind, size in self._variant.sizes:
+            edit = _EDITS.get(kind)
+            if edit is not None:
+                stops = edit(stops, size, _Side(yaw, self._sign, self._angle))
+        return stops
+
+
+@dataclass(frozen=True, slots=True)
+class _Side:
+    """To which side a fault goes."""
+
+    yaw: float
+    sign: float
+    angle: float
+
+    @property
+    def along(self) -> FloatArray:
+        """Unit vector (3,) along the fingers' travel."""
+        return self.sign * np.array([np.cos(self.yaw), np.sin(self.yaw), 0.0])
+
+    @property
+    def across(self) -> FloatArray:
+        """Unit vector (3,) across it."""
+        return self.sign * np.array([-np.sin(self.yaw), np.cos(self.yaw), 0.0])
+
+    @property
+    def anywhere(self) -> FloatArray:
+        """Unit vector (3,) in any direction of the plane."""
+        return np.array([np.cos(self.angle), np.sin(self.angle), 0.0])
+
+
+def _up(height: float) -> FloatArray:
+    return np.array([0.0, 0.0, height])
+
+
+def _changed(stops: Stops, phases: Sequence[str], change: Callable[[WayPoint], WayPoint]) -> Stops:
+    return [change(stop) if stop.phase in phases else stop for stop in stops]
+
+
+def _first(stops: Stops, phase: str) -> int:
+    return next(i for i, stop in enumerate(stops) if stop.phase == phase)
+
+
+def _high(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('grasp', 'close'), lambda stop: stop.moved(_up(size)))
+
+
+def _drop_high(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('carry', 'lower', 'open', 'retreat'), lambda s: s.moved(_up(size)))
+
+
+def _aside(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, _GRASP, lambda stop: stop.moved(size * side.across))
+
+
+def _along(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, _GRASP, lambda stop: stop.moved(size * side.along))
+
+
+def _turn(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, _GRASP, lambda s: replace(s, yaw=s.yaw + side.sign * size))
+
+
+def _lean(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, _GRASP, lambda s: replace(s, lean=s.lean + side.sign * size))
+
+
+def _loose(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('close', *_HELD), lambda s: replace(s, opening=max(s.opening, size)))
+
+
+def _slack(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('carry', 'lower'), lambda s: replace(s, opening=max(s.opening, size)))
+
+
+def _narrow(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(
+        stops, ('above', 'grasp'), lambda s: replace(s, opening=s.opening * (1 - size))
+    )
+
+
+def _drops(stops: Stops, size: float, side: _Side) -> Stops:
+    """The gripper opens before the last `size` of the way from the lift to the place."""
+    begin, end = _first(stops, 'lift'), _first(stops, 'lower')
+    at = begin + (1 - size) * (end - begin)
+    number = min(int(at), end - 1)
+    share = at - number
+    here, after = stops[number], stops[number + 1]
+    place = here.position + share * (after.position - here.position)
+    point = replace(after, position=place, yaw=here.yaw + share * (after.yaw - here.yaw))
+    let_go = [point, replace(point, opening=1.0, seconds=0.3)]
+    rest = _changed(stops[number + 1 :], _HELD, lambda s: replace(s, opening=1.0))
+    rest = _changed(rest, ('open',), lambda s: replace(s, opening=1.0))
+    return [*stops[: number + 1], *let_go, *rest]
+
+
+def _blink(stops: Stops, size: float, side: _Side) -> Stops:
+    lifted = _first(stops, 'lift')
+    opened = replace(stops[lifted], opening=1.0, seconds=size / 2)
+    return [
+        *stops[: lifted + 1],
+        opened,
+        replace(opened, opening=0.0),
+        *stops[lifted + 1 :],
+    ]
+
+
+def _low_carry(stops: Stops, size: float, side: _Side) -> Stops:
+    floor = stops[_first(stops, 'close')].position[2] + _LOWEST_M
+
+    def lowered(stop: WayPoint) -> WayPoint:
+        x, y, z = stop.position
+        return replace(stop, position=np.array([x, y, max(z - size, min(z, floor))]))
+
+    return _changed(stops, ('lift', 'carry'), lowered)
+
+
+def _push(stops: Stops, size: float, side: _Side) -> Stops:
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    way = size * side.along
+    return [above.moved(way), replace(grasp, phase='above').moved(way), *stops[1:]]
+
+
+def _sweep(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers come down beside the object and push it across the fingers."""
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    away = -0.07 * side.across
+    # half a finger and half a small object lie between the tool and the object's centre
+    end = (size - 0.03) * side.across
+    shut = replace(grasp, phase='above', opening=0.0)
+    rise = above.position - grasp.position
+    return [
+        shut.moved(away + rise),
+        shut.moved(away),
+        shut.moved(end),
+        shut.moved(end + rise),
+        *stops,
+    ]
+
+
+def _elsewhere(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, _PLACE, lambda stop: stop.moved(size * side.anywhere))
+
+
+def _retry(stops: Stops, size: float, side: _Side) -> Stops:
+    begin = [stop.moved(size * side.across) for stop in stops[: _first(stops, 'lift')]]
+    begin = [replace(stop, phase='above') for stop in begin]
+    raised = begin[-1].moved(_up(_TRY_LIFT_M))
+    return [*begin, raised, replace(raised, opening=1.0, seconds=0.3), *stops]
+
+
+def _regrasp(stops: Stops, size: float, side: _Side) -> Stops:
+    first = stops[: _first(stops, 'lift')]
+    closed = replace(first[-1], seconds=None)
+    way, rise = size * side.anywhere, _up(_TRY_LIFT_M)
+    begin = [
+        *first,
+        closed.moved(rise),
+        closed.moved(way + rise),
+        closed.moved(way + _up(0.002)),
+        replace(closed.moved(way + _up(0.002)), opening=1.0, seconds=0.3),
+        replace(closed.moved(way + rise), opening=1.0),
+    ]
+    return [*(replace(stop, phase='above') for stop in begin), *stops]
+
+
+_EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
+    'high': _high,
+    'drop_high': _drop_high,
+    'aside': _aside,
+    'along': _along,
+    'turn': _turn,
+    'lean': _lean,
+    'loose': _loose,
+    'slack': _slack,
+    'narrow': _narrow,
+    'drops': _drops,
+    'blink': _blink,
+    'low_carry': _low_carry,
+    'push': _push,
+    'sweep': _sweep,
+    'elsewhere': _elsewhere,
+    'retry': _retry,
+    'regrasp': _regrasp,
+}

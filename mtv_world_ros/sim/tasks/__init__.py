@@ -1,0 +1,1 @@
+"""The simulated tasks and when they are done."""

@@ -1,0 +1,250 @@
+"""A simulated episode in closed loop: joint targets in, images, joint states and success out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import ByteArray, FloatArray
+from mtv_world_ros.errors import SimulatorError, TrajectoryError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.sim.tasks.predicates import History
+from mtv_world_ros.sim.tasks.tasks import Task, task_named
+from mtv_world_ros.sim.world.arm import ARMS, velocity_gains
+from mtv_world_ros.sim.world.opengl import load_mujoco
+from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, RandomizationConfig
+from mtv_world_ros.sim.world.scene import Scene, scene_xml, TIMESTEP_S
+
+CONTROL_PERIOD_S = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimObservation:
+    """What a policy sees after a step.
+
+    Attributes:
+        time_s: simulated time since reset [s].
+        images: view -> (H, W, 3) uint8 RGB.
+        masks: view -> (H, W) uint8; 0 = none, i + 1 = scene.objects[i]; empty without masks.
+        positions: (J,) measured joint positions in the robot's order [rad or m].
+        success: the task's predicate holds at this instant.
+    """
+
+    time_s: float
+    images: dict[str, ByteArray]
+    masks: dict[str, ByteArray]
+    positions: FloatArray
+    success: bool
+
+
+def scene_generator(seed: int) -> np.random.Generator:
+    """Returns the generator that draws the scene of an episode seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+
+
+class SimEpisode:
+    """Physics and cameras of one episode at a time.
+
+    Args:
+        robot: the bimanual arm; two arms of six joints and a gripper, left first.
+        home: (J,) joint positions at reset [rad or m].
+        config: what is randomised, and the image size.
+        rendering: False runs physics alone, without OpenGL; images are then empty.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        home: FloatArray,
+        config: RandomizationConfig | None = None,
+        *,
+        rendering: bool = True,
+    ) -> None:
+        self.robot = robot
+        self.home = np.asarray(home, dtype=np.float64)
+        self._config = config or RandomizationConfig()
+        self._rendering = rendering
+        self._mujoco = load_mujoco(rendering=rendering)
+        self._lead = np.array(velocity_gains() * len(ARMS))
+        self._renderer: Any = None
+        self._model: Any = None
+
+    def reset(self, seed: int, task: str | Task) -> SimObservation:
+        """Builds the scene of a seed and returns its first observation."""
+        self.task = task_named(task) if isinstance(task, str) else task
+        return self.load(draw_scene(self.task, scene_generator(seed), self._config), self.task)
+
+    def load(self, scene: Scene, task: Task) -> SimObservation:
+        """Builds a given scene and returns its first observation.
+
+        Raises:
+            SimulatorError: MuJoCo refuses the scene.
+        """
+        self.close()
+        mujoco = self._mujoco
+        self.scene, self.task = scene, task
+        try:
+            self._model = mujoco.MjModel.from_xml_string(scene_xml(scene, self.robot))
+        except ValueError as error:
+            raise SimulatorError(
+                f"the scene of task '{task.name}' does not build: {error}"
+            ) from error
+        self._data = mujoco.MjData(self._model)
+        self._index_model()
+        if self._rendering:
+            height, width = scene.cameras[0].height, scene.cameras[0].width
+            self._renderer = mujoco.Renderer(self._model, height, width)
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._target, self._seen = self.home, []
+        self._data.qpos[self._arm_qpos] = self._spread(self.home)
+        self._data.ctrl[:] = self._spread(self.home)
+        mujoco.mj_forward(self._model, self._data)
+        return self.observe()
+
+    def close(self) -> None:
+        """Frees the OpenGL context of the current scene."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    @property
+    def instruction(self) -> str:
+        """What the episode's robot is told to do."""
+        return instruction_of(self.task, self.scene)
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since reset [s]."""
+        return float(self._data.time)
+
+    def step(self, targets: FloatArray, seconds: float = 0.1) -> SimObservation:
+        """Drives the joints to `targets` (J,) over one camera period and observes."""
+        targets = self._checked(targets)
+        start, num = self._target, max(1, round(seconds / CONTROL_PERIOD_S))
+        for k in range(1, num + 1):
+            self.advance(start + (targets - start) * k / num)
+        return self.observe()
+
+    def advance(self, targets: FloatArray) -> None:
+        """Runs one control period towards joint `targets` (J,), without looking.
+
+        Raises:
+            TrajectoryError: wrong number of joints, or not finite.
+        """
+        targets = self._checked(targets)
+        velocity = (self._spread(targets) - self._spread(self._target)) / CONTROL_PERIOD_S
+        self._data.ctrl[:] = self._spread(targets) + self._lead * velocity
+        num_steps = round(CONTROL_PERIOD_S / TIMESTEP_S)
+        self._mujoco.mj_step(self._model, self._data, nstep=num_steps)
+        self._target = targets
+
+    def _checked(self, targets: FloatArray) -> FloatArray:
+        targets = np.asarray(targets, dtype=np.float64)
+        if targets.shape != self.home.shape or not np.isfinite(targets).all():
+            raise TrajectoryError(
+                f'joint targets must be {len(self.home)} finite values, got shape '
+                f'{targets.shape}: {targets.tolist()}'
+            )
+        return targets
+
+    def positions(self) -> FloatArray:
+        """Returns the measured joint positions (J,) in the robot's order [rad or m]."""
+        measured = self._data.qpos[self._arm_qpos].reshape(len(ARMS), 8)
+        gripper = (measured[:, 6] - measured[:, 7]) / 2
+        return np.concatenate([measured[:, :6], gripper[:, None]], axis=1).reshape(-1)
+
+    def object_poses(self) -> FloatArray:
+        """Returns T_base_object (O, 4, 4) of the objects' centres [m]."""
+        poses = np.tile(np.eye(4), (len(self.scene.objects), 1, 1))
+        for pose, item in zip(poses, self.scene.objects, strict=True):
+            body = self._data.body(item.role)
+            pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return poses
+
+    def seen_poses(self) -> FloatArray:
+        """Returns T_base_object (T, O, 4, 4) [m] at every observation since reset."""
+        return np.array([poses for poses, _ in self._seen])
+
+    def history(self) -> History:
+        """Returns what predicates look at: all that was observed since reset."""
+        poses = np.array([poses for poses, _ in self._seen])
+        scene = self.scene
+        return History(
+            positions={item.role: poses[:, i, :3, 3] for i, item in enumerate(scene.objects)},
+            rotations={item.role: poses[:, i, :3, :3] for i, item in enumerate(scene.objects)},
+            sizes={item.role: item.size for item in scene.objects},
+            openings=self.robot.gripper_openings(np.array([seen for _, seen in self._seen])),
+            starts={item.role: poses[0, i, :3, 3] for i, item in enumerate(scene.objects)},
+            goals=tuple(np.asarray(goal) for goal in scene.goals),
+        )
+
+    def observe(self, *, rendering: bool = True) -> SimObservation:
+        """Renders all views, unless told not to, and evaluates the task's predicate now."""
+        positions = self.positions()
+        self._seen.append((self.object_poses(), positions))
+        images, masks = self._render() if self._rendering and rendering else ({}, {})
+        return SimObservation(
+            time_s=self.time_s,
+            images=images,
+            masks=masks,
+            positions=positions,
+            success=bool(self.task.succeeds(self.history())[-1]),
+        )
+
+    def _render(self) -> tuple[dict[str, ByteArray], dict[str, ByteArray]]:
+        images, masks = {}, {}
+        for camera in self.scene.cameras:
+            self._renderer.update_scene(self._data, camera.view)
+            images[camera.view] = self._renderer.render()
+            masks[camera.view] = self._render_instances()
+        return images, masks
+
+    def _render_instances(self) -> ByteArray:
+        """Draws the same scene with every geom in the colour of its number.
+
+        The renderer's own segmentation looks all geoms up again in every frame, which takes
+        as long as drawing them.
+        """
+        flag, scene = self._mujoco.mjtRndFlag, self._renderer.scene
+        by_number = [int(flag.mjRND_SEGMENT), int(flag.mjRND_IDCOLOR)]
+        scene.flags[by_number] = 1
+        colours = self._renderer.render()
+        scene.flags[by_number] = 0
+        if len(self._instance_of) != scene.ngeom + 1:
+            self._instance_of = self._instances(scene)
+        return self._instance_of[colours[..., 0] | colours[..., 1].astype(np.uint16) << 8]
+
+    def _instances(self, scene: Any) -> ByteArray:
+        """Instance id by the number of a drawn geom, from 1; nothing drawn is 0."""
+        owners = {
+            self._model.body(item.role).id: i for i, item in enumerate(self.scene.objects, 1)
+        }
+        instances = np.zeros(scene.ngeom + 1, dtype=np.uint8)
+        for drawn in scene.geoms[: scene.ngeom]:
+            if drawn.objtype == self._mujoco.mjtObj.mjOBJ_GEOM and drawn.segid >= 0:
+                body = int(self._model.geom_bodyid[drawn.objid])
+                instances[drawn.segid + 1] = owners.get(body, 0)
+        return instances
+
+    def _index_model(self) -> None:
+        """Finds where the joints stand in qpos; which geom is whose is asked when it is drawn."""
+        joints = [
+            name
+            for arm in ARMS
+            for name in (
+                *(f'{arm}_joint{number}' for number in range(1, 7)),
+                f'{arm}_left_finger',
+                f'{arm}_right_finger',
+            )
+        ]
+        self._arm_qpos = np.array([self._model.joint(name).qposadr[0] for name in joints])
+        self._instance_of = np.zeros(0, dtype=np.uint8)
+
+    @staticmethod
+    def _spread(positions: FloatArray) -> FloatArray:
+        """(14,) robot joints -> (16,) actuators: the right finger mirrors the left."""
+        arms = positions.reshape(len(ARMS), 7)
+        return np.concatenate([arms, -arms[:, 6:]], axis=1).reshape(-1)

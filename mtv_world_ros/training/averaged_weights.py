@@ -1,0 +1,95 @@
+"""The trained weights: float32 for the optimizer, their averages, and the copy that computes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from diffusers.training_utils import EMAModel
+import torch
+from torch import nn, Tensor
+
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
+
+
+class Weights:
+    """A transformer in the number format of forward and backward, and what is trained of it.
+
+    Parameters without `requires_grad` stay as they are and take no further memory.
+
+    Args:
+        transformer: becomes `worker`.
+        device: where all of it goes.
+        dtype: of forward and backward.
+        ema_decay: of the averaged weights.
+    """
+
+    def __init__(
+        self,
+        transformer: MultiViewWanTransformer,
+        device: torch.device,
+        dtype: torch.dtype,
+        ema_decay: float,
+    ) -> None:
+        trained = {n: p for n, p in transformer.named_parameters() if p.requires_grad}
+        self.master: dict[str, nn.Parameter] = {
+            name: nn.Parameter(parameter.detach().to(device, torch.float32, copy=True))
+            for name, parameter in trained.items()
+        }
+        self.worker = place(transformer, device, dtype)
+        parameters = dict(self.worker.named_parameters())
+        self._pairs = [(parameters[name], master) for name, master in self.master.items()]
+        self.ema = EMAModel(self.parameters, decay=ema_decay, use_ema_warmup=True, power=0.75)
+        self.share()
+
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """The float32 weights."""
+        return list(self.master.values())
+
+    @torch.no_grad()
+    def load(self, weights: dict[str, Tensor]) -> None:
+        """Takes float32 weights, by name; the computing copy follows."""
+        for name, master in self.master.items():
+            master.copy_(weights[name])
+        self.share()
+
+    @torch.no_grad()
+    def share(self) -> None:
+        """Gives the computing copy the float32 weights."""
+        for worker, master in self._pairs:
+            worker.copy_(master)
+
+    @torch.no_grad()
+    def collect(self) -> None:
+        """Adds the computing copy's gradients to those in float32, and drops them."""
+        for worker, master in self._pairs:
+            if master.grad is None:
+                # zeros where nothing came: all processes must add up the same tensors
+                master.grad = torch.zeros_like(master)
+            if worker.grad is not None:
+                master.grad += worker.grad
+            worker.grad = None
+
+    @contextmanager
+    def lent(self) -> Iterator[MultiViewWanTransformer]:
+        """Lends the computing copy with averaged weights, which are those that will serve."""
+        with torch.no_grad():
+            for (worker, _), average in zip(self._pairs, self.ema.shadow_params, strict=True):
+                worker.copy_(average)
+        try:
+            yield self.worker
+        finally:
+            self.share()
+
+    def averages(self) -> dict[str, Tensor]:
+        """Returns the averaged float32 weights by name."""
+        return dict(zip(self.master, self.ema.shadow_params, strict=True))
+
+    def averaged(self) -> MultiViewWanTransformer:
+        """Returns a float32 transformer with the averaged weights."""
+        whole = copy_of(self.worker)
+        parameters = dict(whole.named_parameters())
+        self.ema.copy_to([parameters[name] for name in self.master])
+        return whole

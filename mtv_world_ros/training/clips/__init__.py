@@ -1,0 +1,1 @@
+"""Training clips: what is cut from recordings, and its batches."""

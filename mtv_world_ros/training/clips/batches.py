@@ -1,0 +1,271 @@
+"""Batches by step and clip number: the same numbers give the same clip, in whatever process.
+
+Shape letters: B batch, V views, T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mtv_world_ros.data.recording import chunk_of, clip_starts, cut_clip, Recording
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.actions import ActionEncoding, collate
+from mtv_world_ros.training.clips.clip_controls import ControlMaker
+from mtv_world_ros.training.clips.clip_workers import ClipWorkers
+from mtv_world_ros.training.clips.leads import Lead, lead_before
+from mtv_world_ros.training.clips.past import draw_past, history_before, history_of_lead, Past
+from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Clips with their trajectory videos.
+
+    Attributes:
+        frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model is shown it.
+        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
+        object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
+        actions: what `ActionEncoding` gives, where they are not drawn.
+        anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
+            history; see `past.py`.
+        history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
+        history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
+        leads: B of them, what comes before the clips that are to start from the model's own
+            prediction, None for the others; empty = none is.
+        step: of the training, from 0.
+        numbers: of its clips within the step's whole batch, which processes and accumulation
+            split; each clip's noise depends on its own.
+    """
+
+    frames: Tensor
+    start_frame: Tensor
+    trajectory: Tensor | None
+    object_ids: Tensor | None
+    actions: Tensor | None = None
+    anchor: Tensor | None = None
+    history: Tensor | None = None
+    history_sigmas: Tensor | None = None
+    leads: tuple[Lead | None, ...] = ()
+    step: int = 0
+    numbers: Sequence[int] = ()
+
+    def parts(self, count: int) -> Iterator[Batch]:
+        """Yields its clips in so many batches, as even as can be."""
+        size = len(self.numbers)
+        for index in range(count):
+            chosen = slice(size * index // count, size * (index + 1) // count)
+            values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'step'}
+            held = {name: v if v is None else v[chosen] for name, v in values.items()}
+            yield replace(self, **held)
+
+
+class _Sample(NamedTuple):
+    """One clip of a batch."""
+
+    frames: ByteArray
+    start_frame: ByteArray
+    trajectory: ByteArray | None
+    object_ids: ByteArray | None
+    actions: np.ndarray | None
+    lead: Lead | None
+    past: Past | None
+
+
+class BatchSource:
+    """Cuts, draws and disturbs clips; one batch is prepared while the last one trains.
+
+    Args:
+        recordings: where clips come from.
+        config: views and times of clips, how they are drawn and disturbed, how many a step.
+        robot: of the recordings.
+        segmenter: finds the objects of the first frames.
+        seed: of choice and disturbances.
+        actions: how positions become actions, where they are not drawn.
+        numbers: the clips of a step that this process makes; None: all.
+        workers: processes that make them; 0 = a thread of this one.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        config: TrainingConfig,
+        *,
+        robot: RobotModel,
+        segmenter: Segmenter,
+        seed: int,
+        actions: ActionEncoding | None = None,
+        numbers: Sequence[int] | None = None,
+        workers: int = 0,
+    ) -> None:
+        self._numbers = range(config.optimizer.batch_size) if numbers is None else numbers
+        spec, stride_s = config.spec, config.video.clip_stride_s
+        whole = [(r, _spaced(r, clip_starts(r, spec), stride_s)) for r in recordings]
+        self._starts = [(r, starts) for r, starts in whole if len(starts)]
+        if not self._starts:
+            raise TrainingError(
+                f'none of {len(recordings)} episodes is long enough for a clip of '
+                f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s); '
+                'record longer ones or lower video.num_frames'
+            )
+        self.controls = ControlMaker(
+            robot=robot,
+            segmenter=segmenter,
+            rendering=config.rendering,
+            object_mask=config.video.object_mask,
+            actions=actions,
+        )
+        self._spec, self._augment, self._seed = spec, config.augment, seed
+        self._self_rollout, self._history = config.self_rollout, config.history
+        self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._workers = ClipWorkers(self._clip, workers) if workers else None
+        self._ahead: tuple[int, Future[Batch]] | None = None
+
+    @property
+    def starts(self) -> list[tuple[Recording, np.ndarray]]:
+        """The recordings that clips are cut from, with the frames that they start from."""
+        return self._starts
+
+    @property
+    def num_clips(self) -> int:
+        """Clips that can be cut."""
+        return sum(len(starts) for _, starts in self._starts)
+
+    def batch(self, step: int) -> Batch:
+        """Returns the batch of a step, and starts preparing the next one."""
+        if self._ahead is not None and self._ahead[0] == step:
+            result = self._ahead[1].result()
+        else:
+            result = self._make(step)
+        self._ahead = (step + 1, self._pool.submit(self._make, step + 1))
+        return result
+
+    def close(self) -> None:
+        """Stops preparing."""
+        self._pool.shutdown(cancel_futures=True)
+        if self._workers is not None:
+            self._workers.close()
+
+    def _make(self, step: int) -> Batch:
+        if self._workers is None:
+            samples = [self._clip(step, number) for number in self._numbers]
+        else:
+            samples = self._workers.clips(step, self._numbers)
+        encoded = [s.actions for s in samples if s.actions is not None]
+        return Batch(
+            step=step,
+            numbers=self._numbers,
+            frames=torch.from_numpy(np.stack([s.frames for s in samples])),
+            start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
+            trajectory=_stack([s.trajectory for s in samples]),
+            object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
+            actions=torch.from_numpy(collate(encoded)) if encoded else None,
+            leads=tuple(s.lead for s in samples),
+            **pasts([s.past for s in samples]),
+        )
+
+    def _clip(self, step: int, number: int) -> _Sample:
+        return self._sample(np.random.default_rng((self._seed, step, number)), step)
+
+    def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
+        recording, starts = self._choose(rng)
+        start = int(starts[rng.integers(len(starts))])
+        lead = lead_before(recording, start, self._spec, self._self_rollout, step, rng)
+        if lead is None:
+            clip = cut_clip(recording, start, self._spec)
+        else:
+            clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        past = self._past(recording, start, lead, rng)
+        names = clip.objects or objects_from_instruction(recording.instruction)
+        if rng.random() < self._augment.name_dropout:
+            names = tuple(name for name in names if rng.random() < 0.5)
+        trajectory, actions = self.controls.make(clip, names, clip.frames[:, 0])
+        frames = clip.frames
+        if rng.random() < self._augment.colour_permutation:
+            colours = rng.permutation(3)
+            frames = frames[..., colours]
+            past = past and Past(past.anchor[..., colours], past.frames[..., colours], past.sigma)
+            lead = lead and replace(lead, colours=tuple(colours.tolist()))
+        start = frames[:, 0]
+        if rng.random() < self._augment.start_noise:
+            start = _disturb(start, self._augment.start_noise_std, rng)
+        whole = np.ascontiguousarray(frames)
+        lead = lead and replace(lead, names=names)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead, past)
+
+    def _past(
+        self, recording: Recording, start: int, lead: Lead | None, rng: np.random.Generator
+    ) -> Past | None:
+        """What the clip is shown of what came before it, in models that take that."""
+        if not self._history.on:  # nothing is drawn: runs without history keep their clips
+            return None
+        if lead is None:
+            history = history_before(recording, start, self._spec, self._history, rng)
+        else:
+            history = history_of_lead(lead, self._history)
+        return draw_past(history, self._history, rng)
+
+    def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
+        """An episode and the starts of its clips; failed ones as often as they are asked for."""
+        share = self._augment.failure_share
+        pool = self._starts
+        if share is not None and self._failed and rng.random() < share:
+            pool = self._failed
+        return pool[rng.integers(len(pool))]
+
+
+def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
+    """Returns fields of a batch: what its clips are shown of what came before them."""
+    known = [past for past in given if past is not None]
+    if not known:
+        return {}
+    return {
+        'anchor': torch.from_numpy(np.stack([past.anchor for past in known])),
+        'history': torch.from_numpy(np.stack([past.frames for past in known])),
+        'history_sigmas': torch.tensor([past.sigma for past in known]),
+    }
+
+
+def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
+    """Those of the starts that are at least a stride [s] apart."""
+    kept: list[int] = []
+    for start in starts:
+        if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
+            kept.append(int(start))
+    return np.array(kept, dtype=int)
+
+
+def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
+    """Zero ids in place of missing ones, where another clip has some; they weigh the same."""
+    known = next((part for part in ids if part is not None), None)
+    if known is None:
+        return list(ids)
+    return [np.zeros_like(known) if part is None else part for part in ids]
+
+
+def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:
+    """All of a batch as one tensor; None where some clip has none."""
+    found = [part for part in parts if part is not None]
+    return torch.from_numpy(np.stack(found)) if len(found) == len(parts) else None
+
+
+def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:
+    """Blur and noise of random strength, like a frame the model predicted itself."""
+    blurred = np.stack([cv2.blur(frame, (3, 3)) for frame in frames]).astype(np.float32)
+    share = rng.random() * 0.7
+    mixed = (1 - share) * frames + share * blurred
+    mixed = mixed + rng.normal(0, 255 * noise_std * rng.random(), mixed.shape)
+    return mixed.round().clip(0, 255).astype(np.uint8)

@@ -1,0 +1,100 @@
+"""How a clip's actions are told: drawn as a trajectory video, or encoded as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from threading import Lock
+
+import numpy as np
+
+from mtv_world_ros.data.recording import Clip
+from mtv_world_ros.data_types import BoolArray, ByteArray
+from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.object_motion import moved_masks, ObjectMotion
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.actions import ActionEncoding
+from mtv_world_ros.rendering.trajectory_video import (
+    render_trajectory_video,
+    TrajectoryVideoConfig,
+)
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlMaker:
+    """Makes what the model is told of a clip's actions, as serving does.
+
+    Attributes:
+        robot: of the episodes.
+        segmenter: finds the objects of the start frame.
+        rendering: how trajectory videos look.
+        object_mask: whether they carry the objects' masks.
+        actions: how actions are encoded where they are not drawn; None = they are drawn.
+    """
+
+    robot: RobotModel
+    segmenter: Segmenter
+    rendering: TrajectoryVideoConfig
+    object_mask: bool
+    actions: ActionEncoding | None = None
+    # batches are prepared in one thread while the model's rollouts are drawn in another
+    _lock: Lock = field(default_factory=Lock)
+
+    def make(
+        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray
+    ) -> tuple[ByteArray | None, np.ndarray | None]:
+        """Returns the trajectory video (V, 1 + T, H, W, 3), or else the encoded actions.
+
+        Args:
+            clip: one chunk; its cameras, times and positions count.
+            names: of the objects.
+            start_frame: (V, H, W, 3) uint8 RGB, what the chunk starts from; the objects are
+                looked for in it.
+        """
+        if self.actions is not None:
+            return None, self.actions.encode(self.robot, clip.positions)
+        masks = None
+        if self.object_mask:
+            masks = self._moving_masks(clip, names)
+            if masks is None:
+                masks = self._masks(start_frame, names)
+        video = render_trajectory_video(
+            cameras=clip.cameras,
+            robot=self.robot,
+            positions=clip.positions,
+            times=clip.times,
+            object_masks=masks,
+            config=self.rendering,
+        )
+        return video.frames, None
+
+    def _masks(self, frames: ByteArray, names: tuple[str, ...]) -> BoolArray:
+        """(V, O, H, W) of frames (V, H, W, 3)."""
+        with self._lock:
+            return self.segmenter.segment(frames[:, None], names).masks[:, :, 0]
+
+    def _moving_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray | None:
+        """(V, O, 1 + T, H, W) masks that go where the objects went; None = they are held.
+
+        They are those of the episode's first frame, as in a rollout of chained chunks.
+        """
+        origin, poses = clip.origin, clip.object_poses
+        if not self.rendering.object_motion or origin is None or poses is None:
+            return None
+        if any(name not in clip.objects for name in names):
+            return None
+        items = [clip.objects.index(name) for name in names]
+        first, poses = origin.object_poses[items], poses[:, items]
+        motion = ObjectMotion(
+            reference=first[:, :3, 3],
+            points=poses[..., :3, 3],
+            rotations=poses[..., :3, :3] @ np.swapaxes(first[:, :3, :3], -1, -2),
+        )
+        at_first = origin.positions[None]
+        return moved_masks(
+            self._masks(origin.frames, names),
+            motion,
+            clip.cameras,
+            [camera_poses(camera, self.robot, at_first)[0] for camera in clip.cameras],
+            np.stack([camera_poses(c, self.robot, clip.positions) for c in clip.cameras]),
+        )

@@ -1,0 +1,68 @@
+"""What a clip is shown of what came before it, drawn as serving will show it.
+
+A clip is taken as if a rollout had begun some frames before it: that frame is the anchor, and the
+frames since are the history, as many as there are up to N. So the first chunk of a rollout (none),
+the chunks soon after it (few, the oldest repeated) and all later ones come in training as they do
+in serving, and no number of frames is served that was not trained.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mtv_world_ros.data.recording import frame_indices, Recording
+from mtv_world_ros.data_types import ByteArray, WorldModelSpec
+from mtv_world_ros.history import History
+from mtv_world_ros.training.clips.leads import frame_before, Lead
+from mtv_world_ros.training.config import HistoryConfig
+
+
+class Past(NamedTuple):
+    """What of a clip's past the model is shown.
+
+    Attributes:
+        anchor: (V, H, W, 3) uint8 RGB first frame of the rollout.
+        frames: (V, N, H, W, 3) uint8 RGB.
+        sigma: noise level of the frames; 1 = there are none.
+    """
+
+    anchor: ByteArray
+    frames: ByteArray
+    sigma: float
+
+
+def history_before(
+    recording: Recording,
+    start: int,
+    spec: WorldModelSpec,
+    config: HistoryConfig,
+    rng: np.random.Generator,
+) -> History:
+    """Returns that of a rollout which began some frames before recorded frame `start`."""
+    begins = rng.random() < config.first_share
+    longest = int((recording.times[start] - recording.times[0]) * spec.fps + 1e-3)
+    if begins or not longest:
+        return History.begin(recording.frames[:, start])
+    age = int(rng.integers(1, longest + 1))
+    first = frame_before(recording, start, age / spec.fps)
+    shown = None if first is None else frame_indices(recording, first, spec, age)
+    if shown is None:  # a gap: no rollout leads over it
+        return History.begin(recording.frames[:, start])
+    kept = shown[max(age - config.num_frames, 0) : age]
+    return History(anchor=recording.frames[:, shown[0]], frames=recording.frames[:, kept])
+
+
+def history_of_lead(lead: Lead, config: HistoryConfig) -> History:
+    """Returns that of a rollout which begins where the lead does; its frames are recorded ones."""
+    shown = lead.clip.frames[:, : lead.num_chunks * lead.num_frames]
+    kept = max(shown.shape[1] - config.num_frames, 0)
+    return History(anchor=shown[:, 0], frames=shown[:, kept:])
+
+
+def draw_past(history: History, config: HistoryConfig, rng: np.random.Generator) -> Past:
+    """Returns what a clip is shown of its history, with a noise level drawn for it."""
+    known = history.frames.shape[1] > 0 and rng.random() >= config.dropout
+    sigma = float(rng.uniform(0.0, config.max_noise)) if known else 1.0
+    return Past(history.anchor, history.filled(config.num_frames), sigma)

@@ -1,0 +1,1 @@
+"""Encoded clips, kept on disk."""

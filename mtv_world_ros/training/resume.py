@@ -1,0 +1,158 @@
+"""The state of a training on disk: everything that a resumed run needs, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+import torch
+from torch import Tensor
+
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.training.averaged_weights import Weights
+
+#: folder of the state in that of the training
+STATE = 'state'
+_TENSORS, _CARD = 'state.safetensors', 'state.json'
+
+
+class DiskError(TrainingError):
+    """Files cannot be read or written; what was saved before is whole."""
+
+
+@contextmanager
+def disk_errors_named(folder: Path) -> Iterator[None]:
+    """Tells a full disk, or a folder that may not be written, from a fault of the program.
+
+    Raises:
+        DiskError: in place of the error.
+    """
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise DiskError(
+            f"files of '{folder}' cannot be read or written: {error}; the last saved state and "
+            'checkpoint are whole: free some space and run the same command again'
+        ) from error
+
+
+def save_state(
+    folder: Path, weights: Weights, optimizer: torch.optim.Optimizer, card: Mapping[str, Any]
+) -> None:
+    """Writes the state into `folder/state`, which is the old or the new one at any moment.
+
+    Raises:
+        DiskError: it could not be written; the old one stays.
+    """
+    tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
+    tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
+    for index, state in optimizer.state_dict()['state'].items():
+        tensors |= {f'adam.{index}.{k}': v for k, v in state.items()}
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    whole = {**card, 'ema_step': weights.ema.optimization_step}
+    partial = folder / f'{STATE}.partial'
+    with disk_errors_named(folder):
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        try:
+            save_file(tensors, partial / _TENSORS)
+            (partial / _CARD).write_text(json.dumps(whole))
+            for file in partial.iterdir():
+                _flush(file)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
+            raise
+        _swap(partial, folder / STATE)
+
+
+def read_card(folder: Path) -> dict[str, Any] | None:
+    """Returns what is known of the saved state, None where there is none."""
+    _recover(folder / STATE)
+    file = folder / STATE / _CARD
+    return json.loads(file.read_text()) if file.is_file() else None
+
+
+def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Checks that a saved state belongs to this run.
+
+    Args:
+        folder: of the training.
+        card: of the state.
+        mine: `seed`, `control` and `base` (a digest, or None) of this run.
+
+    Raises:
+        TrainingError: it does not.
+    """
+    trained = {'control': 'trajectory_video', 'base': None, **card}
+    state = folder / STATE
+    for name in ('seed', 'control'):
+        if trained[name] != mine[name]:
+            raise TrainingError(
+                f"'{state}' was trained with {name} {trained[name]!r}, this run has "
+                f'{mine[name]!r}; '
+                f'give --{name} the same, or another --out'
+            )
+    if trained['base'] != mine['base']:
+        raise TrainingError(
+            f"'{state}' was trained on top of other weights than those of --init; give the "
+            'same, or another --out'
+        )
+
+
+def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer) -> None:
+    """Puts the saved state's numbers in place.
+
+    Raises:
+        TrainingError: it is damaged, or of another model.
+    """
+    card, file = read_card(folder), folder / STATE / _TENSORS
+    assert card is not None
+    try:
+        tensors = load_file(file)
+        weights.load({k[7:]: v for k, v in tensors.items() if k.startswith('master.')})
+        shadow = weights.ema.shadow_params
+        weights.ema.shadow_params = [
+            tensors[f'ema.{i}'].to(p.device) for i, p in enumerate(shadow)
+        ]
+    except (OSError, SafetensorError, KeyError, RuntimeError) as error:
+        raise TrainingError(
+            f"'{file}' is damaged or of another model: {error}; give the preset it was trained "
+            'with, or another --out'
+        ) from error
+    weights.ema.optimization_step = card['ema_step']
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith('adam.'):
+            _, index, name = key.split('.')
+            state.setdefault(int(index), {})[name] = value
+    groups = optimizer.state_dict()['param_groups']
+    optimizer.load_state_dict({'state': state, 'param_groups': groups})
+
+
+def _flush(file: Path) -> None:
+    with file.open('rb') as stream:
+        os.fsync(stream.fileno())
+
+
+def _swap(partial: Path, target: Path) -> None:
+    """Puts a finished folder under its name; until then the old one is there, or `.old` is."""
+    old = target.with_name(target.name + '.old')
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        target.rename(old)
+    partial.rename(target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _recover(target: Path) -> None:
+    """Brings the old folder back where the run was killed between the two renames."""
+    old = target.with_name(target.name + '.old')
+    if not target.exists() and old.exists():
+        old.rename(target)

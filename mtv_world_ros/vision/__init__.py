@@ -1,0 +1,1 @@
+"""Who is where in the frames: segmenters, describers, the Jaccard index."""

@@ -1,0 +1,87 @@
+"""Objects that a person wrote down, for work without any model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mtv_world_ros.config import check_keys, read_yaml
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
+from mtv_world_ros.vision.describers.scene_objects import check_objects, SceneObject
+
+_KEYS = ('objects', 'instructions')
+
+
+class ObjectList:
+    """Looks objects up by instruction; looks at no image.
+
+    Args:
+        by_instruction: objects per instruction; letter case, spacing and a full stop do not count.
+        others: objects for every other instruction; None = there is no other.
+        source: where the list stands, for messages.
+    """
+
+    def __init__(
+        self,
+        by_instruction: Mapping[str, tuple[SceneObject, ...]],
+        others: tuple[SceneObject, ...] | None = None,
+        source: str = 'the object list',
+    ) -> None:
+        self.by_instruction = {_plain(key): value for key, value in by_instruction.items()}
+        self.others = others
+        self.source = source
+
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+        """Returns the objects listed for the instruction.
+
+        Raises:
+            DescriptionError: `unlisted`.
+        """
+        del first_frame
+        found = self.by_instruction.get(_plain(instruction), self.others)
+        if found is None:
+            known = list(self.by_instruction)
+            raise DescriptionError(
+                f"{self.source} has no objects for '{instruction}'"
+                f'{nearest(_plain(instruction), known)}; add it under '
+                "'instructions', or a list under 'objects' that holds for all others",
+                'unlisted',
+            )
+        return found
+
+
+def load_object_list(path: Path) -> ObjectList:
+    """Reads `objects` (for all instructions) and `instructions` (each with its own objects).
+
+    An object is its name, or a mapping with `name` and other keys of `SceneObject`.
+
+    Raises:
+        ConfigError: the file cannot be read, or what it says is wrong.
+    """
+    source = f"object list '{path}'"
+    values = read_yaml(path, 'object list', 'list')
+    if not isinstance(values, Mapping) or not values:
+        raise ConfigError(f"{source} needs the key 'objects' or 'instructions'")
+    check_keys(values, _KEYS, (), source)
+    listed = values.get('instructions') or {}
+    if not isinstance(listed, Mapping):
+        raise ConfigError(f"{source}: 'instructions' has to map each instruction to its objects")
+    by_instruction = {
+        str(key): _checked(items, f"{source}: instruction '{key}'")
+        for key, items in listed.items()
+    }
+    others = _checked(values['objects'], source) if 'objects' in values else None
+    return ObjectList(by_instruction, others, source)
+
+
+def _checked(items: Any, where: str) -> tuple[SceneObject, ...]:
+    try:
+        return check_objects(items, complete=False)
+    except DescriptionError as error:
+        raise ConfigError(f'{where}: {error}') from error
+
+
+def _plain(instruction: str) -> str:
+    return ' '.join(instruction.lower().split()).rstrip('.! ')

@@ -1,0 +1,240 @@
+"""A vision-language model behind a server that speaks OpenAI's chat completions protocol."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import json
+import os
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import ConfigError, DescriptionError
+from mtv_world_ros.vision.describers.retries import attempt, RetryConfig
+from mtv_world_ros.vision.describers.vlm import Answer
+from mtv_world_ros.vision.describers.vlm_prompt import ANSWER_SCHEMA, excerpt
+
+#: from the strictest to none; a server that refuses one is asked with the next
+_FORMATS: tuple[dict[str, Any] | None, ...] = (
+    {
+        'type': 'json_schema',
+        'json_schema': {'name': 'scene_objects', 'strict': True, 'schema': ANSWER_SCHEMA},
+    },
+    {'type': 'json_object'},
+    None,
+)
+#: how servers say that they do not know a parameter's value
+_REFUSED_FORMAT = (400, 422)
+_MAX_ANSWER_BYTES = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenAIConfig:
+    """Which server and model, and how patient to be.
+
+    Attributes:
+        model: name as the server knows it.
+        base_url: up to the version: Ollama has `http://localhost:11434/v1`, Ark
+            `https://ark.cn-beijing.volces.com/api/v3`.
+        key_variable: environment variable that holds the API key; empty = none is needed.
+        timeout_s: longest wait for one answer [s].
+        retry_budget_s: no new attempt starts later than this after the first [s].
+        first_wait_s: wait before the second attempt [s]; doubles after each. What the server
+            asks for in Retry-After goes first.
+    """
+
+    model: str
+    base_url: str = 'https://api.openai.com/v1'
+    key_variable: str = 'OPENAI_API_KEY'
+    timeout_s: float = 60.0
+    retry_budget_s: float = 120.0
+    first_wait_s: float = 1.0
+
+
+class OpenAIChat:
+    """Asks the server; see `Chat`.
+
+    Raises:
+        ConfigError: the key is not set, or `openai` is not installed.
+    """
+
+    def __init__(self, config: OpenAIConfig) -> None:
+        self.config = config
+        self._key = _api_key(config)
+        self._client = _client(config, self._key)
+        self._format = 0  # index of the strictest format that the server took
+
+    @property
+    def identity(self) -> str:
+        """The model and its server."""
+        return f'{self.config.model} at {self.config.base_url}'
+
+    def ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
+        """Returns the answer to the last turn; see `Chat`."""
+        messages = _messages(frame, turns)
+        for index in range(self._format, len(_FORMATS)):
+            try:
+                body = self._complete(messages, _FORMATS[index])
+            except _FormatRefused:
+                continue
+            self._format = index
+            return self._answer(body)
+        raise AssertionError('without a format there is none to refuse')
+
+    def _complete(self, messages: list[Any], wanted: dict[str, Any] | None) -> bytes:
+        """The body of a completion, after as many attempts as the budget allows."""
+        import openai
+
+        try:
+            return attempt(lambda: self._post(messages, wanted), self._retries())
+        except openai.APITimeoutError as error:
+            raise self._too_slow() from error
+        except openai.APIStatusError as error:
+            if wanted is not None and error.status_code in _REFUSED_FORMAT:
+                raise _FormatRefused from error
+            raise self._failed(error.status_code, str(error)) from error
+        except openai.OpenAIError as error:
+            cause = f'{error} {error.__cause__ or ""}'
+            raise DescriptionError(
+                f'{self.identity} cannot be reached ({self._hide_key(cause)}); is the server '
+                "up, and the describer's 'base_url' right?",
+                'unreachable',
+            ) from error
+
+    def _retries(self) -> RetryConfig:
+        config = self.config
+        return RetryConfig(budget_s=config.retry_budget_s, first_wait_s=config.first_wait_s)
+
+    def _post(self, messages: list[Any], wanted: dict[str, Any] | None) -> bytes:
+        """One request. Reads piece by piece: some servers keep a slow answer alive with blanks."""
+        import httpx2
+
+        deadline = time.monotonic() + self.config.timeout_s
+        extra: dict[str, Any] = {} if wanted is None else {'response_format': wanted}
+        create = self._client.chat.completions.with_streaming_response.create
+        body = bytearray()
+        try:
+            with create(
+                model=self.config.model, messages=messages, temperature=0, **extra
+            ) as response:
+                for piece in response.iter_bytes():
+                    body += piece
+                    if time.monotonic() > deadline:
+                        raise self._too_slow()
+                    if len(body) > _MAX_ANSWER_BYTES:
+                        raise self._unusable(f'it is longer than {_MAX_ANSWER_BYTES} bytes')
+        except httpx2.TimeoutException as error:
+            raise self._too_slow() from error
+        except httpx2.HTTPError as error:
+            raise DescriptionError(
+                f'{self.identity} broke off in its answer: {error}', 'unreachable'
+            ) from error
+        return bytes(body)
+
+    def _answer(self, body: bytes) -> Answer:
+        """What a completion says; nothing is taken for granted about its form."""
+        try:
+            completion = json.loads(body)
+            choice = completion['choices'][0]
+            message = choice['message']
+            reason = choice.get('finish_reason')
+            refusal, text = message.get('refusal'), message.get('content') or ''
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise self._unusable(f"'{excerpt(body.decode(errors='replace'))}'") from error
+        if not isinstance(text, str):
+            raise self._unusable(f'its content is {excerpt(repr(text))}')
+        if refusal or reason == 'content_filter':
+            said = refusal or text or 'its content filter stopped it'
+            raise DescriptionError(
+                f"{self.identity} refuses to describe the frame: '{excerpt(str(said))}'; use "
+                "another model, or an object list (describer 'kind: list')",
+                'refused',
+            )
+        return Answer(text, is_cut_off=reason == 'length')
+
+    def _too_slow(self) -> DescriptionError:
+        return DescriptionError(
+            f'{self.identity} did not answer within {self.config.timeout_s:g} s; a larger '
+            "'timeout_s' of the describer waits longer",
+            'timeout',
+        )
+
+    def _unusable(self, what: str) -> DescriptionError:
+        return DescriptionError(
+            f"{self.identity} sent no chat completion: {what}; the describer's 'base_url' has to "
+            'be the root of an OpenAI-compatible API, such as http://localhost:11434/v1'
+        )
+
+    def _failed(self, status: int, text: str) -> DescriptionError:
+        """The error for an HTTP status that is final."""
+        said = f'{self.identity} answers with status {status}: {self._hide_key(excerpt(text))}'
+        budget = f"'retry_budget_s' ({self.config.retry_budget_s:g} s)"
+        if status == 429:
+            return DescriptionError(
+                f'{said}; the rate limit did not clear within {budget}', 'rate_limited'
+            )
+        if status >= 500:
+            return DescriptionError(f'{said}; it did not recover within {budget}', 'server_error')
+        where = {
+            401: f"check the key in '{self.config.key_variable}'",
+            403: f"check the key in '{self.config.key_variable}'",
+            404: "check the describer's 'model' and 'base_url'",
+        }.get(status, "check that 'model' takes images")
+        return DescriptionError(f'{said}; {where}', 'rejected')
+
+    def _hide_key(self, text: str) -> str:
+        """Servers may quote the key; it does not belong into logs and reports."""
+        return text.replace(self._key, '***') if self._key else text
+
+
+class _FormatRefused(Exception):
+    """The server does not take this `response_format`, or dislikes something else."""
+
+
+def _api_key(config: OpenAIConfig) -> str:
+    if not config.key_variable:
+        return ''
+    key = os.environ.get(config.key_variable, '').strip()
+    if not key:
+        raise ConfigError(
+            f"the environment variable '{config.key_variable}' is not set; export the API key of "
+            f"{config.base_url} in it, or set the describer's 'key_variable' to another one ('' "
+            'for a server that needs none)'
+        )
+    return key
+
+
+def _client(config: OpenAIConfig, key: str) -> Any:
+    try:
+        import openai
+    except ImportError as error:
+        raise ConfigError(
+            f"the describer 'openai' needs the package openai ({error}); pip install '.[describe]'"
+        ) from error
+    return openai.OpenAI(
+        api_key=key or 'none',
+        base_url=config.base_url,
+        timeout=config.timeout_s,
+        max_retries=0,  # `attempt` has the only budget
+    )
+
+
+def _messages(frame: ByteArray, turns: Sequence[str]) -> list[Mapping[str, Any]]:
+    """The turns as messages; the frame goes with the first, as PNG, so nothing is lost."""
+    is_encoded, png = cv2.imencode('.png', np.ascontiguousarray(frame[..., ::-1]))
+    assert is_encoded
+    url = f'data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'
+    first = [
+        {'type': 'image_url', 'image_url': {'url': url}},
+        {'type': 'text', 'text': turns[0]},
+    ]
+    later = [
+        {'role': 'user' if index % 2 else 'assistant', 'content': turn}
+        for index, turn in enumerate(turns[1:])
+    ]
+    return [{'role': 'user', 'content': first}, *later]

@@ -1,0 +1,1 @@
+"""Masks of named objects: by colour, with public weights, as recorded."""

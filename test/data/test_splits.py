@@ -1,0 +1,61 @@
+import json
+
+import pytest
+
+from mtv_world_ros.data.splits import select
+from mtv_world_ros.errors import ConfigError, EpisodeError
+
+
+@pytest.fixture
+def dataset(tmp_path, make_episode):
+    """Three episodes, two of them for testing, one with an unseen object."""
+    marks = {'episode_0': None, 'episode_1': '', 'episode_2': 'object'}
+    names = list(marks)
+    for name in names:
+        make_episode(name)
+    card = {
+        'splits': {'train': names[:1], 'test': names[1:]},
+        'episodes': [{'name': name, 'zero_shot': mark} for name, mark in marks.items()],
+    }
+    (tmp_path / 'dataset.json').write_text(json.dumps(card))
+    return tmp_path
+
+
+def names(selection):
+    return [path.name for path in selection.paths]
+
+
+def test_held_out_split_is_the_default_where_there_is_one(dataset):
+    found = select(dataset)
+    assert names(found) == ['episode_1', 'episode_2']
+    assert str(found) == '2 of 3 episodes, split test'
+    assert {path.name: kind for path, kind in found.zero_shot.items()} == {'episode_2': 'object'}
+
+
+def test_splits_are_chosen_by_name(dataset):
+    assert names(select(dataset, 'train')) == ['episode_0']
+    assert len(select(dataset, 'all').paths) == 3
+    assert names(select(dataset, 'all', 2)) == ['episode_0', 'episode_1']
+    with pytest.raises(ConfigError, match="'tests' .*did you mean 'test'"):
+        select(dataset, 'tests')
+
+
+def test_folder_without_a_card_is_scored_whole(dataset):
+    (dataset / 'dataset.json').unlink()
+    found = select(dataset)
+    assert len(found.paths) == 3 and found.split == 'all' and not found.zero_shot
+    with pytest.raises(ConfigError, match="split 'test'.*which has all"):
+        select(dataset, 'test')
+
+
+def test_what_cannot_be_used_is_an_error(dataset, tmp_path_factory):
+    with pytest.raises(EpisodeError, match='holds no episodes'):
+        select(tmp_path_factory.mktemp('empty'))
+    card = json.loads((dataset / 'dataset.json').read_text())
+    card['splits']['test'] = ['gone']
+    (dataset / 'dataset.json').write_text(json.dumps(card))
+    with pytest.raises(EpisodeError, match="split 'test' .* has no episodes"):
+        select(dataset)
+    (dataset / 'dataset.json').write_text('{"splits": 3')
+    with pytest.raises(ConfigError, match='not a data set card'):
+        select(dataset)

@@ -1,0 +1,12 @@
+"""The small episodes, for every test of the replay."""
+
+from small_episodes import episodes, make_episode, make_pipeline, oracle, recordings, robot
+
+__all__ = [
+    'episodes',
+    'make_episode',
+    'make_pipeline',
+    'oracle',
+    'recordings',
+    'robot',
+]

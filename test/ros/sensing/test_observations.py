@@ -1,0 +1,136 @@
+"""Which images and joint states make up an observation."""
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import make_header, NANO
+from mtv_world_ros.ros.sensing.observations import FreshnessLimits, ObservationBuffer
+
+NOW = 1_000 * NANO
+MS = 1_000_000
+
+
+@pytest.fixture
+def make_buffer(ros, tmp_path):
+    cameras = load_calibration(ros.make_calibration(tmp_path / 'calibration.yaml'))
+
+    def make(skew=0.05, joint_names=('a', 'b'), size=(96, 72)):
+        limits = FreshnessLimits(image_age=0.5, joint_state_age=0.5, view_skew=skew)
+        buffer = ObservationBuffer(
+            cameras=[cameras[view] for view in ('low', 'high')],
+            joint_names=joint_names,
+            width=size[0],
+            height=size[1],
+            limits=lambda: limits,
+        )
+        for view in ('low', 'high'):
+            buffer.add_camera_info(view, ros.make_info(view))
+        return buffer
+
+    return make
+
+
+def joints(stamp_ns, **positions):
+    return JointState(
+        header=make_header(stamp_ns), name=list(positions), position=list(positions.values())
+    )
+
+
+def shade(ros, view, stamp_ns, value):
+    image = ros.make_image(view, stamp_ns)
+    image.data = bytes([value]) * len(image.data)
+    return image
+
+
+def test_views_that_arrive_one_after_the_other_are_paired_by_stamp(make_buffer, ros):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for step, value in ((-200, 1), (-100, 2)):
+        for view in ('low', 'high'):
+            buffer.add_image(view, shade(ros, view, NOW + step * MS, value))
+    buffer.add_image('low', shade(ros, 'low', NOW, 3))  # high's is still on its way
+    scene = buffer.observe(NOW)
+    assert scene.observation.stamp_ns == scene.source_stamp_ns == NOW - 100 * MS
+    assert scene.observation.frames[:, 0, 0, 0].tolist() == [2, 2]
+    buffer.add_image('high', shade(ros, 'high', NOW, 3))
+    assert buffer.observe(NOW).observation.frames[:, 0, 0, 0].tolist() == [3, 3]
+
+
+def test_skew_within_the_limit_is_stamped_with_the_older_view(make_buffer, ros):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    buffer.add_image('low', ros.make_image('low', NOW))
+    buffer.add_image('high', ros.make_image('high', NOW - 40 * MS))
+    assert buffer.observe(NOW).observation.stamp_ns == NOW - 40 * MS
+    buffer.add_image('high', ros.make_image('high', NOW - 60 * MS))
+    with pytest.raises(Rejection, match='the views are 0.060 s apart') as refused:
+        buffer.observe(NOW)
+    assert refused.value.reason == Reason.VIEWS_OUT_OF_SYNC
+
+
+def test_joint_states_of_several_publishers_are_merged_at_the_images_time(make_buffer, ros):
+    buffer = make_buffer()
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW - 50 * MS))
+    for step in range(-100, 1, 10):
+        buffer.add_joint_state(joints(NOW + step * MS, a=step, lift=9.0))
+    buffer.add_joint_state(joints(NOW - 30 * MS, b=7.0))
+    np.testing.assert_array_equal(buffer.observe(NOW).observation.positions, [-50, 7])
+
+
+def test_one_joint_that_stopped_is_stale(make_buffer, ros):
+    buffer = make_buffer()
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    buffer.add_joint_state(joints(NOW - 700 * MS, a=0.0, b=0.0))
+    buffer.add_joint_state(joints(NOW, a=0.0))
+    with pytest.raises(Rejection, match="state of joint 'b' is 0.700 s old"):
+        buffer.observe(NOW)
+
+
+def test_an_image_from_the_future_is_forgotten_with_the_next(make_buffer, ros):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW + 10 * NANO))
+    with pytest.raises(Rejection, match='stamped 10.000 s in the future'):
+        buffer.observe(NOW)
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    assert buffer.observe(NOW).observation.stamp_ns == NOW
+
+
+def test_frames_and_cameras_come_at_the_models_size(make_buffer, ros):
+    buffer = make_buffer(size=(48, 36))
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    observation = buffer.observe(NOW).observation
+    assert observation.frames.shape == (2, 36, 48, 3)
+    assert [(c.view, c.width, c.height) for c in observation.cameras] == [
+        ('low', 48, 36),
+        ('high', 48, 36),
+    ]
+    blocks = ros.make_pixels('low')[42:50:2, 26:36:2]
+    np.testing.assert_allclose(observation.frames[0, 21:25, 13:18], blocks, atol=1)
+
+
+def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    buffer.clear()
+    for reason, add in (
+        (Reason.IMAGE_MISSING, lambda: buffer.add_image('low', ros.make_image('low', NOW))),
+        (Reason.IMAGE_MISSING, lambda: buffer.add_image('high', ros.make_image('high', NOW))),
+        (Reason.JOINT_STATE_MISSING, lambda: buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))),
+    ):
+        with pytest.raises(Rejection) as refused:
+            buffer.observe(NOW)
+        assert refused.value.reason == reason
+        add()
+    assert buffer.observe(NOW).observation.stamp_ns == NOW

@@ -1,0 +1,281 @@
+"""Each predicate on hand-made poses, on both sides of each threshold."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.sim.tasks.predicates import (
+    all_of,
+    are_collected,
+    are_inside,
+    are_plates_stacked,
+    beside,
+    ever_and_final,
+    grippers_open,
+    has_moved,
+    History,
+    is_apart,
+    is_at_goal,
+    is_beside,
+    is_served,
+    is_shaken,
+    is_stacked,
+    num_reversals,
+    stacked,
+)
+
+B = np.array([[0.1, 0.3, 0.025]])
+
+
+def _history(places, *, sizes=None, openings=None, starts=None, goals=()):
+    """One object or more standing still; places: role -> (x, y, z) or (T, 3)."""
+    positions = {role: np.atleast_2d(np.asarray(p, float)) for role, p in places.items()}
+    num = max(len(p) for p in positions.values())
+    positions = {
+        role: np.repeat(p, num, 0) if len(p) < num else p for role, p in positions.items()
+    }
+    sizes = dict.fromkeys(places, (0.05, 0.05, 0.05)) | (sizes or {})
+    return History(
+        positions=positions,
+        rotations={role: np.repeat(np.eye(3)[None], num, 0) for role in places},
+        sizes=sizes,
+        openings=np.ones((2, num)) if openings is None else np.asarray(openings, float),
+        starts={role: p[0] for role, p in positions.items()} | (starts or {}),
+        goals=tuple(np.asarray(goal, float) for goal in goals),
+    )
+
+
+def _turned(history, role, yaw):
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+    num = len(history.positions[role])
+    return replace(history, rotations=history.rotations | {role: np.repeat(turn[None], num, 0)})
+
+
+@pytest.mark.parametrize(
+    ('dx', 'dy', 'succeeds'),
+    [
+        (0.13, 0.0, True),
+        (0.081, 0.0, True),
+        (0.079, 0.0, False),
+        (0.199, 0.0, True),
+        (0.201, 0.0, False),
+        (0.13, 0.049, True),
+        (0.13, 0.051, False),
+        (0.13, -0.049, True),
+        (0.13, -0.051, False),
+        (-0.13, 0.0, False),
+    ],
+)
+def test_beside_holds_between_its_thresholds_on_either_side(dx, dy, succeeds):
+    for side in (-1.0, 1.0):
+        history = _history({'a': B + [[side * dx, dy, 0.0]], 'b': B})
+        assert bool(is_beside('a', 'b', side)(history)[0]) is succeeds
+
+
+def test_beside_measures_distance_in_the_plane_not_along_x():
+    # dx alone would be too near, the distance is not
+    assert beside(B + [[-0.07, 0.045, 0.0]], B, -1)
+    assert not beside(B + [[-0.065, 0.045, 0.0]], B, -1)
+
+
+@pytest.mark.parametrize(
+    ('offset', 'succeeds'),
+    [
+        ((0.0, 0.0, 0.05), True),
+        ((0.024, -0.024, 0.05), True),
+        ((0.026, 0.0, 0.05), False),
+        ((0.0, -0.026, 0.05), False),
+        ((0.0, 0.0, 0.0615), True),
+        ((0.0, 0.0, 0.0625), False),
+        ((0.0, 0.0, 0.0385), True),
+        ((0.0, 0.0, 0.0375), False),
+    ],
+)
+def test_stacked_holds_within_its_tolerances(offset, succeeds):
+    assert bool(stacked(B + [offset], B, 0.05)[0]) is succeeds
+
+
+def test_stack_height_is_the_mean_of_both_blocks():
+    sizes = {'a': (0.03, 0.03, 0.03), 'b': (0.05, 0.05, 0.05)}
+    assert is_stacked('a', 'b')(_history({'a': B + [[0, 0, 0.04]], 'b': B}, sizes=sizes)).all()
+    assert not is_stacked('a', 'b')(
+        _history({'a': B + [[0, 0, 0.055]], 'b': B}, sizes=sizes)
+    ).any()
+
+
+def test_grippers_count_as_open_only_if_both_are():
+    openings = np.array([[0.81, 0.81, 0.79], [0.81, 0.79, 0.81]])
+    assert grippers_open(openings).tolist() == [True, False, False]
+
+
+def test_tasks_want_all_their_conditions_and_open_grippers():
+    places = {'a': np.repeat(B + [[-0.13, 0, 0]], 2, 0), 'b': B}
+    history = _history(places, openings=[[0.5, 1.0], [1.0, 1.0]])
+    assert all_of(is_beside('a', 'b', -1))(history).tolist() == [False, True]
+    both = all_of(is_beside('a', 'b', -1), is_beside('a', 'b', 1))
+    assert not both(history).any()
+
+
+@pytest.mark.parametrize(('distance', 'succeeds'), [(0.059, False), (0.061, True)])
+def test_apart(distance, succeeds):
+    history = _history({'a': B, 'b': B + [[0.6 * distance, 0.8 * distance, 0.0]]})
+    assert bool(is_apart('a', 'b')(history)[0]) is succeeds
+
+
+@pytest.mark.parametrize(('distance', 'succeeds'), [(0.099, False), (0.101, True)])
+def test_moved_away_from_its_start(distance, succeeds):
+    history = _history({'a': B + [[0.0, distance, 0.0]]}, starts={'a': B[0]})
+    assert bool(has_moved('a')(history)[0]) is succeeds
+
+
+@pytest.mark.parametrize(
+    ('offset', 'succeeds'),
+    [
+        ((0.0, 0.029, 0.0), True),
+        ((0.0, 0.031, 0.0), False),
+        ((0.022, 0.022, 0.0), False),
+        ((0.0, 0.0, 0.029), True),
+        ((0.0, 0.0, 0.031), False),  # still in the air
+    ],
+)
+def test_at_its_goal(offset, succeeds):
+    history = _history({'a': B + [offset]}, goals=[(9, 9, 9), B[0]])
+    assert bool(is_at_goal(1, 'a')(history)[0]) is succeeds
+
+
+PLATE = {'p': (0.11, 0.11, 0.02)}
+
+
+@pytest.mark.parametrize(
+    ('offset', 'succeeds'),
+    [
+        ((0.0, 0.0, 0.0), True),
+        ((0.034, 0.0, 0.0), True),
+        ((0.036, 0.0, 0.0), False),
+        ((0.026, 0.026, 0.0), False),
+        ((0.0, 0.0, 0.0149), True),
+        ((0.0, 0.0, 0.0151), False),
+        ((0.0, 0.0, -0.0151), False),
+    ],
+)
+def test_served_on_the_floor_of_a_plate(offset, succeeds):
+    # a cup of 6 cm whose bottom is on the plate's floor, 5 mm over the table
+    rest = np.array([0.0, 0.3, 0.005 + 0.03])
+    history = _history(
+        {'a': rest + offset, 'p': (0.0, 0.3, 0.01)}, sizes=PLATE | {'a': (0.05, 0.05, 0.06)}
+    )
+    assert bool(is_served('a', 'p')(history)[0]) is succeeds
+
+
+@pytest.mark.parametrize(
+    ('offset', 'succeeds'),
+    [
+        ((0.0, 0.0, 0.02), True),
+        ((0.039, 0.0, 0.02), True),
+        ((0.041, 0.0, 0.02), False),
+        ((0.0, 0.0, 0.029), True),
+        ((0.0, 0.0, 0.031), False),
+        ((0.0, 0.0, 0.005), True),  # nested
+        ((0.0, 0.0, -0.011), False),
+    ],
+)
+def test_plates_stacked(offset, succeeds):
+    lower = np.array([0.0, 0.3, 0.01])
+    history = _history({'a': lower + offset, 'p': lower}, sizes=PLATE | {'a': (0.11, 0.11, 0.02)})
+    assert bool(are_plates_stacked('a', 'p')(history)[0]) is succeeds
+
+
+BASKET = {'c': (0.15, 0.12, 0.05)}
+CENTRE = np.array([0.0, 0.3, 0.025])
+
+
+@pytest.mark.parametrize(
+    ('offset', 'succeeds'),
+    [
+        ((0.049, 0.0, 0.0), True),
+        ((0.051, 0.0, 0.0), False),
+        ((0.03, 0.041, 0.0), False),
+        ((0.0, 0.0, -0.019), True),
+        ((0.0, 0.0, -0.021), False),  # through the floor
+        ((0.0, 0.0, 0.054), True),
+        ((0.0, 0.0, 0.056), False),  # still over the wall
+    ],
+)
+def test_collected_near_the_middle_and_in_the_height_band(offset, succeeds):
+    history = _history({'a': CENTRE + offset, 'b': CENTRE, 'c': CENTRE}, sizes=BASKET)
+    assert bool(are_collected(('a', 'b'), 'c')(history)[0]) is succeeds
+    assert bool(are_collected(('b', 'a'), 'c')(history)[0]) is succeeds
+
+
+@pytest.mark.parametrize(
+    ('offset', 'inside', 'wholly'),
+    [
+        ((0.049, 0.0, 0.0), True, True),
+        ((0.051, 0.0, 0.0), True, False),
+        ((0.074, 0.0, 0.0), True, False),
+        ((0.076, 0.0, 0.0), False, False),
+        ((0.0, 0.061, 0.0), False, False),
+    ],
+)
+def test_inside_by_centre_or_by_footprint_also_where_the_container_is_turned(
+    offset, inside, wholly
+):
+    sizes = BASKET | {'a': (0.05, 0.03, 0.05)}
+    for yaw in (0.0, 0.7):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        turned = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]]) @ offset
+        history = _turned(_history({'a': CENTRE + turned, 'c': CENTRE}, sizes=sizes), 'c', yaw)
+        assert bool(are_inside(('a',), 'c')(history)[0]) is inside
+        assert bool(are_inside(('a',), 'c', footprint=True)(history)[0]) is wholly
+
+
+def _swinging(angles):
+    """Axes (T, 3) that lean by `angles` in a slanting plane."""
+    angles = np.asarray(angles)
+    along = np.array([0.6, 0.8])
+    return np.column_stack([np.sin(angles)[:, None] * along, np.cos(angles)])
+
+
+def test_reversals_count_turns_back_by_more_than_the_swing():
+    assert num_reversals(_swinging([0, 0.2, 0.4, 0.3, 0.1])).tolist() == [0, 0, 0, 0, 1]
+    assert num_reversals(_swinging([0, 0.4, 0.0, 0.4, 0.0]))[-1] == 3
+    assert num_reversals(_swinging([0, 0.4, 0.26, 0.4, 0.26]))[-1] == 0  # by 0.14 only
+    assert num_reversals(_swinging([0, 0.1, 0.2, 0.3, 0.4]))[-1] == 0
+    assert num_reversals(_swinging([0.0]))[-1] == 0
+
+
+def _shaken(angles, heights):
+    angles = np.asarray(angles, float)
+    places = np.column_stack([np.zeros((len(angles), 2)), heights])
+    history = _history({'a': places}, sizes={'a': (0.05, 0.05, 0.1)})
+    axes = _swinging(angles)
+    rotations = np.repeat(np.eye(3)[None], len(angles), 0)
+    rotations[:, :, 2] = axes
+    return is_shaken('a')(replace(history, rotations={'a': rotations}))
+
+
+def test_shaken_wants_two_reversals_while_lifted_and_stays_true():
+    swings = [0, 0.4, 0.0, 0.4, 0.0, 0.0]
+    assert _shaken(swings, [0.05, 0.15, 0.15, 0.15, 0.15, 0.05]).tolist() == [
+        False, False, False, True, True, True,
+    ]  # fmt: skip
+    assert not _shaken(swings, [0.1] * 6).any()  # lowest point at 5 cm
+    assert not _shaken([0, 0.4, 0.0, 0.0, 0.0, 0.0], [0.15] * 6).any()
+
+
+@pytest.mark.parametrize(('height', 'succeeds'), [(0.1115, True), (0.1085, False)])
+def test_lifted_is_measured_at_the_lowest_point(height, succeeds):
+    # upright at the moments that count: bottom at 6 cm where the centre is at 11 cm
+    heights = [0.05, 0.2, height, 0.2, height]
+    assert bool(_shaken([0, 0.4, 0.0, 0.4, 0.0], heights)[-1]) is succeeds
+
+
+def test_final_wants_success_in_each_of_the_last_samples():
+    held = np.array([False, True, True, True])
+    assert ever_and_final(held, held=3) == (True, True)
+    assert ever_and_final(held, held=4) == (True, False)
+    assert ever_and_final(np.array([True, False]), held=1) == (True, False)
+    assert ever_and_final(np.zeros(4, dtype=bool), held=1) == (False, False)
+    assert ever_and_final(np.ones(2, dtype=bool), held=5) == (True, False)

@@ -1,0 +1,139 @@
+"""Which describer a YAML file brings; and the object list, which is one too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mtv_world_ros.assembly import assemble_describer
+from mtv_world_ros.errors import ConfigError, DescriptionError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.vision.describers.config import describer_config, load_describer_config
+from mtv_world_ros.vision.describers.describer import InstructionDescriber
+from mtv_world_ros.vision.describers.object_list import load_object_list
+from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
+from mtv_world_ros.vision.describers.scene_objects import names_of
+
+FRAME = np.zeros((4, 4, 3), np.uint8)
+OBJECTS = """
+objects: [cup, {name: blue bowl, role: container}]
+instructions:
+  Stack the red  block on the blue block.: [red block, blue block]
+  wait: []
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_without_a_configuration_the_instruction_names_the_objects():
+    assert isinstance(assemble_describer(), InstructionDescriber)
+
+
+def test_the_file_that_is_shipped_is_valid_with_each_of_its_variants():
+    shipped = share_path('config', 'describer.yaml')
+    assert load_describer_config(shipped).kind == 'instruction'
+    paragraphs = shipped.read_text().split('\n\n')[1:]
+    for kind, paragraph in zip(('list', 'openai', 'local'), paragraphs, strict=False):
+        lines = [line.removeprefix('# ') for line in paragraph.splitlines()]
+        config = describer_config(yaml.safe_load('\n'.join(lines)))
+        assert config.kind == kind
+        assert getattr(config, kind)
+
+
+def test_an_object_list_is_found_beside_the_file_that_names_it(tmp_path):
+    write(tmp_path / 'objects.yaml', OBJECTS)
+    file = write(tmp_path / 'describer.yaml', 'kind: list\nlist: objects.yaml\n')
+    describer = assemble_describer(file)
+    stack = describer.describe(FRAME, 'stack the red block on the blue block')
+    assert names_of(stack) == ('red block', 'blue block')
+    assert describer.describe(FRAME, 'wait') == ()
+    others = describer.describe(FRAME, 'anything else')
+    assert names_of(others) == ('cup', 'blue bowl')
+    assert others[1].role == 'container'
+
+
+def test_an_instruction_that_is_not_listed_is_an_error_not_an_empty_scene(tmp_path):
+    text = 'instructions: {stack the red block on the blue block: [red block]}'
+    listed = load_object_list(write(tmp_path / 'objects.yaml', text))
+    with pytest.raises(DescriptionError) as caught:
+        listed.describe(FRAME, 'stack the red block on the blue blok')
+    assert caught.value.status == 'unlisted'
+    assert "did you mean 'stack the red block on the blue block'?" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('object: [cup]', "unknown key 'object' (did you mean 'objects'?)"),
+        ('', "needs the key 'objects'"),
+        ('[cup]', "needs the key 'objects'"),
+        ('objects: cup', 'has to be a list'),
+        ('objects:', 'has to be a list'),
+        ('objects: [{nam: cup}]', "did you mean 'name'?"),
+        ('objects: [cup, cup]', "name 'cup' is given to more than one object"),
+        ('instructions: [cup]', "'instructions' has to map"),
+        ('instructions: {take it: [{name: cup, role: cup}]}', "instruction 'take it'"),
+        ('objects: [', 'cannot be read'),
+    ],
+)
+def test_a_wrong_object_list_says_what_and_where(tmp_path, text, words):
+    file = write(tmp_path / 'objects.yaml', text)
+    with pytest.raises(ConfigError) as caught:
+        load_object_list(file)
+    assert words in str(caught.value) and str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('kind: opnai', "kind 'opnai' is none (did you mean 'openai'?)"),
+        ('kind: openai', "needs the key 'openai'"),
+        ('kind: list', "needs the key 'list'"),
+        ('kind: [openai]', "'kind' is ['openai']; expected a text"),
+        ('cach: x', "unknown key 'cach' (did you mean 'cache'?)"),
+        ('kind: openai\nopenai: {base_url: x}', "openai: key 'model' is missing"),
+        ('kind: openai\nopenai: {model: x, timeout: 3}', "did you mean 'timeout_s'?"),
+        ('kind: openai\nopenai: {model: x, timeout_s: 0}', 'a positive number'),
+        ('kind: openai\nopenai: {model: x, timeout_s: true}', 'a positive number'),
+        ('kind: openai\nopenai: {model: x, timeout_s: .nan}', 'a positive number'),
+        ('kind: local\nlocal: {model: x, max_new_tokens: 1.5}', 'a positive whole number'),
+        ('kind: local\nlocal: [x]', 'local: expected keys and values'),
+        ('- kind', 'expected keys and values'),
+        ('kind: {', 'cannot be read'),
+    ],
+)
+def test_a_wrong_configuration_says_what_and_where(tmp_path, text, words):
+    file = write(tmp_path / 'describer.yaml', text)
+    with pytest.raises(ConfigError) as caught:
+        assemble_describer(file)
+    assert words in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ConfigError, match='nowhere.yaml'):
+        assemble_describer(tmp_path / 'nowhere.yaml')
+
+
+def test_numbers_of_a_file_reach_the_client(tmp_path, monkeypatch):
+    pytest.importorskip('openai')
+    text = """
+    kind: openai
+    openai: {model: doubao, base_url: 'http://127.0.0.1:1/v1', key_variable: MY_KEY, timeout_s: 7}
+    cache: answers
+    """
+    file = write(tmp_path / 'describer.yaml', text)
+    with pytest.raises(ConfigError, match="'MY_KEY' is not set"):
+        assemble_describer(file)
+    monkeypatch.setenv('MY_KEY', 'secret')
+    describer = assemble_describer(file)
+    assert describer.chat.config == OpenAIConfig(
+        model='doubao', base_url='http://127.0.0.1:1/v1', key_variable='MY_KEY', timeout_s=7.0
+    )
+    assert describer.cache.folder == tmp_path / 'answers'
+    assert describer.chat._client.max_retries == 0
