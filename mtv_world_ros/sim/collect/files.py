@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import write_whole
 
 #: what to do where something cannot be written
 GO_ON = 'finished episodes are kept, so run the same command again once there is room'
