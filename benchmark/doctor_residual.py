@@ -17,8 +17,8 @@ import numpy as np
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector
-from mtv_world_ros.inspection.joint_track import JointTrack
 from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
 from mtv_world_ros.inspection.robot_shape import load_shape, rods
 

@@ -37,7 +37,7 @@ from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 from mtv_world_ros.evaluation.report.summary import Summary
 from mtv_world_ros.files import write_json
 from mtv_world_ros.history import History
-from mtv_world_ros.model.history_settings import HistorySettings
+from mtv_world_ros.model.history_tokens import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.training.run import spread

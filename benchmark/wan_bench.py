@@ -19,7 +19,7 @@ from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, sample_latents
-from mtv_world_ros.model.serving.followers import Followers
+from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import prepare
 from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS

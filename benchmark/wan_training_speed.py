@@ -32,8 +32,8 @@ from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
+from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.training.speed import ideal_seconds, measured_peak
 from mtv_world_ros.training.trainer import Trainer
 
 

@@ -1,4 +1,4 @@
-"""Where files that are not code lie, and what tells one folder of them from another."""
+"""Files that are not code: where bundled ones lie, digests, writing them whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Collection, Mapping
 import hashlib
 import json
 import math
+import os
 from pathlib import Path
 import sys
 from typing import Any
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.whole_files import write_whole
 
 PACKAGE = 'mtv_world_ros'
 
@@ -78,3 +78,24 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Writes a file beside its name and renames it, in a folder that is made where it is missing.
+
+    Args:
+        path: the file; what was there before stays until the new content is complete.
+        content: text is written as UTF-8.
+
+    Raises:
+        OSError: it cannot be written; what was there before is still there.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    beside = path.with_name(f'.{path.name}.{os.getpid()}.part')  # others may write the same file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        beside.write_bytes(data)
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise

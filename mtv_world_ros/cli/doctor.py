@@ -12,8 +12,8 @@ from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
-    from mtv_world_ros.inspection.findings import Inspection
     from mtv_world_ros.inspection.inspect import Inspector
+    from mtv_world_ros.inspection.report import Inspection
 
 
 def add(commands: argparse._SubParsersAction) -> None:

@@ -23,9 +23,9 @@ from mtv_world_ros.evaluation.metrics.statistics import episode_means, QUALITY
 from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video import compare
 from mtv_world_ros.evaluation.video_file import decode_video, encode_video
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
-from mtv_world_ros.whole_files import write_whole
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

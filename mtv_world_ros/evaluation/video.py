@@ -12,8 +12,8 @@ import numpy as np
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation.video_file import encode_video
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.whole_files import write_whole
 
 #: kinds of frames, in the order of rows and columns
 KINDS = ('real', 'trajectory', 'imagined')

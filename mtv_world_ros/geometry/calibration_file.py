@@ -12,8 +12,8 @@ import yaml
 from mtv_world_ros.config import check_keys, read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.transforms import is_rigid, pose
-from mtv_world_ros.whole_files import write_whole
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
          'T_mount_camera', 'position', 'quaternion_xyzw')  # fmt: skip

@@ -1,4 +1,4 @@
-"""Where objects are in space, from their masks in calibrated views."""
+"""Where objects are in space, from their masks in views; how often one that swings turns back."""
 
 from __future__ import annotations
 
@@ -113,3 +113,24 @@ def moved_mask(
 def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
     """Distance along the optical axis [m]."""
     return float(T_base_camera[:3, 2] @ (point - T_base_camera[:3, 3]))
+
+
+def count_reversals(angles: FloatArray, swing: float) -> FloatArray:
+    """Returns (T,) how often the angle has turned back by more than `swing` so far.
+
+    Args:
+        angles: (T,) without jumps of whole turns [rad].
+        swing: smaller turns are noise [rad].
+    """
+    counts, count, heading = np.zeros(len(angles)), 0, 0
+    extreme = angles[0] if len(angles) else 0.0
+    for k, angle in enumerate(angles):
+        if heading == 0:
+            if abs(angle - extreme) > swing:
+                heading, extreme = int(np.sign(angle - extreme)), angle
+        elif heading * (angle - extreme) > 0:
+            extreme = angle
+        elif heading * (extreme - angle) > swing:
+            count, heading, extreme = count + 1, -heading, angle
+        counts[k] = count
+    return counts

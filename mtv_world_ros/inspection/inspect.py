@@ -21,9 +21,8 @@ from mtv_world_ros.inspection.clocks import (
     check_rate,
     check_skew,
     ClockConfig,
+    JointTrack,
 )
-from mtv_world_ros.inspection.findings import broken, Finding, Inspection, Section, suspicious
-from mtv_world_ros.inspection.joint_track import JointTrack
 from mtv_world_ros.inspection.motion_residual import (
     measure_residual,
     MotionResidual,
@@ -31,6 +30,7 @@ from mtv_world_ros.inspection.motion_residual import (
 )
 from mtv_world_ros.inspection.overlay import overlay_picture
 from mtv_world_ros.inspection.projection_checks import check_limits, check_visibility
+from mtv_world_ros.inspection.report import broken, Finding, Inspection, Section, suspicious
 from mtv_world_ros.inspection.robot_shape import load_shape, RobotShape
 
 Checked = tuple[dict[str, str], list[Finding]]

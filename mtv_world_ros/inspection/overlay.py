@@ -11,9 +11,8 @@ from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.inspection.joint_track import JointTrack
-from mtv_world_ros.inspection.robot_shape import LinkShape
-from mtv_world_ros.inspection.silhouettes import draw_silhouettes
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.inspection.robot_shape import draw_silhouettes, LinkShape
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,

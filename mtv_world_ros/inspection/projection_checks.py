@@ -9,7 +9,7 @@ import numpy as np
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.inspection.findings import broken, Finding, suspicious
+from mtv_world_ros.inspection.report import broken, Finding, suspicious
 
 #: share of the frames in which at least one tool should be in the image
 _LEAST_IN_IMAGE = 0.5

@@ -1,11 +1,13 @@
-"""The inspection as Markdown."""
+"""What an inspection found: findings, verdicts, the report of a recording and its Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from mtv_world_ros.inspection.findings import Inspection, Section
-
+#: from best to worst
+VERDICTS = ('ok', 'suspicious', 'broken')
 _ADVICE = {
     'ok': 'Nothing wrong was found.',
     'suspicious': 'Look at the overlay pictures before you rely on this recording.',
@@ -15,6 +17,73 @@ _LEGEND = (
     'Pictures: a cross at each tool point and the trail of the last 2 s in the colour of the arm, '
     'and white the outline of the robot as it is drawn.'
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """Something wrong: a verdict worse than `ok`, and why in a sentence."""
+
+    verdict: str
+    text: str
+
+
+def suspicious(text: str) -> Finding:
+    """A finding that may be harmless."""
+    return Finding(verdict='suspicious', text=text)
+
+
+def broken(text: str) -> Finding:
+    """A finding that makes the view or the recording useless."""
+    return Finding(verdict='broken', text=text)
+
+
+def worst(verdicts: Sequence[str]) -> str:
+    """The worst of some verdicts; `ok` if there is none."""
+    return max(verdicts, key=VERDICTS.index, default='ok')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """One view, or what concerns all views (joints, commands, clocks).
+
+    Attributes:
+        name: of the view, or `recording`.
+        measures: what was measured, as text, by name.
+        findings: what is wrong.
+        notes: what could not be checked and why, and other things to know.
+    """
+
+    name: str
+    measures: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The worst of the findings."""
+        return worst([finding.verdict for finding in self.findings])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """All of a recording.
+
+    Attributes:
+        episode: its path.
+        robot: name of the robot it was checked against.
+        views: a section for each view.
+        recording: what concerns all views.
+    """
+
+    episode: Path
+    robot: str
+    views: tuple[Section, ...]
+    recording: Section
+
+    @property
+    def verdict(self) -> str:
+        """The worst of all sections."""
+        return worst([section.verdict for section in (*self.views, self.recording)])
 
 
 def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:

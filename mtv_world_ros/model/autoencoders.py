@@ -1,7 +1,4 @@
-"""A tiny autoencoder of Wan's latent space, for speed: TAEHV's architecture and weight files.
-
-Layout after madebyollin/taehv (`taew2_1`): frames pass convolutions one by one; a memory block
-also sees the frame before, at its own depth.
+"""Autoencoders: Wan's own, a tiny one of its latent space, and pixels rearranged.
 
 Shapes: B batch, N = 1 + 4 k frames, F = 1 + k latent frames, H W pixels, h w = H / 8, W / 8.
 """
@@ -11,6 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from diffusers import AutoencoderKLWan, ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
 import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
@@ -76,6 +75,8 @@ class TinyAutoencoder(nn.Module):
     """Maps RGB video in [-1, 1] to Wan's normalised latents and back, nearly as Wan's own does.
 
     It takes the place of a `WanAutoencoder`; at 288x384, 81 frames it costs about a twentieth.
+    Layout and weight files are TAEHV's (madebyollin/taehv, `taew2_1`): frames pass convolutions
+    one by one; a memory block also sees the frame before, at its own depth.
     """
 
     includes_start = True
@@ -178,3 +179,121 @@ def _fitting(file: Path, name: str, value: Tensor, shape: torch.Size) -> Tensor:
             '(taew2_1 of TAEHV)'
         )
     return value
+
+
+class WanAutoencoder(nn.Module):
+    """Maps RGB video in [-1, 1] to normalised latents and back: 8x in space, 4x in time.
+
+    The first latent frame holds the first video frame alone, each further one holds four: a video
+    has 1 + 4 k frames. So a chunk is encoded together with the observed frame that it starts from
+    (`includes_start`), and that frame is dropped after decoding.
+
+    Shapes: B batch, N = 1 + 4 k frames, F = 1 + k latent frames, H W pixels, h w = H / 8, W / 8.
+    """
+
+    includes_start = True
+
+    def __init__(self, vae: AutoencoderKLWan) -> None:
+        super().__init__()
+        self.vae = vae
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of the latents."""
+        return self.vae.config['z_dim']
+
+    @property
+    def frames_per_latent(self) -> int:
+        """Video frames in a latent frame, but for the first one."""
+        return self.vae.config['scale_factor_temporal']
+
+    @property
+    def pixels_per_latent(self) -> int:
+        """Width and height of a latent position in pixels."""
+        return self.vae.config['scale_factor_spatial']
+
+    def num_latent_frames(self, num_frames: int) -> int:
+        """Latent frames that denoising a chunk of T frames takes: the start's and T / 4."""
+        return 1 + num_frames // self.frames_per_latent
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the weights."""
+        return self.vae.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.vae.device
+
+    @property
+    def config(self) -> Any:
+        """The arguments that it was built with."""
+        return self.vae.config
+
+    def encode(self, video: Tensor) -> Tensor:
+        """Returns (B, C, F, h, w) latents, zero mean and unit scale, of a (B, 3, N, H, W) video.
+
+        The most likely latents, not a sample: the same video gives the same latents.
+        """
+        latents = self.vae.encode(video, return_dict=False)[0].mode()
+        mean, std = self._statistics(latents)
+        return (latents - mean) / std
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Returns the (B, 3, N, H, W) video of (B, C, F, h, w) latents."""
+        mean, std = self._statistics(latents)
+        return self.vae.decode(latents * std + mean, return_dict=False)[0]  # type: ignore[index]
+
+    def save_pretrained(self, folder: Path, **options: Any) -> None:
+        """Writes it as diffusers' own class."""
+        self.vae.save_pretrained(folder, **options)
+
+    def _statistics(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        shape = (1, -1, 1, 1, 1)
+        mean, std = (
+            torch.tensor(self.vae.config[name], device=like.device, dtype=like.dtype)
+            for name in ('latents_mean', 'latents_std')
+        )
+        return mean.reshape(shape), std.reshape(shape)
+
+
+class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
+    """Maps RGB video in [-1, 1] to latents of `3 * block_size**2` channels and back, exactly.
+
+    A learned autoencoder beside a model as small as `small` costs more than it gives (measured,
+    see `benchmark/results/`). The interface is that of diffusers' as far as it is used.
+
+    Shapes: B batch, F frames, H W pixels, h w = H / block_size, W / block_size.
+    """
+
+    #: whether a chunk is encoded and denoised together with the frame that it starts from
+    includes_start = False
+
+    @register_to_config
+    def __init__(self, block_size: int = 2) -> None:
+        super().__init__()
+        self.block_size = block_size
+        # ModelMixin asks a parameter for device and dtype; a buffer serves both.
+        self.register_buffer('scale', torch.ones(()), persistent=True)
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of the latents."""
+        return 3 * self.block_size**2
+
+    def num_latent_frames(self, num_frames: int) -> int:
+        """Latent frames that denoising a chunk of T frames takes."""
+        return num_frames
+
+    def encode(self, video: Tensor) -> Tensor:
+        """Returns (B, C, F, h, w) latents of a (B, 3, F, H, W) video."""
+        frames = video.transpose(1, 2).flatten(0, 1)
+        latents = F.pixel_unshuffle(frames, self.block_size) * self.scale
+        return latents.unflatten(0, (video.shape[0], -1)).transpose(1, 2)
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Returns the (B, 3, F, H, W) video of (B, C, F, h, w) latents."""
+        frames = latents.transpose(1, 2).flatten(0, 1)
+        video = F.pixel_shuffle(frames / self.scale, self.block_size)
+        return video.unflatten(0, (latents.shape[0], -1)).transpose(1, 2)

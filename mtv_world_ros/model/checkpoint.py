@@ -15,8 +15,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.card import CARD, check_card, read_card
-from mtv_world_ros.model.encoders import TextEncoder
-from mtv_world_ros.model.image_encoder import ImageEncoder
+from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.tensor_files import open_tensors, PICKLES

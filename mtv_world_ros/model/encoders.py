@@ -1,19 +1,25 @@
-"""umT5: the instruction as tokens for the transformer's cross-attention."""
+"""Context of the transformer's cross-attention: umT5 for instructions, CLIP for start images."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from pathlib import Path
 import shutil
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import nn, Tensor
+import torch.nn.functional as F
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
 
 FOLDERS = ('text_encoder', 'tokenizer')
+#: mean and standard deviation of the colours that CLIP was trained with
+_MEAN = (0.48145466, 0.4578275, 0.40821073)
+_STD = (0.26862954, 0.26130258, 0.27577711)
+_FOLDER = 'image_encoder'
 
 
 class TextEncoder:
@@ -78,3 +84,76 @@ class TextEncoder:
         """Copies its files into another checkpoint."""
         for name in FOLDERS:
             shutil.copytree(self._checkpoint / name, checkpoint / name)
+
+
+class ImageEncoder:
+    """Encodes images to the tokens before CLIP's last layer, as Wan does.
+
+    The last few images' tokens are kept: the seeds of a start frame and a chain that is anchored
+    on one encode it once.
+
+    Args:
+        model: transformers' `CLIPVisionModel`.
+        source: the checkpoint it came from.
+        num_kept: images whose tokens are kept.
+    """
+
+    def __init__(self, model: nn.Module, source: Path, num_kept: int = 8) -> None:
+        self.model: Any = model
+        self._source, self._num_kept = source, num_kept
+        self._kept: OrderedDict[bytes, Tensor] = OrderedDict()
+        self._device, self._stays = torch.device('cpu'), True
+
+    @classmethod
+    def load(cls, checkpoint: Path, *, dtype: torch.dtype = torch.float32) -> ImageEncoder:
+        """Returns the one of a checkpoint folder.
+
+        Raises:
+            CheckpointError: it is missing or cannot be loaded.
+        """
+        folder = checkpoint / _FOLDER
+        try:
+            model = import_transformers().CLIPVisionModel.from_pretrained(
+                str(folder), dtype=dtype, local_files_only=True, use_safetensors=True
+            )
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"'{folder}' cannot be loaded: {error}") from error
+        return cls(model.eval(), checkpoint)
+
+    def to(self, device: torch.device, dtype: torch.dtype, *, stays: bool = True) -> ImageEncoder:
+        """Moves it, and returns it; `stays=False`: it is there only while it encodes."""
+        self._device, self._stays = device, stays
+        self.model.to(device=device if stays else 'cpu', dtype=dtype)
+        self._kept.clear()
+        return self
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Returns (V, N, D) tokens of (V, H, W, 3) uint8 RGB images; N = 257 for ViT-H/14."""
+        tokens = torch.stack([self._tokens(image) for image in images])
+        if not self._stays:
+            self.model.to('cpu')
+        return tokens
+
+    def _tokens(self, image: Tensor) -> Tensor:
+        key = repr(tuple(image.shape)).encode() + image.cpu().numpy().tobytes()
+        if key not in self._kept:
+            self._kept[key] = self._encode(image)
+            if len(self._kept) > self._num_kept:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    @torch.inference_mode()
+    def _encode(self, image: Tensor) -> Tensor:
+        self.model.to(self._device)
+        size = self.model.config.image_size
+        pixels = image.to(self.model.device).movedim(-1, 0)[None].float().div(255)
+        # the whole image, squeezed to a square: Wan crops nothing
+        pixels = F.interpolate(pixels, (size, size), mode='bicubic', align_corners=False)
+        mean, std = (pixels.new_tensor(x)[:, None, None] for x in (_MEAN, _STD))
+        pixels = ((pixels - mean) / std).to(self.model.dtype)
+        return self.model(pixels, output_hidden_states=True).hidden_states[-2][0]
+
+    def save(self, checkpoint: Path) -> None:
+        """Copies its files into another checkpoint."""
+        shutil.copytree(self._source / _FOLDER, checkpoint / _FOLDER)

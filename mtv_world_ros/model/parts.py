@@ -13,9 +13,11 @@ from diffusers import (
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError, nearest
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
-from mtv_world_ros.model.autoencoders import TinyAutoencoder
-from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
+from mtv_world_ros.model.autoencoders import (
+    SpaceToDepthAutoencoder,
+    TinyAutoencoder,
+    WanAutoencoder,
+)
 
 Autoencoder: TypeAlias = SpaceToDepthAutoencoder | WanAutoencoder | TinyAutoencoder
 Scheduler: TypeAlias = FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler

@@ -22,9 +22,9 @@ from mtv_world_ros.model.conditioning import (
     Conditioning,
     decode_frames,
 )
-from mtv_world_ros.model.history_settings import history_settings
 from mtv_world_ros.model.history_tokens import (
     check_history,
+    history_settings,
     with_anchor,
     with_history,
     without_history,
@@ -33,7 +33,7 @@ from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.model.serving.followers import Followers
+from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.memory_check import check_memory
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import decoder_of, prepare

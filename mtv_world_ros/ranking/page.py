@@ -7,10 +7,9 @@ from pathlib import Path
 from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
 from mtv_world_ros.evaluation.report.html import document
 from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
-from mtv_world_ros.files import write_json
+from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.ranking.report import grids, markdown, remarks, TITLE
 from mtv_world_ros.ranking.summary import ALL_TASKS, JUDGES, Summary
-from mtv_world_ros.whole_files import write_whole
 
 #: hues of the report's style sheet
 _NUM_HUES = 6

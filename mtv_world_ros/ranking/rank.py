@@ -73,7 +73,7 @@ def _scored(
     jobs: Sequence[Job], make: Callable[[], Any], workers: int, ray_address: str | None
 ) -> Iterator[tuple[Job, Outcome]]:
     if ray_address is not None:
-        from mtv_world_ros.ranking.ray_workers import score_with_ray
+        from mtv_world_ros.parallel import score_with_ray
 
         return score_with_ray(jobs, make, workers, ray_address)
     threads = max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)

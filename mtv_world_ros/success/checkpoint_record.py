@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mtv_world_ros.errors import CheckpointError, nearest
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import write_whole
 
 Record = TypeVar('Record')
 

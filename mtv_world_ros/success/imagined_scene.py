@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.geometry.mask_geometry import block_size, Location
-from mtv_world_ros.geometry.swings import count_reversals
+from mtv_world_ros.geometry.mask_geometry import block_size, count_reversals, Location
 from mtv_world_ros.success.goal_pictures import Picture, PictureMasks
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.success.views import Views

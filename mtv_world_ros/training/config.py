@@ -14,7 +14,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import spec_of
-from mtv_world_ros.model.history_settings import HistorySettings
+from mtv_world_ros.model.history_tokens import HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.training.optimizer_config import LoraSettings, OptimizerConfig
 

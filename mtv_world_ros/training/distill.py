@@ -16,7 +16,7 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.model.card import spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning
-from mtv_world_ros.model.history_settings import history_settings
+from mtv_world_ros.model.history_tokens import history_settings
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, flow_of

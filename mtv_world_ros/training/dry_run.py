@@ -1,10 +1,11 @@
-"""What a training step of a preset takes, found without weights, data or memory for them."""
+"""What a training step of a preset takes, and how fast a machine could do it at best."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import time
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from mtv_world_ros.model.action_features import EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
+from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
@@ -24,6 +26,11 @@ _FLOAT = 4
 #: CLIP tokens of an image
 _IMAGE_TOKENS = 257
 _GIB = 2**30
+#: rows and columns of the matrices that are multiplied
+_SIZE = {'cpu': 1024, 'cuda': 8192}
+#: products between two waits for the device: on a GPU waiting takes a share of one
+_TOGETHER = {'cpu': 1, 'cuda': 10}
+_REPEATS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,3 +224,38 @@ def _latent_size(config: TrainingConfig) -> tuple[int, int, int, int]:
     count = config.history.num_frames
     num_history = count and autoencoder.num_latent_frames(count - int(autoencoder.includes_start))
     return frames, num_history, video.height // block, video.width // block
+
+
+def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
+    """Returns operations a second of the fastest of some products of large matrices.
+
+    On a CPU with the threads that torch has now; what else runs there at the time lowers it.
+    """
+    size = _SIZE.get(device.type, _SIZE['cuda'])
+    together = _TOGETHER.get(device.type, _TOGETHER['cuda'])
+    left, right = (torch.randn(size, size, device=device, dtype=dtype) for _ in range(2))
+    fastest = float('inf')
+    for _ in range(_REPEATS):
+        started = time.perf_counter()
+        for _ in range(together):
+            product = left @ right
+        product[0, 0].item()  # waits for the device
+        fastest = min(fastest, time.perf_counter() - started)
+    return together * 2 * size**3 / fastest
+
+
+def ideal_seconds(
+    config: TrainingConfig,
+    actions: ActionEncoding | None,
+    dtype: torch.dtype,
+    flops: float,
+) -> float:
+    """Returns the time of a step whose forward and backward run at a peak of operations a second.
+
+    The transformer's alone: encoding, and what gradient checkpointing computes again, is not the
+    model's arithmetic.
+    """
+    dim = 0 if actions is None else actions.dim
+    optimizer = replace(config.optimizer, gradient_checkpointing=False)
+    config = replace(config, optimizer=optimizer)
+    return step_cost(config, action_dim=dim, dtype=dtype).step_flop / flops

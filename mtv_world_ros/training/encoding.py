@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.conditioning import (
     condition,
     condition_on_actions,
     Conditioning,
     encode_chunk,
 )
-from mtv_world_ros.model.history_settings import HistorySettings
-from mtv_world_ros.model.history_tokens import with_anchor, with_history
-from mtv_world_ros.model.image_encoder import ImageEncoder
+from mtv_world_ros.model.encoders import ImageEncoder
+from mtv_world_ros.model.history_tokens import HistorySettings, with_anchor, with_history
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.batches import Batch

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 import json
 from pathlib import Path
 
@@ -10,24 +11,23 @@ import torch
 from tqdm import tqdm
 
 from mtv_world_ros.data.episode_reader import list_episodes
-from mtv_world_ros.data.recording import Recording
+from mtv_world_ros.data.recording import clip_starts, Recording
 from mtv_world_ros.data.recording_cache import cached_recording
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.errors import EpisodeError, MtvWorldError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import CARD
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions
 from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.held_out import HeldOut
 from mtv_world_ros.training.latent_cache.cached_batches import CachedSource
 from mtv_world_ros.training.latent_cache.latent_run import cached
-from mtv_world_ros.training.left_out import check_clips, counted, num_dropped
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.resume import disk_errors_named, DiskError
-from mtv_world_ros.training.speed import ideal_seconds, measured_peak
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -234,3 +234,39 @@ def _loop(
             log.add(report)
             if held_out is not None and is_main:
                 held_out.after(report.step, trainer, log)
+
+
+def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
+    """Refuses an episode that no clip can be cut from.
+
+    Raises:
+        EpisodeError: it is too short, or frames are missing everywhere.
+    """
+    if not len(clip_starts(recording, spec)):
+        raise EpisodeError(
+            f"episode '{recording.path}' is too short, or has too large gaps, for a clip of "
+            f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s)'
+        )
+
+
+def counted(skipped: Mapping[str, str]) -> list[str]:
+    """Returns a line a reason, without the paths in it, the most frequent first.
+
+    Args:
+        skipped: reasons by the episode's path.
+    """
+    reasons = Counter(
+        reason.replace(path, '...').replace(Path(path).name, '...')
+        for path, reason in skipped.items()
+    )
+    return [f'{count} x {reason}' for reason, count in reasons.most_common()]
+
+
+def num_dropped(recordings: Sequence[Recording], spec: WorldModelSpec) -> int:
+    """Returns how many clips cannot be cut because frames are missing within them."""
+    dropped = 0
+    for recording in recordings:
+        last = recording.times[-1] - spec.chunk_seconds + 1e-6
+        dropped += int((recording.times <= last).sum())
+        dropped -= int((recording.times[clip_starts(recording, spec)] <= last).sum())
+    return dropped

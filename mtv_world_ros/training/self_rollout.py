@@ -30,7 +30,7 @@ from mtv_world_ros.model.sampler import sample_latents
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
-from mtv_world_ros.training.clips.leads import Lead
+from mtv_world_ros.training.clips.past import Lead
 from mtv_world_ros.training.encoding import condition_batch, Encoders
 
 

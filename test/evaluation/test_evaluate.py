@@ -6,7 +6,7 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.evaluate import evaluate
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 
 def run(pipeline, episodes, out, **options):

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from mtv_world_ros.evaluation.round_trip import round_trip
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 
 class Frozen(SpaceToDepthAutoencoder):

@@ -13,9 +13,9 @@ from mtv_world_ros.inspection.clocks import (
     check_rate,
     check_skew,
     ClockConfig,
+    JointTrack,
     response,
 )
-from mtv_world_ros.inspection.joint_track import JointTrack
 
 CONFIG = ClockConfig()
 START = 1_700_000_000_000_000_000

@@ -12,11 +12,10 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
+from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector, load_inspector
-from mtv_world_ros.inspection.joint_track import JointTrack
 from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
-from mtv_world_ros.inspection.robot_shape import load_shape, rods
-from mtv_world_ros.inspection.silhouettes import draw_silhouettes
+from mtv_world_ros.inspection.robot_shape import draw_silhouettes, load_shape, rods
 
 QUICK = InspectionConfig(residual=ResidualConfig(max_pairs=25, lags_s=(0.0,)))
 

@@ -12,7 +12,7 @@ from small_transformer import build, inputs, SMALL
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.history import History
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.model.history_settings import history_settings
-from mtv_world_ros.model.transformer.positions import MultiViewRotaryPosEmbed
+from mtv_world_ros.model.history_tokens import history_settings
+from mtv_world_ros.model.transformer.tokens import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}

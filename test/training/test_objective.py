@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.config import ObjectiveConfig
 from mtv_world_ros.training.objective import (

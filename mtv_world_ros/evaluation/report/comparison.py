@@ -11,8 +11,7 @@ from typing import NamedTuple
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.evaluation.report import tables
 from mtv_world_ros.evaluation.report.summary import Group, SEEN, Summary
-from mtv_world_ros.files import plain, write_json
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import plain, write_json, write_whole
 
 #: tasks beside each other in a table
 TASKS_PER_TABLE = 3

@@ -23,8 +23,7 @@ from mtv_world_ros.evaluation.report.headline import (
 from mtv_world_ros.evaluation.report.markup import data_uri, element, join, Markup
 from mtv_world_ros.evaluation.report.read_back import Evaluated, Pick, picks, read_evaluations
 from mtv_world_ros.evaluation.report.report_tables import paper_tables, task_section
-from mtv_world_ros.files import share_path
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import share_path, write_whole
 
 #: of all embedded videos [bytes]; base64 adds a third
 VIDEO_BUDGET = 6_000_000

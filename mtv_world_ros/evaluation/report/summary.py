@@ -16,8 +16,7 @@ from mtv_world_ros.evaluation.metrics.statistics import Estimate, summarise
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.report import tables
 from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.files import write_json
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import write_json, write_whole
 
 BRACKETS = (
     'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: of the '

@@ -8,14 +8,13 @@ from diffusers.models.attention_dispatch import _AttentionBackendRegistry
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.model.autoencoders import TinyAutoencoder
+from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving.compiled import capture, compile_blocks
 from mtv_world_ros.model.serving.float8 import convert
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
 
 
 def prepare(

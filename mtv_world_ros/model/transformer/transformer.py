@@ -1,7 +1,7 @@
 """The one diffusion transformer: Wan's, over all views in one token sequence.
 
 Shape letters: B batch, V views, C latent channels, F latent frames, H W latent size,
-P latent frames of the history, f h w = token grid, D width; `token_grid.py` has the rest.
+P latent frames of the history, f h w = token grid, D width; `tokens.py` has the rest.
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ from torch.utils.checkpoint import checkpoint
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.transformer.action_context import build_control
 from mtv_world_ros.model.transformer.context import check_tokens, fit_cross_attention
-from mtv_world_ros.model.transformer.positions import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, ReferenceStem
-from mtv_world_ros.model.transformer.token_grid import (
+from mtv_world_ros.model.transformer.tokens import (
     arrange,
     by_token,
     check_start_image,
-    fit_context,
-    TokenGrid,
-)
-from mtv_world_ros.model.transformer.tokens import (
     embed_history,
     embed_reference,
     embed_video,
+    fit_context,
+    MultiViewRotaryPosEmbed,
+    TokenGrid,
     unembed,
 )
 

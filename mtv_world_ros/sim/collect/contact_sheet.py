@@ -10,8 +10,7 @@ import numpy as np
 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry
-from mtv_world_ros.sim.collect.files import write_file
+from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, write_file
 
 SHEET_FILE = 'contact_sheet.png'
 OUTCOMES = ('success', 'failure')

@@ -15,10 +15,12 @@ import numpy as np
 
 from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.errors import EpisodeError, SimulatorError
-from mtv_world_ros.sim.collect.files import write_file
+from mtv_world_ros.files import write_whole
 
 CARD_FILE = 'dataset.json'
 TASKS_SET, ZERO_SHOT_SET = 'tasks', 'zero_shot'
+#: what to do where something cannot be written
+GO_ON = 'finished episodes are kept, so run the same command again once there is room'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,3 +194,15 @@ def card_of(
 def write_card(out: Path, card: dict[str, Any]) -> None:
     """Writes `dataset.json`, whole or not at all."""
     write_file(out / CARD_FILE, (json.dumps(card, indent=1) + '\n').encode())
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a file, whole or not at all.
+
+    Raises:
+        SimulatorError: it cannot be written; what was there before is still there.
+    """
+    try:
+        write_whole(path, data)
+    except OSError as error:
+        raise SimulatorError(f"cannot write '{path}': {error}; {GO_ON}") from error

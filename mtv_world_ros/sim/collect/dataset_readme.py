@@ -16,9 +16,8 @@ from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.sim.collect.contact_sheet import SHEET_FILE
-from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, ZERO_SHOT_SET
+from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, write_file, ZERO_SHOT_SET
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.files import write_file
 from mtv_world_ros.sim.tasks.tasks import TASKS
 
 README_FILE = 'README.md'

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.geometry.swings import count_reversals
+from mtv_world_ros.geometry.mask_geometry import count_reversals
 from mtv_world_ros.sim.shape_geoms import FLOOR_M
 
 #: a gripper counts as open above this share of its range

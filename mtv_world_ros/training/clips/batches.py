@@ -22,8 +22,14 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.training.clips.clip_workers import ClipWorkers
-from mtv_world_ros.training.clips.leads import Lead, lead_before
-from mtv_world_ros.training.clips.past import draw_past, history_before, history_of_lead, Past
+from mtv_world_ros.training.clips.past import (
+    draw_past,
+    history_before,
+    history_of_lead,
+    Lead,
+    lead_before,
+    Past,
+)
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter

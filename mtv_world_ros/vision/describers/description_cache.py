@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.vision.describers.scene_objects import check_objects, SceneObject
-from mtv_world_ros.whole_files import write_whole
 
 
 class DescriptionCache:

@@ -11,7 +11,7 @@ from torch import Tensor
 from wan_files import TRANSFORMER
 
 from mtv_world_ros.errors import ConfigError, ModelError
-from mtv_world_ros.model.serving.followers import Followers
+from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 

@@ -18,12 +18,11 @@ from wan_predictions import frames, imported, predict, T, VIEWS
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.history import History
+from mtv_world_ros.model.autoencoders import WanAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
-from mtv_world_ros.model.encoders import TextEncoder
-from mtv_world_ros.model.image_encoder import ImageEncoder
+from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.lora import add_adapter, save_adapter
-from mtv_world_ros.model.wan_autoencoder import WanAutoencoder
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 

@@ -17,7 +17,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.actions import ActionEncoding
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.transformer.action_context import by_slot
 from mtv_world_ros.model.transformer.context import Context

@@ -8,7 +8,7 @@ import pytest
 from sensor_msgs.msg import Image
 import torch
 
-from mtv_world_ros.model.autoencoder import SpaceToDepthAutoencoder
+from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.lora import add_adapter, save_adapter
 from mtv_world_ros.model.parts import build_scheduler

@@ -8,10 +8,15 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, film_strip, write_sheet
-from mtv_world_ros.sim.collect.dataset_card import card_of, read_entry, TASKS_SET, ZERO_SHOT_SET
+from mtv_world_ros.sim.collect.dataset_card import (
+    card_of,
+    read_entry,
+    TASKS_SET,
+    write_file,
+    ZERO_SHOT_SET,
+)
 from mtv_world_ros.sim.collect.dataset_readme import commands, readme
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.files import write_file
 from mtv_world_ros.sim.tasks.tasks import tasks_named
 
 START_NS, HEIGHT, WIDTH = 1_700_000_000_000_000_000, 24, 32

@@ -15,7 +15,7 @@ from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.frechet.distance import frechet_distance, frechet_interval
 from mtv_world_ros.evaluation.metrics.frechet.features import ClipFeatures, FrameFeatures
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import write_whole
 
 #: name of the distance -> what it is measured on
 DISTANCES = ('fid', 'fvd')

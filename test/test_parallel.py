@@ -3,8 +3,7 @@ import sys
 import pytest
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.parallel import score_all
-from mtv_world_ros.ranking.ray_workers import score_with_ray
+from mtv_world_ros.parallel import score_all, score_with_ray
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from mtv_world_ros.whole_files import write_whole
+from mtv_world_ros.files import write_whole
 
 
 @pytest.mark.parametrize(('content', 'data'), [('grün\n', 'grün\n'.encode()), (b'\0\1', b'\0\1')])
