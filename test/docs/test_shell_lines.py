@@ -25,7 +25,7 @@ import yaml
 
 from mtv_world_ros.cli import COMMANDS, main
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.sim.opengl import missing_opengl
+from mtv_world_ros.sim.world.opengl import missing_opengl
 
 ROOT = Path(__file__).resolve().parents[2]
 #: what a block may need; those with a function are run where it returns nothing
@@ -42,6 +42,8 @@ NEEDS: dict[str, Callable[[], str | None] | None] = {
     'weights': None,
 }
 LANGUAGES = {'bash', 'python', 'text', 'yaml'}
+#: has the options that `mtv-world replay` passes on
+PLAYER = ROOT / 'mtv_world_ros' / 'ros' / 'bags' / 'player.py'
 #: folders of the repository that lines may name files of
 FOLDERS = ('benchmark', 'config', 'docs', 'examples', 'launch', 'requirements', 'resource', 'test')
 #: options of other programs that the texts mention
@@ -180,7 +182,7 @@ def check_mtv_world(words: Sequence[str]) -> bool:
         assert end.code == 0, said.getvalue()
         return True
     if more and getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
-        source = (ROOT / 'mtv_world_ros' / 'ros' / 'player.py').read_text()
+        source = PLAYER.read_text()
         more = [word for word in more if word.startswith('-') and f"'{word}'" not in source]
     assert not more, f'unrecognized arguments: {more}'
     try:
@@ -195,12 +197,12 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.model.action_features import check_control
-    from mtv_world_ros.model.serving import ServingOptions
-    from mtv_world_ros.sim.policy_variant import parse_variant
-    from mtv_world_ros.sim.tasks import tasks_named
-    from mtv_world_ros.sim.zero_shot import kinds_named
-    from mtv_world_ros.success.segmenter_choice import SEGMENTERS
+    from mtv_world_ros.model.serving.options import ServingOptions
+    from mtv_world_ros.sim.expert.faults import parse_variant
+    from mtv_world_ros.sim.tasks.tasks import tasks_named
+    from mtv_world_ros.sim.world.zero_shot import kinds_named
     from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
 
     def each(names: str | Sequence[str]) -> list[str]:
         return names.split(',') if isinstance(names, str) else list(names)
@@ -255,6 +257,9 @@ def check_python(words: Sequence[str]) -> bool:
     if words[:2] == ['-m', 'mtv_world_ros.cli']:
         return check_mtv_world(words[2:])
     if words[0] == '-m':
+        module = words[1].split('.')
+        exists = (ROOT.joinpath(*module[:-1]) / f'{module[-1]}.py').is_file()
+        assert exists or module[0] != 'mtv_world_ros', f'there is no module {words[1]}'
         return False
     options = {word.split('=')[0] for word in words if word.startswith('--')}
     known = set(re.findall(r"'(--[\w-]+)'", _script_sources(ROOT / words[0])))
@@ -321,6 +326,7 @@ def test_lines_are_right(block):
         ('mtv-world evaluate bundled x --out y --serving compil=true', 'compil'),
         ('python benchmark/serving_speed.py --thread 2', 'has no'),
         ('python benchmark/serving.py', 'does not exist'),
+        ('python -m mtv_world_ros.ros.policy_node', 'there is no module'),
         ('world_model --ros-args -p modes:=imagine', 'no such parameter'),
         ('ros2 launch mtv_world_ros world_model.launch.py mod:=imagine', 'has no argument'),
         ('ros2 launch mtv_world_ros world.launch.py', 'is no launch file'),
@@ -354,7 +360,7 @@ def test_commands_stand_in_blocks_marked_bash(page):
 @pytest.mark.parametrize('page', TEXTS)
 def test_options_and_commands_in_the_text_exist(page):
     known = {option for parser in parsers().values() for option in parser._option_string_actions}
-    shared = [ROOT / 'mtv_world_ros' / 'ros' / 'player.py', *(ROOT / 'benchmark').glob('*.py')]
+    shared = [PLAYER, *(ROOT / 'benchmark').glob('*.py')]
     known |= {o for path in shared for o in re.findall(r"'(--[\w-]+)'", path.read_text())}
     for code in _CODE.findall(TEXTS[page]):
         words = code.split()
