@@ -1,6 +1,6 @@
-# `make` installs into .venv; nothing here needs root. See README.md.
+# `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: install demo test lint format clean distclean
+.PHONY: help install demo test lint format docs clean distclean
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -12,7 +12,10 @@ unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-install: $(STAMP)
+help:  ## list the targets
+	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+
+install: $(STAMP)  ## install everything into .venv; the second call does nothing
 
 $(STAMP): setup.py requirements/constraints.txt requirements/install.sh
 	@PYTHON="$(PYTHON)" requirements/install.sh
@@ -21,22 +24,26 @@ $(STAMP): setup.py requirements/constraints.txt requirements/install.sh
 demo: $(STAMP)  ## replay the bundled episode through the node; results under out/demo/
 	$(BIN)/mtv-world demo
 
-lint: $(STAMP)
+lint: $(STAMP)  ## ruff, pyright and import-linter
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo
 
-test: lint
+test: lint  ## the linters, then all tests (about 10 minutes)
 	$(BIN)/python -m pytest
 
-format: $(STAMP)
+format: $(STAMP)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean:  ## what the demo, the tests and colcon leave behind; data/ and runs/ stay
+docs: $(STAMP)  ## build the documentation; open out/docs/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@echo 'open out/docs/index.html'
+
+clean:  ## remove what the demo, the tests and colcon left behind; data/ and runs/ stay
 	rm -rf out build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache
 	find mtv_world_ros test benchmark launch -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean
+distclean: clean  ## remove .venv, too
 	rm -rf .venv

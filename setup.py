@@ -74,7 +74,7 @@ setup(
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
         # `mtv-world rank --ray`: rollouts on a Ray cluster; pulls no torch.
         'rank': ['ray>=2.60,<3'],
-        # The simulator; it also needs an OpenGL library, see README.
+        # The simulator; it also needs an OpenGL library, see docs/installation.md.
         'sim': ['mujoco>=4.0,<5'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
         'ros': [
@@ -88,6 +88,8 @@ setup(
         # `colcon test` looks for pytest under this name
         'test': ['pytest>=7.4'],
         'lint': ['import-linter>=2.16', 'pyright[nodejs]', 'ruff>=0.17'],
+        # `make docs`
+        'docs': ['mkdocs>=1.6,<2', 'mkdocs-material>=9.6,<10'],
     },
     entry_points={
         'console_scripts': [

@@ -1,4 +1,4 @@
-"""Parameter file, README, viewer layout, middleware profile and launch files fit the node."""
+"""Parameter file, its page, viewer layout, middleware profile and launch files fit the node."""
 
 import ast
 import json
@@ -27,13 +27,20 @@ def test_every_parameter_says_what_it_means_and_where_it_ends():
         assert is_number == bool(described.integer_range or described.floating_point_range)
 
 
-def test_readme_lists_every_parameter_with_its_default():
-    readme = share_path('README.md').read_text()
+def test_the_page_lists_every_parameter_with_its_default_and_what_is_valid():
+    page = share_path('docs', 'parameters.md').read_text()
     for entry in TABLE:
-        row = next((r for r in readme.splitlines() if r.startswith(f'| `{entry.name}`')), None)
-        assert row, f'{entry.name} is not in README.md'
-        default = row.split('|')[2].strip(' `')
-        assert default == _shown(entry.default), entry.name
+        row = next((r for r in page.splitlines() if r.startswith(f'| `{entry.name}`')), None)
+        assert row, f'{entry.name} is not in docs/parameters.md'
+        default, valid = (cell.strip() for cell in row.split('|')[2:4])
+        assert default.strip('`') == _shown(entry.default), entry.name
+        assert valid == _valid(entry), entry.name
+
+
+def _valid(entry):
+    if entry.choices:
+        return ', '.join(f'`{choice}`' for choice in entry.choices)
+    return '' if entry.bounds is None else '{:.10g} … {:.10g}'.format(*entry.bounds)
 
 
 def _shown(value):

@@ -1,0 +1,418 @@
+"""Shell lines of the README and the docs: all are checked, those that are cheap are run.
+
+A block of lines is run, in the order of the pages and in one temporary folder, unless a comment
+before it says what it needs that is not at hand: `<!-- needs: gpu -->`, see `NEEDS`. A comment
+`<!-- small: --episodes 1 -->` appends options to the `mtv-world` lines of the block when they are
+run here. Lines that are not run are checked against the real command line all the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+from dataclasses import dataclass, field
+import io
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import yaml
+
+from mtv_world_ros.cli import COMMANDS, main
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.sim.world.opengl import missing_opengl
+
+ROOT = Path(__file__).resolve().parents[2]
+#: what a block may need; those with a function are run where it returns nothing
+NEEDS: dict[str, Callable[[], str | None] | None] = {
+    'data': None,
+    'gpu': None,
+    'native_ros': None,
+    'network': None,
+    'opengl': missing_opengl,
+    'root': None,
+    'ros': None,  # runs until it is stopped, or waits for somebody; test/ros has such tests
+    'server': None,
+    'time': None,
+    'weights': None,
+}
+LANGUAGES = {'bash', 'python', 'text', 'yaml'}
+#: has the options that `mtv-world replay` passes on
+PLAYER = ROOT / 'mtv_world_ros' / 'ros' / 'bags' / 'player.py'
+#: folders of the repository that lines may name files of
+FOLDERS = ('benchmark', 'config', 'docs', 'examples', 'launch', 'requirements', 'resource', 'test')
+#: options of other programs that the texts mention
+FOREIGN_OPTIONS = {'--show-args', '--symlink-install', '--system-site-packages'}
+_COMMENT = re.compile(r'<!-- (needs|small): (.+?) -->')
+_CODE = re.compile(r'`([^`\n]+)`')
+
+
+@dataclass(kw_only=True)
+class Block:
+    """Shell lines of one code block, and the comments before it."""
+
+    page: str
+    number: int
+    lines: list[str] = field(default_factory=list)
+    needs: list[str] = field(default_factory=list)
+    small: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.page}:{self.number}'
+
+    def commands(self) -> Iterator[list[str]]:
+        """Words of each command, one after the other."""
+        for line in '\n'.join(self.lines).replace('\\\n', ' ').splitlines():
+            words = shlex.shlex(line, posix=True, punctuation_chars='&|;')
+            words.whitespace_split, words.commenters = True, '#'
+            command: list[str] = []
+            for word in [*words, '&&']:
+                if word != '&&':
+                    command.append(word)
+                elif command:
+                    yield command
+                    command = []
+
+    def obstacle(self) -> str:
+        """Why it is not run here; empty = it is."""
+        for need in self.needs:
+            word = need.split(' ')[0]
+            probe = NEEDS[word]
+            reason = need if probe is None else probe()
+            if reason:
+                return f'checked, not run: needs {word}'
+        return ''
+
+
+def pages() -> list[Path]:
+    """The README, the pages in the order of the site, and what else shows commands."""
+    text = (ROOT / 'mkdocs.yml').read_text()
+    names = re.findall(r'- (\w+\.md)$', text, re.M)
+    return [
+        ROOT / 'README.md',
+        *(ROOT / 'docs' / name for name in names),
+        ROOT / 'CONTRIBUTING.md',
+    ]
+
+
+def fences(text: str) -> Iterator[tuple[int, str, list[str], list[str]]]:
+    """Line number, language, lines and comments before of every code block."""
+    comments: list[str] = []
+    inside: tuple[int, str, list[str]] | None = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        mark = re.match(r'\s*```(\w*)', line)
+        if mark and inside is None:
+            inside = (number, mark[1], [])
+        elif mark and inside is not None:
+            yield (*inside, comments)
+            inside, comments = None, []
+        elif inside is not None:
+            inside[2].append(line)
+        elif _COMMENT.match(line):
+            comments.append(line)
+        elif line.strip():
+            comments = []
+
+
+def blocks_of(page: str, text: str) -> Iterator[Block]:
+    for number, language, lines, comments in fences(text):
+        if language == 'bash':
+            block = Block(page=page, number=number, lines=lines)
+            for kind, value in _COMMENT.findall('\n'.join(comments)):
+                if kind == 'small':
+                    block.small = value
+                else:
+                    block.needs.append(value)
+            yield block
+
+
+TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in pages()}
+BLOCKS = [block for page, text in TEXTS.items() for block in blocks_of(page, text)]
+
+
+# --- checking -----------------------------------------------------------------------------------
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """Parsers of `mtv-world`'s commands; none takes abbreviations here."""
+    commands = argparse.ArgumentParser(prog='mtv-world').add_subparsers()
+    for command in COMMANDS:
+        command.add(commands)
+    for parser in commands.choices.values():
+        parser.allow_abbrev = False
+    return dict(commands.choices)
+
+
+def check(block: Block) -> None:
+    """Fails where a line cannot be right."""
+    for need in block.needs:
+        assert need.split(' ')[0] in NEEDS, f"'{need}' is none of {list(NEEDS)}"
+    for command in block.commands():
+        program, *rest = command
+        assert program in PROGRAMS, f'{program} is not known to this test'
+        check_files(rest)
+        runnable = PROGRAMS[program](rest)
+        needed = [need for need in block.needs if need != 'opengl']
+        assert runnable or needed, f"'{program}' is not run: say what it needs"
+
+
+def check_files(words: Sequence[str]) -> None:
+    """Files of the repository that are named must exist."""
+    for word in words:
+        name = word.removeprefix('src/mtv_world_ros/').removeprefix('$PWD/').split('=$PWD/')[-1]
+        if name.split('/')[0] in FOLDERS and '/' in name:
+            assert (ROOT / name).exists(), f'{name} does not exist'
+
+
+def check_mtv_world(words: Sequence[str]) -> bool:
+    if words[0] == '--help':
+        return True
+    known = parsers()
+    assert words[0] in known, f"'mtv-world {words[0]}' is none of {list(known)}"
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            arguments, more = known[words[0]].parse_known_args(words[1:])
+    except SystemExit as end:
+        assert end.code == 0, said.getvalue()
+        return True
+    if more and getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
+        source = PLAYER.read_text()
+        more = [word for word in more if word.startswith('-') and f"'{word}'" not in source]
+    assert not more, f'unrecognized arguments: {more}'
+    try:
+        check_values(vars(arguments))
+    except MtvWorldError as error:
+        pytest.fail(str(error))
+    return True
+
+
+def check_values(given: dict[str, Any]) -> None:
+    """Raises a user error where a preset, policy, task ... does not exist."""
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.cli.train import set_overrides
+    from mtv_world_ros.model.action_features import check_control
+    from mtv_world_ros.model.serving.options import ServingOptions
+    from mtv_world_ros.sim.expert.faults import parse_variant
+    from mtv_world_ros.sim.tasks.tasks import tasks_named
+    from mtv_world_ros.sim.world.zero_shot import kinds_named
+    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
+
+    def each(names: str | Sequence[str]) -> list[str]:
+        return names.split(',') if isinstance(names, str) else list(names)
+
+    load_training_config(
+        given.get('preset') or 'small', set_overrides(given.get('overrides') or [])
+    )
+    if given.get('control'):
+        check_control(given['control'])
+    for name in each(given.get('policies') or ()):
+        parse_variant(name)
+    if given.get('policy') and given['policy'].startswith('expert'):
+        parse_variant(given['policy'])
+    for key in ('task', 'tasks'):
+        if given.get(key) not in (None, '', 'all') and not given[key].endswith('.yaml'):
+            tasks_named(given[key])
+    kinds_named(given.get('zero_shot') or '')
+    ServingOptions.parse(given.get('serving') or '')
+    assert given.get('segmenter') in (None, *SEGMENTERS)
+    if given.get('robot'):
+        robot_path(given['robot'])
+
+
+def check_world_model(words: Sequence[str]) -> bool:
+    known = yaml.safe_load((ROOT / 'config' / 'node.yaml').read_text())['/**']['ros__parameters']
+    names = [word.split(':=')[0] for word in words if ':=' in word]
+    assert not [name for name in names if name not in known], f'no such parameter: {names}'
+    options = {word for word in words if word.startswith('-')}
+    assert options <= {'--ros-args', '-p', '--params-file'}, options
+    return False
+
+
+def check_ros2(words: Sequence[str]) -> bool:
+    if words[0] == 'launch':
+        file = ROOT / 'launch' / words[2]
+        assert file.is_file(), f'{file.name} is no launch file'
+        source = file.read_text()
+        for name in (word.split(':=')[0] for word in words[3:]):
+            assert {f"'{name}'", f"'{name.replace('_', '-')}'"} & set(
+                re.findall(r"'[\w-]+'", source)
+            ), f'{file.name} has no argument {name}'
+    elif words[0] == 'run':
+        assert words[1] == 'mtv_world_ros'
+        assert words[2] in ('mtv-world', 'world_model')
+        PROGRAMS[words[2]](words[3:])
+    else:
+        assert words[:2] in (['bag', 'play'], ['bag', 'record'])
+    return False
+
+
+def check_python(words: Sequence[str]) -> bool:
+    if words[:2] == ['-m', 'mtv_world_ros.cli']:
+        return check_mtv_world(words[2:])
+    if words[0] == '-m':
+        module = words[1].split('.')
+        exists = (ROOT.joinpath(*module[:-1]) / f'{module[-1]}.py').is_file()
+        assert exists or module[0] != 'mtv_world_ros', f'there is no module {words[1]}'
+        return False
+    options = {word.split('=')[0] for word in words if word.startswith('--')}
+    known = set(re.findall(r"'(--[\w-]+)'", _script_sources(ROOT / words[0])))
+    assert options <= known, f'{words[0]} has no {options - known}'
+    return words[0].startswith('examples/')
+
+
+def _script_sources(script: Path) -> str:
+    """The script and what its shared options come from."""
+    shared = [*script.parent.glob('*.py'), *(ROOT / 'mtv_world_ros' / 'cli').glob('*.py')]
+    own = script.read_text()
+    return own + '\n'.join(
+        path.read_text() for path in shared if re.search(rf'from \S*{path.stem} import', own)
+    )
+
+
+def check_launcher(words: Sequence[str]) -> bool:
+    at = list(words).index('-m')
+    check_python(words[at:])
+    return False
+
+
+def check_make(words: Sequence[str]) -> bool:
+    targets = re.findall(r'^(\w+):', (ROOT / 'Makefile').read_text(), re.M)
+    assert set(words) <= set(targets), f'make has no target {set(words) - set(targets)}'
+    return words == ['help']
+
+
+PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
+    'accelerate': check_launcher,
+    'make': check_make,
+    'mtv-world': check_mtv_world,
+    'python': check_python,
+    'python3': lambda words: False,
+    'ros2': check_ros2,
+    'source': lambda words: list(words) == ['.venv/bin/activate'],
+    'torchrun': check_launcher,
+    'world_model': check_world_model,
+    # of the system, or of others; never run
+    **dict.fromkeys(
+        ('apt', 'cd', 'cp', 'export', 'git', 'hf', 'mkdir', 'pip', 'rosdep', 'touch'),
+        lambda words: False,
+    ),
+}
+
+
+@pytest.mark.parametrize('block', BLOCKS, ids=str)
+def test_lines_are_right(block):
+    check(block)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('mtv-world train data/sim --out x --presett small', 'unrecognized arguments'),
+        ('mtv-world train data/sim --out x --epis 3', 'unrecognized arguments'),
+        ('mtv-world trian data/sim', 'is none of'),
+        ('mtv-world train data/sim --out x --preset smal', 'smal.yaml'),
+        ('mtv-world train data/sim --out x --set optimizer.step=3', "did you mean 'steps'"),
+        ('mtv-world collect --task stack_block --episodes 1 --out x', 'stack_block'),
+        ('mtv-world collect --episodes 1 --policies expert-lat-0.3 --out x', 'lat'),
+        ('mtv-world replay resource/demo_epsiode --offline', 'does not exist'),
+        ('mtv-world replay resource/demo_episode --lockstep', 'unrecognized arguments'),
+        ('mtv-world evaluate bundled x --out y --serving compil=true', 'compil'),
+        ('python benchmark/serving_speed.py --thread 2', 'has no'),
+        ('python benchmark/serving.py', 'does not exist'),
+        ('python -m mtv_world_ros.ros.policy_node', 'there is no module'),
+        ('world_model --ros-args -p modes:=imagine', 'no such parameter'),
+        ('ros2 launch mtv_world_ros world_model.launch.py mod:=imagine', 'has no argument'),
+        ('ros2 launch mtv_world_ros world.launch.py', 'is no launch file'),
+        ('make dmeo', 'has no target'),
+        ('git clone x', 'say what it needs'),
+        ('curl x', 'is not known'),
+    ],
+)
+def test_a_mistake_in_a_line_is_found(text, message):
+    (block,) = blocks_of('page.md', f'Try it:\n\n```bash\n{text}\n```\n')
+    with pytest.raises((AssertionError, pytest.fail.Exception), match=message):
+        check(block)
+
+
+def test_what_a_block_needs_must_be_a_known_word():
+    (block,) = blocks_of('page.md', '<!-- needs: gpus -->\n```bash\nmake\n```\n')
+    with pytest.raises(AssertionError, match="'gpus' is none of"):
+        check(block)
+
+
+@pytest.mark.parametrize('page', TEXTS)
+def test_commands_stand_in_blocks_marked_bash(page):
+    for number, language, lines, _ in fences(TEXTS[page]):
+        assert language in LANGUAGES, f'{page}:{number}: a block of {language or "no language"}'
+        shell = [line for line in lines if line.split(' ')[0] in PROGRAMS]
+        assert language == 'bash' or not shell, f'{page}:{number}: {shell[0]}'
+    indented = re.findall(r'^(?: {4}|\t)(?:mtv-world|ros2|make|python) .*$', TEXTS[page], re.M)
+    assert not indented
+
+
+@pytest.mark.parametrize('page', TEXTS)
+def test_options_and_commands_in_the_text_exist(page):
+    known = {option for parser in parsers().values() for option in parser._option_string_actions}
+    shared = [PLAYER, *(ROOT / 'benchmark').glob('*.py')]
+    known |= {o for path in shared for o in re.findall(r"'(--[\w-]+)'", path.read_text())}
+    for code in _CODE.findall(TEXTS[page]):
+        words = code.split()
+        if words[:1] == ['mtv-world'] and len(words) > 1 and words[1].isidentifier():
+            assert words[1] in parsers(), code
+        options = {word for word in re.findall(r'--[a-z][\w-]*', code) if words[0] != 'pip'}
+        assert options <= known | FOREIGN_OPTIONS, code
+
+
+def test_every_command_is_in_the_readme():
+    for command in parsers():
+        assert re.search(rf'`(mtv-world )?{command}[ `]', TEXTS['README.md']), command
+
+
+# --- running ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def workplace(tmp_path_factory) -> Iterator[Path]:
+    """A folder with what the lines name of the repository; lines of later pages find in it what
+    earlier ones made."""
+    torch = pytest.importorskip('torch')
+    folder = tmp_path_factory.mktemp('docs')
+    for name in FOLDERS:
+        if (ROOT / name).exists():
+            (folder / name).symlink_to(ROOT / name)
+    threads = torch.get_num_threads()
+    yield folder
+    torch.set_num_threads(threads)
+
+
+def run(command: Sequence[str], small: str, folder: Path) -> None:
+    program, *rest = command
+    if program == 'mtv-world':
+        try:
+            status = main([*rest, *shlex.split(small)])
+        except SystemExit as end:  # --help
+            status = end.code
+        assert status == 0, f'{shlex.join(command)}: exit status {status}'
+    elif program == 'make':
+        subprocess.run(['make', '-C', str(ROOT), *rest], check=True, capture_output=True)
+    elif program == 'python':
+        done = subprocess.run(
+            [sys.executable, *rest], cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize('block', BLOCKS, ids=str)
+def test_lines_run(block, workplace, monkeypatch):
+    if obstacle := block.obstacle():
+        pytest.skip(obstacle)
+    monkeypatch.chdir(workplace)
+    for command in block.commands():
+        run(command, block.small, workplace)
