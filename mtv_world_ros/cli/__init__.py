@@ -19,6 +19,7 @@ from mtv_world_ros.cli import (
     replay,
     report,
     train,
+    train_motion,
 )
 from mtv_world_ros.errors import MtvWorldError
 
@@ -28,6 +29,7 @@ COMMANDS = (
     imagine,
     collect,
     train,
+    train_motion,
     distill,
     evaluate,
     rank,

@@ -11,7 +11,7 @@ Shape letters: B batch, O objects, A tools, T steps, D width.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn, Tensor
@@ -58,6 +58,27 @@ class Motion:
 
     points: Tensor
     rotations: Tensor
+    held: Tensor
+    spread: Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Memory:
+    """Where the objects are between two steps, and what the network remembers of them.
+
+    Attributes:
+        points: (B, O, 3) [m].
+        rotations: (B, O, 3, 3) from the start.
+        velocity: (B, O, 6) way [m] and turn [rad] of the last step.
+        hidden: (B, O, H).
+        held: (B, O, A), see `Motion`.
+        spread: (B, O), see `Motion`.
+    """
+
+    points: Tensor
+    rotations: Tensor
+    velocity: Tensor
+    hidden: Tensor
     held: Tensor
     spread: Tensor
 
@@ -115,43 +136,76 @@ class ObjectMotionNetwork(nn.Module):
             truth: (B, T + 1, O, 3) points and (B, T + 1, O, 3, 3) rotations, for training.
             forced: (B, T) bool, steps that start from the truth; needs `truth`.
         """
-        batch, objects = scene.present.shape
+        return self.roll(scene, truth=truth, forced=forced)[0]
+
+    def roll(
+        self,
+        scene: Scene,
+        memory: Memory | None = None,
+        *,
+        skip: int = 0,
+        truth: tuple[Tensor, Tensor] | None = None,
+        forced: Tensor | None = None,
+    ) -> tuple[Motion, Memory]:
+        """Returns the motion and what the next call is given.
+
+        Args:
+            scene: what is given.
+            memory: of the call before, of which this one goes on; None = it begins.
+            skip: rows of the tools that only show what was before: 1 where `memory` is given.
+            truth: see `forward`.
+            forced: see `forward`.
+        """
         described = torch.cat(
             [scene.features.flatten(2) * _SCALE, scene.points[..., 2:] * _SCALE], dim=-1
         )
         shape = self.shape(described)
-        points = scene.points
-        rotations = torch.eye(3, device=points.device).expand(batch, objects, 3, 3)
-        memory = points.new_zeros(batch, objects, self.hidden)
-        velocity = points.new_zeros(batch, objects, 6)
-        spread = points.new_zeros(batch, objects)
-        held = points.new_zeros(batch, objects, scene.tools.shape[2])
-        track = [(points, rotations, held, spread)]
-        for step in range(scene.tools.shape[1] - 1):
+        now = memory or self._begin(scene)
+        track = [now]
+        for step in range(skip, scene.tools.shape[1] - 1):
             if truth is not None and forced is not None:
                 known = forced[:, step][:, None, None]
-                points = torch.where(known, truth[0][:, step], points)
-                rotations = torch.where(known[..., None], truth[1][:, step], rotations)
+                now = replace(
+                    now,
+                    points=torch.where(known, truth[0][:, step], now.points),
+                    rotations=torch.where(known[..., None], truth[1][:, step], now.rotations),
+                )
             rows = [max(step - 1, 0), step, step + 1]
-            moved, turned, held, memory, more = self.step(
+            moved, turned, held, hidden, more = self.step(
                 scene.tools[:, rows],
                 scene.openings[:, rows],
                 scene.present,
                 shape,
-                points,
-                rotations,
-                velocity,
-                memory,
+                now.points,
+                now.rotations,
+                now.velocity,
+                now.hidden,
             )
-            velocity = torch.cat([moved - points, _vector(turned @ rotations.mT)], dim=-1)
-            points, rotations = moved, turned
-            spread = spread + more
-            track.append((points, rotations, held, spread))
-        return Motion(
-            points=torch.stack([t[0] for t in track], 1),
-            rotations=torch.stack([t[1] for t in track], 1),
-            held=torch.stack([t[2] for t in track], 1),
-            spread=torch.stack([t[3] for t in track], 1),
+            now = Memory(
+                points=moved,
+                rotations=turned,
+                velocity=torch.cat(
+                    [moved - now.points, _vector(turned @ now.rotations.mT)], dim=-1
+                ),
+                hidden=hidden,
+                held=held,
+                spread=now.spread + more,
+            )
+            track.append(now)
+        names = ('points', 'rotations', 'held', 'spread')
+        rows_of = {name: torch.stack([getattr(m, name) for m in track], 1) for name in names}
+        return Motion(**rows_of), now
+
+    def _begin(self, scene: Scene) -> Memory:
+        points = scene.points
+        batch, objects = scene.present.shape
+        return Memory(
+            points=points,
+            rotations=torch.eye(3, device=points.device).expand(batch, objects, 3, 3),
+            velocity=points.new_zeros(batch, objects, 6),
+            hidden=points.new_zeros(batch, objects, self.hidden),
+            held=points.new_zeros(batch, objects, scene.tools.shape[2]),
+            spread=points.new_zeros(batch, objects),
         )
 
     def step(

@@ -1,0 +1,75 @@
+"""`mtv-world train-motion`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'train-motion',
+        help='train how objects move under commanded tools',
+        description='Trains the object motion network of a checkpoint: where objects go when '
+        'grippers grasp, carry, push and drop them. It learns from recorded episodes: masks of '
+        'the first frame, commands, and where the objects went (/object_poses, else the masks). '
+        "Writes OUT/object_motion; OUT may be the checkpoint's folder.",
+    )
+    parser.add_argument('dataset', type=Path, help='folder with episodes, also in folders in it')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument('--init', type=Path, metavar='DIR', help='go on from DIR/object_motion')
+    parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
+    parser.add_argument('--views', default='low,high', help='comma-separated')
+    parser.add_argument('--steps', type=int, default=4000)
+    parser.add_argument('--batch-size', type=int, default=64)
+    parser.add_argument('--learning-rate', type=float, default=2e-3)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=0, help='0 = all cores but one')
+    parser.set_defaults(handler=_train)
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.model.object_motion.predictor import FOLDER, load_network
+    from mtv_world_ros.model.runtime import set_num_threads
+    from mtv_world_ros.training.object_motion.train import (
+        end_errors,
+        MotionTraining,
+        read_tracks,
+        train_motion,
+    )
+    from mtv_world_ros.training.run import find_episodes
+
+    set_num_threads(arguments.threads)
+    robot = load_robot(robot_path(arguments.robot))
+    views = [view.strip() for view in arguments.views.split(',')]
+    tracks, skipped = read_tracks(find_episodes(arguments.dataset), robot, views)
+    for path, reason in list(skipped.items())[:3]:
+        print(f'left out: {path}: {reason}')
+    held_out = tracks[::20]
+    init = None if arguments.init is None else load_network(arguments.init / FOLDER)
+    network = train_motion(
+        [track for number, track in enumerate(tracks) if number % 20],
+        arguments.out,
+        MotionTraining(
+            steps=arguments.steps,
+            batch_size=arguments.batch_size,
+            learning_rate=arguments.learning_rate,
+            forced_share=0.0 if init else 0.35,
+            seed=arguments.seed,
+        ),
+        init=init,
+    )
+    errors, ways = end_errors(network, held_out)
+    moved = ways > 0.015
+    print(f'{len(tracks)} episodes, {len(skipped)} left out; {len(held_out)} held out:')
+    print(
+        f'objects that moved: n {moved.sum()}, median error at the end '
+        f'{1e3 * np.median(errors[moved]) if moved.any() else float("nan"):.1f} mm, within 2 cm '
+        f'{np.mean(errors[moved] < 0.02) if moved.any() else float("nan"):.2f}'
+    )
+    return 0

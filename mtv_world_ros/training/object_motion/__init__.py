@@ -1,0 +1,1 @@
+"""Training of the object motion network from recorded episodes."""

@@ -1,0 +1,289 @@
+"""`mtv-world train-motion`: from recorded episodes to an object motion network.
+
+Shape letters: B batch, T steps, O objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
+from mtv_world_ros.model.object_motion.predictor import FOLDER, num_features, save_network
+from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
+
+#: steps of a training window
+_WINDOW = 48
+#: share of the windows that begin where their episode does
+_FROM_START = 0.35
+#: standard deviation of where objects are thought to be at first [m]
+_PLACE_NOISE_M = 0.002
+#: relative one of their features
+_SHAPE_NOISE = 0.04
+_EMA_DECAY = 0.999
+#: an object has moved if it went further than this [m]
+_MOVED_M = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionTraining:
+    """How the network is trained.
+
+    Attributes:
+        steps: of the optimizer.
+        batch_size: B, windows a step.
+        learning_rate: largest; it warms up over 100 steps and falls as a cosine.
+        forced_share: share of the training in which fewer and fewer steps start from the truth;
+            after it windows run free from their first step.
+        seed: of weights and windows.
+    """
+
+    steps: int = 4000
+    batch_size: int = 64
+    learning_rate: float = 2e-3
+    forced_share: float = 0.35
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Batch:
+    scene: Scene
+    points: Tensor
+    rotations: Tensor
+    known: Tensor
+    turns_known: Tensor
+
+
+def read_tracks(
+    paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
+) -> tuple[list[ObjectTracks], dict[str, str]]:
+    """Returns what can be trained on, and why the other episodes cannot, by path.
+
+    Raises:
+        TrainingError: none can.
+    """
+    tracks, skipped = [], {}
+    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+        try:
+            tracks.append(object_tracks(path, robot, views))
+        except MtvWorldError as error:
+            skipped[str(path)] = str(error)
+    if not tracks:
+        raise TrainingError(
+            f'no episode can be trained on; the first: {next(iter(skipped.items()))}'
+        )
+    return tracks, skipped
+
+
+def train_motion(
+    tracks: Sequence[ObjectTracks],
+    out: Path,
+    config: MotionTraining,
+    *,
+    init: ObjectMotionNetwork | None = None,
+    held_out: Sequence[ObjectTracks] = (),
+) -> ObjectMotionNetwork:
+    """Trains, writes the averaged weights into `out/object_motion`, and returns them.
+
+    Args:
+        tracks: of the episodes.
+        out: folder.
+        config: how.
+        init: network to go on from.
+        held_out: episodes that the end of the training is told on.
+
+    Raises:
+        TrainingError: the folder is there already, or the loss is not finite.
+    """
+    folder = Path(out) / FOLDER
+    if folder.exists():
+        raise TrainingError(f"'{folder}' exists; choose another --out, or remove it")
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    num_views = tracks[0].features.shape[1]
+    network = init or ObjectMotionNetwork(num_features=num_features(num_views))
+    averaged = torch.optim.swa_utils.AveragedModel(
+        network, avg_fn=lambda old, new, n: old.lerp(new, 1 - min(_EMA_DECAY, _warm(int(n))))
+    )
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4
+    )
+    most = max(len(t.features) for t in tracks)
+    bar = tqdm(range(config.steps), desc='training', unit='step')
+    for step in bar:
+        for group in optimizer.param_groups:
+            group['lr'] = _rate(step, config)
+        chosen = [tracks[k] for k in rng.integers(len(tracks), size=config.batch_size)]
+        batch = _turned(_windows(chosen, most, rng), rng)
+        forced = _forced(step / config.steps, config, batch, rng)
+        motion = network(batch.scene, (batch.points, batch.rotations), forced)
+        loss = _loss(motion, batch)
+        if not math.isfinite(loss.item()):
+            raise TrainingError(f'the loss is {loss.item()} at step {step}; lower --learning-rate')
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        averaged.update_parameters(network)
+        bar.set_postfix(loss=f'{loss.item():.3f}')
+    network.load_state_dict(averaged.module.state_dict())
+    save_network(network, folder)
+    return network
+
+
+def end_errors(
+    network: ObjectMotionNetwork, tracks: Sequence[ObjectTracks]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (N,) errors at the end of whole episodes [m], and how far objects really went [m].
+
+    One of each tracked object of each episode.
+    """
+    errors, ways = [], []
+    for track in tracks:
+        batch = _whole(track)
+        with torch.inference_mode():
+            motion = network(batch.scene)
+        ok = batch.scene.present[0]
+        errors += (motion.points[0, -1] - batch.points[0, -1]).norm(dim=-1)[ok].tolist()
+        ways += (batch.points[0, -1] - batch.points[0, 0]).norm(dim=-1)[ok].tolist()
+    return np.array(errors), np.array(ways)
+
+
+def _warm(count: int) -> float:
+    return count / (count + 20)
+
+
+def _rate(step: int, config: MotionTraining) -> float:
+    warm = min(1.0, (step + 1) / 100)
+    return config.learning_rate * warm * (0.505 + 0.495 * math.cos(math.pi * step / config.steps))
+
+
+def _forced(
+    progress: float, config: MotionTraining, batch: _Batch, rng: np.random.Generator
+) -> Tensor:
+    """(B, T) which steps start from the truth: fewer and fewer; the first of a window always."""
+    share = max(0.0, 1 - progress / max(config.forced_share, 1e-6))
+    size, steps = batch.points.shape[0], batch.points.shape[1] - 1
+    often = rng.random((size, 1)) < 0.3 + 0.5 * share
+    forced = rng.random((size, steps)) < np.where(often, 0.5 + 0.5 * share, share)
+    if share == 0:
+        forced[:] = False
+    forced[:, 0] = True
+    return torch.from_numpy(forced)
+
+
+def _windows(tracks: Sequence[ObjectTracks], most: int, rng: np.random.Generator) -> _Batch:
+    parts = []
+    for track in tracks:
+        last = len(track.points) - 1
+        start = 0
+        if last > _WINDOW and rng.random() >= _FROM_START:
+            start = int(rng.integers(0, last - _WINDOW))
+        order = rng.permutation(len(track.features))
+        rows = np.minimum(np.arange(start, start + _WINDOW + 1), last)
+        noise = rng.normal(0.0, _PLACE_NOISE_M, (len(order), 3))
+        scale = rng.normal(1.0, _SHAPE_NOISE, (len(order), 1, track.features.shape[2]))
+        parts.append(_part(track, rows, order, noise, scale, most))
+    return _stacked(parts)
+
+
+def _whole(track: ObjectTracks) -> _Batch:
+    order = np.arange(len(track.features))
+    rows = np.arange(len(track.points))
+    return _stacked([_part(track, rows, order, np.zeros((len(order), 3)), 1.0, len(order))])
+
+
+def _part(
+    track: ObjectTracks,
+    rows: np.ndarray,
+    order: np.ndarray,
+    noise: np.ndarray,
+    scale: np.ndarray | float,
+    most: int,
+) -> dict[str, np.ndarray]:
+    """One row of a batch, padded to `most` objects."""
+    extra = most - len(order)
+    points = (track.points + noise[np.argsort(order)])[:, order]
+    features = track.features[order] * scale
+    eye = np.broadcast_to(np.eye(3), (len(rows), extra, 3, 3))
+    return {
+        'start': np.pad(points[0], ((0, extra), (0, 0))),
+        'features': np.pad(features, ((0, extra), (0, 0), (0, 0))),
+        'present': np.pad(track.known[0][order], (0, extra)),
+        'tools': track.tools[rows],
+        'openings': track.openings[rows],
+        'points': np.pad(points[rows], ((0, 0), (0, extra), (0, 0))),
+        'rotations': np.concatenate([track.rotations[rows][:, order], eye], axis=1),
+        'known': np.pad(track.known[rows][:, order], ((0, 0), (0, extra))),
+        'turns_known': np.array(track.turns_known),
+    }
+
+
+def _stacked(parts: Sequence[dict[str, np.ndarray]]) -> _Batch:
+    def of(name: str) -> Tensor:
+        values = torch.from_numpy(np.stack([part[name] for part in parts]))
+        return values if values.dtype == torch.bool else values.float()
+
+    scene = Scene(
+        points=of('start'),
+        features=of('features'),
+        present=of('present'),
+        tools=of('tools'),
+        openings=of('openings'),
+    )
+    return _Batch(
+        scene=scene,
+        points=of('points'),
+        rotations=of('rotations'),
+        known=of('known'),
+        turns_known=of('turns_known'),
+    )
+
+
+def _turned(batch: _Batch, rng: np.random.Generator) -> _Batch:
+    """The batch turned by a multiple of 45 degrees about the vertical, or mirrored as well.
+
+    Contact does not know where on the table it happens. Mirrored tools have their x axis turned
+    back, which two-fingered grippers do not notice.
+    """
+    turns, mirrored = int(rng.integers(8)), bool(rng.random() < 0.5)
+    cos, sin = math.cos(turns * math.pi / 4), math.sin(turns * math.pi / 4)
+    mirror = torch.diag(torch.tensor([-1.0 if mirrored else 1.0, 1.0, 1.0]))
+    turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    both, scene = turn @ mirror, batch.scene
+    widths, heights = scene.features[..., :4], scene.features[..., 4:6]
+    if mirrored:
+        widths = widths[..., [0, 3, 2, 1]]
+    widths = torch.roll(widths, turns % 4, -1)
+    tools = scene.tools.clone()
+    tools[..., :3, :3] = both @ scene.tools[..., :3, :3] @ mirror
+    tools[..., :3, 3] = scene.tools[..., :3, 3] @ both.T
+    features = torch.cat([widths, heights, scene.features[..., 6:] @ both.T], -1)
+    return replace(
+        batch,
+        scene=replace(scene, points=scene.points @ both.T, features=features, tools=tools),
+        points=batch.points @ both.T,
+        rotations=both @ batch.rotations @ both.T,
+    )
+
+
+def _loss(motion: Motion, batch: _Batch) -> Tensor:
+    error = (motion.points - batch.points).norm(dim=-1)
+    place = F.huber_loss(motion.points, batch.points, reduction='none', delta=0.01).sum(-1) * 1e4
+    cosine = (motion.rotations.mT @ batch.rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
+    turn = (3 - cosine) * batch.turns_known[:, None, None]
+    spread = motion.spread + 2e-3
+    doubt = torch.log(spread) + error.detach() / spread
+    moved = (batch.points - batch.points[:, :1]).norm(dim=-1) > _MOVED_M
+    weights = (batch.known & batch.scene.present[:, None]) * (1.0 + 3.0 * moved)
+    return ((place + 0.3 * turn + 0.02 * doubt) * weights).sum() / weights.sum()
