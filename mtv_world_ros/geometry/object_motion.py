@@ -1,4 +1,4 @@
-"""Where objects go, and what their masks look like on the way.
+"""Where objects go, and what they look like on the way.
 
 V views, O objects, T frames, H W pixels.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
 
 
@@ -38,60 +38,71 @@ class ObjectMotion:
         )
 
 
-def moved_masks(
+def moved_pictures(
+    frames: ByteArray,
     masks: BoolArray,
     motion: ObjectMotion,
     cameras: Sequence[CameraModel],
     reference_poses: Sequence[FloatArray],
     poses: FloatArray,
-) -> BoolArray:
-    """Returns the masks (V, O, T, H, W) of objects that move rigidly.
+) -> ByteArray:
+    """Returns the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
 
-    Each mask is moved as the picture of a plane through the object's centre that faces the camera:
+    Each object is moved as the picture of a plane through its centre that faces the camera:
     shifted by the projected way, scaled by the ratio of depths, turned by the rotation about the
-    line of sight. What is not known, or behind a camera, is held.
+    line of sight; near ones over far ones. What is not known, or behind a camera, is held.
 
     Args:
-        masks: (V, O, H, W) at the reference.
+        frames: (V, H, W, 3) uint8 RGB of the reference.
+        masks: (V, O, H, W) in it.
         motion: T frames.
         cameras: V cameras at the masks' size.
         reference_poses: V of T_base_camera (4, 4) at the reference.
         poses: (V, T, 4, 4) T_base_camera.
     """
     num_frames = len(motion.points)
-    moved = np.repeat(masks[:, :, None], num_frames, axis=2)
+    views, _, height, width = masks.shape
+    shown = np.zeros((views, num_frames, height, width, 4), np.uint8)
     for view, camera in enumerate(cameras):
         before, depth = project(camera, reference_poses[view], motion.reference)
         after, depths = project(camera, poses[view][:, None], motion.points)
-        zoom = depth / depths
         turns = _turns(motion.rotations, poses[view])
-        for frame, item in zip(*np.nonzero(np.isfinite(after).all(-1)), strict=True):
-            if not (np.isfinite(before[item]).all() and masks[view, item].any()):
-                continue
-            if np.abs(after[frame, item] - before[item]).max() < 0.05 and (
-                abs(turns[frame, item]) < 0.02
-            ):
-                continue
-            moved[view, item, frame] = _warped(
-                masks[view, item],
-                before[item],
-                after[frame, item],
-                float(zoom[frame, item]),
-                float(turns[frame, item]),
-            )
-    return moved
+        cut = [_cut_out(frames[view], mask) for mask in masks[view]]
+        for frame in range(num_frames):
+            # what is not known counts as far away
+            for item in np.argsort(-np.nan_to_num(depths[frame], nan=np.inf), kind='stable'):
+                picture = cut[item]
+                if np.isfinite(after[frame, item]).all() and np.isfinite(before[item]).all():
+                    zoom = float(depth[item] / depths[frame, item])
+                    turn = float(turns[frame, item])
+                    picture = _warped(picture, before[item], after[frame, item], zoom, turn)
+                _lay(shown[view, frame], picture)
+    return shown
+
+
+def _cut_out(frame: ByteArray, mask: BoolArray) -> ByteArray:
+    """(H, W, 4) the object's colours, black elsewhere, and its mask as 0 or 255."""
+    cover = np.where(mask, 255, 0).astype(np.uint8)[..., None]
+    return np.concatenate([np.where(mask[..., None], frame, 0).astype(np.uint8), cover], axis=-1)
+
+
+def _lay(image: ByteArray, picture: ByteArray) -> None:
+    """Lays a picture, already weighed by its cover, over an (H, W, 4) image."""
+    rows, columns = np.nonzero(picture[..., 3])
+    if not len(rows):
+        return
+    box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    part, rest = picture[box], 255 - picture[box][..., 3:].astype(np.uint16)
+    image[box] = part + ((image[box] * rest + 127) // 255).astype(np.uint8)
 
 
 def _warped(
-    mask: BoolArray, before: FloatArray, after: FloatArray, zoom: float, turn: float
-) -> BoolArray:
+    picture: ByteArray, before: FloatArray, after: FloatArray, zoom: float, turn: float
+) -> ByteArray:
     cos, sin = zoom * np.cos(turn), zoom * np.sin(turn)
     linear = np.array([[cos, -sin], [sin, cos]])
     affine = np.column_stack([linear, after - linear @ before])
-    warped = cv2.warpAffine(
-        mask.astype(np.float32), affine, mask.shape[::-1], flags=cv2.INTER_LINEAR
-    )
-    return np.asarray(warped >= 0.5)
+    return cv2.warpAffine(picture, affine, picture.shape[1::-1], flags=cv2.INTER_LINEAR)
 
 
 def _turns(rotations: FloatArray, poses: FloatArray) -> FloatArray:

@@ -52,8 +52,8 @@ class TrajectoryVideoConfig:
             None = none, as in the paper.
         finger_width_m: width of a line along each finger, white and magenta, apart as far as the
             gripper is commanded to open [m]; None = none, as in the paper.
-        object_motion: whether the objects' fills go where the objects are expected to go, or stay
-            where they were, as in the paper.
+        object_motion: objects are shown themselves, over the trails, where they are expected to
+            be; else as fills where they were, as in the paper.
     """
 
     half_life_s: float = 0.5
@@ -107,6 +107,7 @@ def render_trajectory_video(
     times: FloatArray,
     object_masks: BoolArray | None,
     config: TrajectoryVideoConfig,
+    objects: ByteArray | None = None,
 ) -> MultiViewVideo:
     """Draws the trajectory into each view, at the cameras' size.
 
@@ -115,8 +116,8 @@ def render_trajectory_video(
         robot: gives the tool points.
         positions: (T, J) joint positions; frame k shows row k, row 0 is the current state.
         times: (T,) [s], increasing.
-        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or
-            (V, O, T, H, W) of every frame; or None.
+        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
+        objects: (V, T, H, W, 4) uint8 of `moved_pictures`, in place of masks; or None.
         config: how it looks.
 
     Returns:
@@ -133,9 +134,11 @@ def render_trajectory_video(
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.empty(shape, np.uint8)
     for view, camera in enumerate(cameras):
-        _fill(frames[view], () if object_masks is None else object_masks[view], config)
+        masks = () if object_masks is None or objects is not None else object_masks[view]
+        frames[view] = _canvas(camera, masks, config)
         poses = camera_poses(camera, robot, positions)
-        _draw_view(frames[view], camera, poses, arms, motion, config)
+        shown = None if objects is None else objects[view]
+        _draw_view(frames[view], camera, poses, arms, motion, config, shown)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
@@ -166,8 +169,6 @@ def _check(
     if len(sizes) != 1:
         raise ObservationError(f'the cameras have sizes (H, W) {sorted(sizes)}; one is needed')
     expected = (len(cameras), *sizes.pop())
-    if masks is not None and masks.ndim == 5 and masks.shape[2] == len(times):
-        masks = masks[:, :, 0]
     if masks is not None and (masks.ndim != 4 or (len(masks), *masks.shape[2:]) != expected):
         raise ObservationError(
             f'object masks have shape {masks.shape}, expected (V, O, H, W) with (V, H, W) = '
@@ -175,14 +176,14 @@ def _check(
         )
 
 
-def _fill(
-    frames: ByteArray, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
-) -> None:
-    """Makes (T, H, W, 3) frames black with the objects' fills; masks (T, H, W) or (H, W) each."""
-    frames[...] = 0
+def _canvas(
+    camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
+) -> ByteArray:
+    """(H, W, 3) black with the objects' fills."""
+    canvas = np.zeros((camera.height, camera.width, 3), np.uint8)
     for index, mask in enumerate(masks):
-        colour = np.rint(255 * object_colour(index, config.object_fill)).astype(np.uint8)
-        frames[np.broadcast_to(mask, frames.shape[:3])] = colour
+        canvas[mask] = np.rint(255 * object_colour(index, config.object_fill))
+    return canvas
 
 
 def _draw_view(
@@ -192,6 +193,7 @@ def _draw_view(
     arms: Sequence[FloatArray],
     motion: ToolMotion,
     config: TrajectoryVideoConfig,
+    objects: ByteArray | None,
 ) -> None:
     """Draws all arms onto the (T, H, W, 3) frames of one view; links where `arms` has points."""
     num_arms = len(motion.points)
@@ -220,7 +222,11 @@ def _draw_view(
                 box = cores[arm].draw(core, k, motion.closed[arm, k])
                 white.lay(frames[k], core, box)
                 region(core, box)[...] = 0
+        for arm in orders[:, k]:
             _draw_fingers(fingers, frames[k], arm, k)
+        if objects is not None:
+            cover = 255 - objects[k][..., 3:].astype(np.uint16)
+            frames[k] = objects[k][..., :3] + (frames[k] * cover // 255).astype(np.uint8)
 
 
 def _lines(

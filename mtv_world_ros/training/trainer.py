@@ -18,6 +18,7 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.history_tokens import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer.stem import with_new_source
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.base import Base
@@ -146,6 +147,7 @@ class Trainer:
             TrainingError: its transformer is of another shape.
         """
         given = load_checkpoint(folder).transformer.state_dict()
+        given = with_new_source(given, self.weights.worker.state_dict())
         try:
             self.weights.worker.load_state_dict(given)
         except RuntimeError as error:

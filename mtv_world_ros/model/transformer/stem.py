@@ -9,12 +9,16 @@ h4 w4 = a quarter of it, D = width of the transformer, G = frames merged into on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
 #: what every output pixel chooses from: hold the reference, two copies of it, or draw anew
 NUM_SOURCES = 4
+#: weight, before the softmax, of a source that a model learns to use later
+_NEW_SOURCE_BIAS = -1.0
 NUM_COPIES = 2
 
 
@@ -154,10 +158,12 @@ class ReferenceDecoder(nn.Module):
         dim: int,
         merge: int,
         reference_channels: int,
+        copies_control: bool = False,
     ) -> None:
         super().__init__()
         c1, c2, c3 = widths
         self.merge = merge
+        self.num_sources = NUM_SOURCES + copies_control
         self.out_channels = out_channels
         self.from_tokens = nn.Linear(dim, merge * c3)
         self.block3 = ResBlock(2 * c3, c3, dim)
@@ -168,7 +174,7 @@ class ReferenceDecoder(nn.Module):
         self.block1 = ResBlock(2 * c1, c1, dim)
         # 4 latent channels share one pixel position of a space-to-depth block of 2 x 2
         self.num_positions = out_channels // 3
-        num_out = out_channels + NUM_SOURCES * self.num_positions
+        num_out = out_channels + self.num_sources * self.num_positions
         self.conv_out = nn.Conv2d(c1, num_out, 3, padding=1)
         nn.init.zeros_(self.conv_out.weight)
         with torch.no_grad():
@@ -176,9 +182,16 @@ class ReferenceDecoder(nn.Module):
             assert bias is not None
             bias.zero_()
             bias[out_channels : out_channels + self.num_positions] = 2.0
+            bias[out_channels + NUM_SOURCES * self.num_positions :] = _NEW_SOURCE_BIAS
 
     def forward(
-        self, tokens: Tensor, skips: list[Tensor], temb: Tensor, keys: Tensor, reference: Tensor
+        self,
+        tokens: Tensor,
+        skips: list[Tensor],
+        temb: Tensor,
+        keys: Tensor,
+        reference: Tensor,
+        control: Tensor,
     ) -> Tensor:
         """Returns (N, out_channels, h, w) clean latents.
 
@@ -188,6 +201,7 @@ class ReferenceDecoder(nn.Module):
             temb: (B, D) time embedding.
             keys: (R, reference_channels, h2, w2) features of the reference images.
             reference: (R, out_channels, h, w) reference latents.
+            control: (N, out_channels, h, w) latents of the trajectory video.
         """
         fine, half, coarse = skips
         grid = self.from_tokens(tokens).unflatten(-1, (self.merge, -1))
@@ -199,23 +213,42 @@ class ReferenceDecoder(nn.Module):
         x = self.up1(F.interpolate(x, scale_factor=2.0, mode='nearest'))
         x = self.block1(torch.cat([x, fine], dim=1), temb)
         out = self.conv_out(F.silu(x)).float()
-        return self._mix(out, copies.float(), reference)
+        return self._mix(out, copies.float(), reference, control)
 
-    def _mix(self, out: Tensor, copies: Tensor, reference: Tensor) -> Tensor:
+    def _mix(self, out: Tensor, copies: Tensor, reference: Tensor, control: Tensor) -> Tensor:
         """Weighs the sources; channels of a latent are ordered colour-major (C, positions)."""
         c, p = self.out_channels, self.num_positions
         n, _, h, w = out.shape
         drawn = out[:, :c]
-        weights = out[:, c:].reshape(n, NUM_SOURCES, 1, p, h, w).softmax(dim=1)
+        weights = out[:, c:].reshape(n, self.num_sources, 1, p, h, w).softmax(dim=1)
         copied = F.pixel_shuffle(copies.reshape(n * NUM_COPIES, -1, h // 2, w // 2), 2)
         copied = copied.reshape(n, NUM_COPIES, 3, p, h, w)
         held = reference.float().repeat_interleave(n // reference.shape[0], 0)
-        sources = torch.cat(
-            [
-                held.reshape(n, 1, 3, p, h, w),
-                copied,
-                (held + drawn).reshape(n, 1, 3, p, h, w),
-            ],
-            dim=1,
-        )
-        return (weights * sources).sum(dim=1).reshape(n, c, h, w)
+        parts = [
+            held.reshape(n, 1, 3, p, h, w),
+            copied,
+            (held + drawn).reshape(n, 1, 3, p, h, w),
+        ]
+        if self.num_sources > NUM_SOURCES:
+            parts.append(control.float().reshape(n, 1, 3, p, h, w))
+        return (weights * torch.cat(parts, dim=1)).sum(dim=1).reshape(n, c, h, w)
+
+
+def with_new_source(
+    state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Returns a transformer's weights for one whose decoder also copies from the control.
+
+    Args:
+        state: weights by name.
+        wanted: those of the transformer that they are for; where it is the same, nothing changes.
+    """
+    grown = dict(state)
+    for name, fill in (
+        ('proj_out.conv_out.weight', 0.0),
+        ('proj_out.conv_out.bias', _NEW_SOURCE_BIAS),
+    ):
+        if name in state and name in wanted and len(state[name]) < len(wanted[name]):
+            more = state[name].new_full(wanted[name][len(state[name]) :].shape, fill)
+            grown[name] = torch.cat([state[name], more])
+    return grown

@@ -103,7 +103,7 @@ def unembed(
     temb: Tensor,
     keys: Tensor,
     reference: Tensor,
-    like: Tensor,
+    control: Tensor,
 ) -> Tensor:
     """Returns (B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D).
 
@@ -114,11 +114,12 @@ def unembed(
         temb: (B, D) embedding of the video's noise level.
         keys: of `embed_reference`.
         reference: (B, V, C, H, W) latents of the start image.
-        like: (B, V, C, F, H, W); only its shape is read.
+        control: (B, V, C, F, H, W) latents of the trajectory video.
     """
-    batch, views, _, num_frames, height, width = like.shape
+    batch, views, _, num_frames, height, width = control.shape
     if transformer.stem == 'conv':
-        frames = transformer.proj_out(kept, skips, temb, keys, reference.flatten(0, 1))
+        drawn = control.transpose(2, 3).flatten(0, 2)
+        frames = transformer.proj_out(kept, skips, temb, keys, reference.flatten(0, 1), drawn)
         return frames.unflatten(0, (batch, views, num_frames)).transpose(2, 3)
     p_t, p_h, p_w = transformer.patch_size
     out = transformer.proj_out(kept)

@@ -59,6 +59,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         num_context_tokens: learned tokens in place of the text where `context` is `none`.
         start_image: where the start image enters: `both`, as `reference` tokens alone, or in its
             `channel` slot alone.
+        copies_control: the convolutional decoder may also copy from the trajectory video, where
+            that shows the objects themselves (`rendering.object_motion`).
     """
 
     # number formats are chosen by whoever loads the model, in one place for all modules
@@ -95,6 +97,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         action_dim: int = 0,
         num_context_tokens: int = 8,
         start_image: str = 'both',
+        copies_control: bool = False,
     ) -> None:
         super().__init__(
             patch_size=patch_size,
@@ -129,7 +132,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         if context == 'none':
             self.condition_embedder.text_embedder = nn.Identity()  # type: ignore[assignment]
         if stem == 'conv':
-            self._build_conv_stem(in_channels, latent_channels, stem_widths, dim, frames_per_token)
+            self._build_conv_stem(
+                in_channels, latent_channels, stem_widths, dim, frames_per_token, copies_control
+            )
         else:
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
         self.with_text = context != 'none'
@@ -153,10 +158,13 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         widths: tuple[int, int, int],
         dim: int,
         merge: int,
+        copies_control: bool,
     ) -> None:
         self.patch_embedding = ConvStem(in_channels, widths, dim, merge)  # type: ignore[assignment]
         self.ref_conv = ReferenceStem(2 * channels, widths, dim)
-        self.proj_out = ReferenceDecoder(channels, widths, dim, merge, widths[1])  # type: ignore[assignment]
+        self.proj_out = ReferenceDecoder(  # type: ignore[assignment]
+            channels, widths, dim, merge, widths[1], copies_control
+        )
 
     def forward(  # type: ignore[override]
         self,
@@ -234,7 +242,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)
         sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
         kept = sequence.reshape(grid.tokens.shape)[:, :, grid.num_before :]
-        return unembed(self, kept, skips, temb[:, 0], keys, reference, hidden_states)
+        return unembed(self, kept, skips, temb[:, 0], keys, reference, control)
 
     def _embed_times(
         self,

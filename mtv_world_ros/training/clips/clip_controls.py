@@ -10,7 +10,7 @@ import numpy as np
 from mtv_world_ros.data.recording import Clip
 from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.object_motion import moved_masks, ObjectMotion
+from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
@@ -55,15 +55,14 @@ class ControlMaker:
             return None, self.actions.encode(self.robot, clip.positions)
         masks = None
         if self.object_mask:
-            masks = self._moving_masks(clip, names)
-            if masks is None:
-                masks = self._masks(start_frame, names)
+            masks = self._masks(start_frame, names)
         video = render_trajectory_video(
             cameras=clip.cameras,
             robot=self.robot,
             positions=clip.positions,
             times=clip.times,
             object_masks=masks,
+            objects=self._objects(clip, names) if self.object_mask else None,
             config=self.rendering,
         )
         return video.frames, None
@@ -73,8 +72,8 @@ class ControlMaker:
         with self._lock:
             return self.segmenter.segment(frames[:, None], names).masks[:, :, 0]
 
-    def _moving_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray | None:
-        """(V, O, 1 + T, H, W) masks that go where the objects went; None = they are held.
+    def _objects(self, clip: Clip, names: tuple[str, ...]) -> ByteArray | None:
+        """(V, 1 + T, H, W, 4) objects that go where they went; None = they are held as masks.
 
         They are those of the episode's first frame, as in a rollout of chained chunks.
         """
@@ -91,7 +90,8 @@ class ControlMaker:
             rotations=poses[..., :3, :3] @ np.swapaxes(first[:, :3, :3], -1, -2),
         )
         at_first = origin.positions[None]
-        return moved_masks(
+        return moved_pictures(
+            origin.frames,
             self._masks(origin.frames, names),
             motion,
             clip.cameras,
