@@ -39,6 +39,8 @@ COMMANDS = (
     import_dataset,
     import_weights,
 )
+#: of the extra `evaluate`, which several commands need
+_EVALUATE_PACKAGES = ('matplotlib', 'scipy')
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -58,6 +60,15 @@ def main(argv: list[str] | None = None) -> int:
         return arguments.handler(arguments)
     except MtvWorldError as error:
         print(f'mtv-world: {error}', file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        package = (error.name or '').partition('.')[0]
+        if package not in _EVALUATE_PACKAGES:
+            raise
+        print(
+            f"mtv-world: {package} is not installed: pip install 'mtv_world_ros[evaluate]'",
+            file=sys.stderr,
+        )
         return 1
     except KeyboardInterrupt:
         return 130
