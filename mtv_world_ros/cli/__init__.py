@@ -43,14 +43,20 @@ COMMANDS = (
 _EVALUATE_PACKAGES = ('matplotlib', 'scipy')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs a command; returns the exit status (1 for an error of the user's)."""
+def make_parser() -> argparse.ArgumentParser:
+    """Returns the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='mtv-world', description='An online embodied world model for ROS 2.'
     )
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     for command in COMMANDS:
         command.add(commands)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs a command; returns the exit status (1 for an error of the user's)."""
+    parser = make_parser()
     arguments, more = parser.parse_known_args(argv)
     arguments.player = more
     arguments.command_line = sys.argv[1:] if argv is None else argv
