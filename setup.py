@@ -42,6 +42,7 @@ setup(
     data_files=data_files(),
     python_requires='>=3.11',
     install_requires=[
+        'Jinja2>=3.1',
         'PyYAML>=6',
         'av>=18',
         'diffusers>=0.42,<0.43',
@@ -64,8 +65,8 @@ setup(
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
         'vision': ['transformers>=5.23,<6'],
-        # PSNR and SSIM of `mtv-world evaluate --quality`
-        'evaluate': ['torchmetrics>=1.8'],
+        # Intervals, fits and charts of evaluate, calibrate, rank and report; PSNR and SSIM.
+        'evaluate': ['matplotlib>=3.6', 'scipy>=1.11', 'torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # LeRobot datasets are read with it (mtv-world import-dataset).

@@ -50,7 +50,7 @@ _ABOUT = (
     'J all: of all objects; the other columns: of the objects that really move. Persistence: the '
     'first frame held; skill: (J moving - persistence) / (1 - persistence). Shuffled, zero, '
     "mirrored: J moving when another episode's actions, held joints, or the other arm's motion "
-    'are imagined instead; a model that obeys its actions loses there. Brackets: 95 % bootstrap '
+    'are imagined instead; a model that obeys its actions loses there. Brackets: 95 % t intervals '
     'over episodes. The rows without a drawn trajectory have cross-attention that the drawn ones '
     'do not need, hence more parameters; their trajectory channels are zero, so they are not '
     'given the object masks either (compare w/o Mask).'

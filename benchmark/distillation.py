@@ -83,7 +83,7 @@ def main() -> None:
         f'python {shlex.join(sys.argv)}',
         table(['model', 'steps', *COLUMNS, 'model [s a chunk]', 'episodes'], rows)
         + f'\n\nStudents: {options.training_steps} training steps of batch {options.batch_size} '
-        f'along {options.path_steps}-step paths of the teacher. Brackets: 95 % bootstrap over '
+        f'along {options.path_steps}-step paths of the teacher. Brackets: 95 % t intervals over '
         'episodes.',
         options,
         f'torch {torch.__version__}',

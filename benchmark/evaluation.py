@@ -106,7 +106,7 @@ def _stages(found: Summary, count: int, alone: float) -> str:
     ]
     rest = alone / count - sum(seconds.values())
     rows.append(
-        ['all else (bootstrap, files)', f'{rest:.3f}', f'{100 * rest * count / alone:.0f} %']
+        ['all else (intervals, files)', f'{rest:.3f}', f'{100 * rest * count / alone:.0f} %']
     )
     return table(['stage', 'wall time per episode [s]', 'share'], rows)
 

@@ -147,7 +147,7 @@ def body(scored: dict[str, dict[str, Summary]]) -> str:
     return (
         f'J of the objects that move by chunk of {first.spec.num_frames} frames, chained from the '
         f"episode's first frame; {len(first.results)} episodes, denoising steps {steps}, masks by "
-        'the colour segmenter; brackets: 95 % bootstrap over episodes. Later chunks have fewer '
+        'the colour segmenter; brackets: 95 % t intervals over episodes. Later chunks have fewer '
         'episodes.\n\n'
         + table(
             ['checkpoint', 'way', 'view', *(f'chunk {k + 1}' for k in range(num_chunks))], lines

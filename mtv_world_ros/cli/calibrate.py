@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -151,7 +152,7 @@ def _horizon(
     return HorizonCurve(
         period_s=1 / summary.spec.fps,
         values=found.values,
-        lower=tuple(low for low, _ in found.band),
+        lower=tuple(low if isfinite(low) else 0.0 for low, _ in found.band),
         segmenter=str(summary.settings['segmenter']),
         num_episodes=len(rows),
         made=made,

@@ -14,8 +14,13 @@ from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_pa
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.demo.predictions import Predictions, read_predictions, RecordedChunk
 from mtv_world_ros.demo.processes import DemoOptions, record_through_node
-from mtv_world_ros.evaluation.metrics.scores import score_frames, score_rows, ScoreRow, true_masks
-from mtv_world_ros.evaluation.metrics.statistics import episode_means
+from mtv_world_ros.evaluation.metrics.scores import (
+    episode_means,
+    score_frames,
+    score_rows,
+    ScoreRow,
+    true_masks,
+)
 from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video import (
     Comparison,

@@ -122,8 +122,6 @@ def evaluate(
         provenance=provenance,
         results=results,
         failed=dict(sorted(failed.items())),
-        seed=config.seed,
-        num_resamples=config.num_resamples,
     )
     summary = summary.with_distances(_distances(summary, out, config))
     summary.write(out)
@@ -223,7 +221,6 @@ class _Run:
             'spec': [list(spec.views), spec.fps, spec.num_frames, spec.width, spec.height],
             'segmenter': pipeline.segmenter.name,
         }
-        self.settings.pop('num_resamples')
 
     def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, EpisodeResult | str]]:
         """Yields jobs with their result, or why there is none."""

@@ -18,8 +18,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.evaluation.metrics.scores import ScoreRow
-from mtv_world_ros.evaluation.metrics.statistics import episode_means, QUALITY
+from mtv_world_ros.evaluation.metrics.scores import episode_means, QUALITY, ScoreRow
 from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video import compare
 from mtv_world_ros.evaluation.video_file import decode_video, encode_video

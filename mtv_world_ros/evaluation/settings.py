@@ -18,7 +18,7 @@ class EvaluationConfig:
     Attributes:
         mode: `observe`: every chunk from the real frames at its start; `imagine`: chunks chained
             from the episode's first frame.
-        seed: of the noise, of the choice of shuffled actions, of the bootstrap.
+        seed: of the noise and of the choice of shuffled actions.
         num_seeds: rollouts whose mean the success estimate is; J is of the first one's frames.
         num_inference_steps: denoising steps; 0 = those the model is made for.
         actions: of `controls.ACTIONS`: everything is imagined once with each.
@@ -28,7 +28,6 @@ class EvaluationConfig:
         quality: of `image_quality.MEASURES`.
         fid_weights: Inception-v3 state dict; None = no FID.
         fvd_weights: I3D state dict or VideoMAE folder; None = no FVD.
-        num_resamples: of the bootstrap.
     """
 
     mode: str = 'observe'
@@ -41,15 +40,12 @@ class EvaluationConfig:
     quality: tuple[str, ...] = ()
     fid_weights: Path | None = None
     fvd_weights: Path | None = None
-    num_resamples: int = 2000
 
     def __post_init__(self) -> None:
         check_mode(self.mode)
         check_actions(self.actions)
         if self.num_seeds < 1:
             raise ConfigError(f'num_seeds is {self.num_seeds}; it must be at least 1')
-        if self.num_resamples < 1:
-            raise ConfigError(f'num_resamples is {self.num_resamples}; it must be at least 1')
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""

@@ -22,9 +22,9 @@ _CEILING = (
     "are the world model's."
 )
 _INTERVALS = (
-    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: bootstrap over episodes, each '
-    'drawn for all policies and both worlds at once. MMRV weighs a wrongly ranked pair by how far '
-    'its true rates lie apart; 0 is perfect.'
+    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: jackknife over scenes, each '
+    'left out for all policies and both worlds at once; none below 4 scenes. MMRV weighs '
+    'a wrongly ranked pair by how far its true rates lie apart; 0 is perfect.'
 )
 
 

@@ -12,15 +12,14 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.evaluation.metrics.policy_agreement import (
-    bootstrap,
-    Interval,
+    agreement_interval,
     mean_maximum_rank_violation,
     pearson,
     powered_mean,
     PoweredMean,
     rates,
-    wilson,
 )
+from mtv_world_ros.evaluation.metrics.statistics import Interval, wilson
 from mtv_world_ros.ranking.jobs import Judged, Result
 
 #: label of all tasks together
@@ -78,7 +77,7 @@ class Agreement:
     Attributes:
         score: `pearson` or `mmrv`.
         value: NaN where it is not defined, e.g. all rates alike.
-        interval: 95 % bootstrap interval over episodes.
+        interval: 95 % jackknife interval over scenes; NaN where these are too few.
         num_policies: with a rate in both.
     """
 
@@ -105,16 +104,12 @@ class Summary:
         failed: rollouts without a result, and why.
         num_true: episodes of each task whose true outcomes the powered estimates may use.
         provenance: what it was made with, by heading.
-        seed: of the bootstrap.
-        num_resamples: of the bootstrap.
     """
 
     results: Sequence[Result]
     failed: Mapping[str, str]
     num_true: int
     provenance: Mapping[str, str]
-    seed: int = 0
-    num_resamples: int = 2000
 
     @cached_property
     def policies(self) -> tuple[str, ...]:
@@ -160,9 +155,7 @@ class Summary:
             name: Agreement(
                 score=name,
                 value=score(a, b),
-                interval=bootstrap(
-                    score, judged, true, seed=self.seed, num_resamples=self.num_resamples
-                ),
+                interval=agreement_interval(score, judged, true),
                 num_policies=int((np.isfinite(a) & np.isfinite(b)).sum()),
             )
             for name, score in SCORES.items()

@@ -19,7 +19,7 @@ class HorizonCurve:
     Attributes:
         period_s: between frames [s]; frame k is `(k + 1) * period_s` ahead.
         values: (T,) mean J.
-        lower: (T,) 2.5 percentile over resampled episodes.
+        lower: (T,) lower end of the 95 % interval over episodes; 0 where too few reach it.
         segmenter: that found the masks.
         num_episodes: behind it.
         made: command, date, machine.

@@ -11,6 +11,8 @@ import sys
 
 import pytest
 
+from mtv_world_ros.sim.expert.faults import FAULTS
+
 ROOT = Path(__file__).resolve().parents[2]
 MOST_WORDS = 1200
 
@@ -37,6 +39,12 @@ def test_the_index_of_benchmarks_has_every_page():
     index = (ROOT / 'docs' / 'benchmarks.md').read_text()
     for page in (ROOT / 'benchmark' / 'results').glob('*.md'):
         assert f'(../benchmark/results/{page.name})' in index, page.name
+
+
+def test_the_fault_catalogue_has_a_row_for_every_kind():
+    page = (ROOT / 'docs' / 'ranking.md').read_text()
+    rows = re.findall(r'^\| `(\w+)` \| (\w+) \| (\w+) \|', page, re.M)
+    assert rows == [(name, kind.family, kind.split) for name, kind in FAULTS.items()]
 
 
 @pytest.mark.skipif(

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
-from mtv_world_ros.cli import COMMANDS, main
+from mtv_world_ros.cli import main, make_parser
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.sim.world.opengl import missing_opengl
 
@@ -140,9 +140,11 @@ BLOCKS = [block for page, text in TEXTS.items() for block in blocks_of(page, tex
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of `mtv-world`'s commands; none takes abbreviations here."""
-    commands = argparse.ArgumentParser(prog='mtv-world').add_subparsers()
-    for command in COMMANDS:
-        command.add(commands)
+    (commands,) = (
+        action
+        for action in make_parser()._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
     for parser in commands.choices.values():
         parser.allow_abbrev = False
     return dict(commands.choices)

@@ -30,7 +30,7 @@ def _names(out) -> set[str]:
 
 
 def _run(pipeline, episodes, out, **options):
-    return evaluate(pipeline, episodes, out, show_progress=False, num_resamples=50, **options)
+    return evaluate(pipeline, episodes, out, show_progress=False, **options)
 
 
 def test_described_objects_are_scored_and_the_others_are_not(make_pipeline, episodes, tmp_path):

@@ -10,7 +10,7 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 
 def run(pipeline, episodes, out, **options):
-    options = {'show_progress': False, 'num_resamples': 200, **options}
+    options = {'show_progress': False, **options}
     summary = evaluate(pipeline, episodes, out, **options)
     return json.loads((out / 'metrics.json').read_text()), summary.markdown()
 

@@ -141,7 +141,7 @@ def test_pickled_objects_are_not_loaded(tmp_path):
 
 
 def test_evaluation_keeps_what_it_scored(make_pipeline, episodes, recordings, oracle, tmp_path):
-    evaluate(make_pipeline(oracle), episodes[:1], tmp_path, show_progress=False, num_resamples=10)
+    evaluate(make_pipeline(oracle), episodes[:1], tmp_path, show_progress=False)
     read = load_rollout(rollout_path(tmp_path, 'episode_0'))
     assert read.stretches.tolist() == [0] * 4 + [1] * 4
     assert np.allclose(read.times, np.arange(1, 9) / 5, atol=1e-6)

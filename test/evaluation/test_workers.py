@@ -8,7 +8,7 @@ from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.evaluation.evaluate import evaluate, make_jobs, Parallel
 from mtv_world_ros.files import plain
 
-QUIET = {'show_progress': False, 'num_resamples': 50}
+QUIET = {'show_progress': False}
 CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
 
 

@@ -27,7 +27,7 @@ def summary(make_result):
     ]
     return Summary(
         results=results, failed={'x_00000_<b>': 'gone'}, num_true=2,
-        provenance={'command': 'mtv-world rank'}, num_resamples=100,
+        provenance={'command': 'mtv-world rank'},
     )  # fmt: skip
 
 
@@ -72,19 +72,19 @@ def test_the_page_says_what_the_numbers_hide(summary, make_result):
     assert '1 rollouts have no result' in text and 'x_00000_<b>: gone' in text
     blind = Summary(
         results=[make_result(p, 0, p == 'a', nan) for p in 'ab'],
-        failed={}, num_true=1, provenance={}, num_resamples=10,
+        failed={}, num_true=1, provenance={},
     )  # fmt: skip
     text = ' '.join(remarks(blind))
     assert 'r is not defined' in text and 'It judged nothing of stack_blocks_two' in text
     assert 'not defined' in markdown(blind)
     alike = [make_result(p, i, i < 2, 0.9 if i < 2 else 0.1) for p in 'ab' for i in range(4)]
-    same = Summary(results=alike, failed={}, num_true=1, provenance={}, num_resamples=10)
+    same = Summary(results=alike, failed={}, num_true=1, provenance={})
     assert 'rates are alike' in ' '.join(remarks(same))
 
 
 def test_the_page_says_that_two_policies_prove_nothing(make_result):
     pair = [make_result(p, i, p == 'a', 0.9 if p == 'a' else 0.1) for p in 'ab' for i in range(4)]
-    two = Summary(results=pair, failed={}, num_true=1, provenance={}, num_resamples=10)
+    two = Summary(results=pair, failed={}, num_true=1, provenance={})
     assert two.agreement('imagined', None)['pearson'].value == pytest.approx(1.0)
     assert 'Of two policies r is 1 or -1 whatever they do' in ' '.join(remarks(two))
 

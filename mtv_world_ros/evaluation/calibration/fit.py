@@ -8,10 +8,11 @@ from math import isfinite, nan
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.calibration.logistic import fit_non_negative
+from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.success.calibration import Calibration, weighed
@@ -20,6 +21,8 @@ from mtv_world_ros.success.evidence import FEATURES
 
 #: fewer episodes of known outcome than this say nothing
 MIN_EPISODES = 8
+#: of a fitted logistic; all labels equal would have no finite one
+MAX_BIAS = 30.0
 #: what the scores are called, in the order of the tables
 BEFORE, AFTER, FITTED = 'before', 'after', 'fitted'
 ALWAYS = 'always success'
@@ -151,7 +154,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
     # imagination rarely shows what failed, as an object left behind: there, what was stated holds
     stated = EstimatorConfig().weights
     prior = scales * [stated.get(name, 0.0) for name in FEATURES]
-    logistic = fit_non_negative(standard, labels, l2=l2, prior=prior)
+    logistic = fit_logistic(standard, labels, l2=l2, prior=prior, non_negative=True)
     return {
         'features': FEATURES,
         'means': tuple(means.tolist()),
@@ -192,3 +195,78 @@ def _mean_of(probabilities: Sequence[float]) -> float:
 def _judged(sample: Sample, probability: float) -> Judgement:
     outcome = 'success' if sample.success else 'failure'
     return Judgement(probability=probability, outcome=outcome)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Logistic:
+    """P(true) = 1 / (1 + exp(-(weights x + bias))).
+
+    Attributes:
+        weights: (F,).
+        bias: is not penalised; within +-`MAX_BIAS`.
+    """
+
+    weights: FloatArray
+    bias: float
+
+    def probability(self, features: FloatArray) -> FloatArray:
+        """Returns (N,) for features (N, F)."""
+        return expit(features @ self.weights + self.bias)
+
+
+def fit_logistic(
+    features: FloatArray,
+    labels: BoolArray,
+    *,
+    l2: float = 1.0,
+    prior: FloatArray | None = None,
+    non_negative: bool = False,
+) -> Logistic:
+    """Minimises -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
+
+    Args:
+        features: (N, F).
+        labels: (N,).
+        l2: strength of the penalty; positive, so that there is one minimum.
+        prior: (F,) weights that hold where the rows say nothing; None = zero.
+        non_negative: no weight below 0, for features that grow with the probability.
+
+    Raises:
+        ConfigError: there are no rows, or `l2` is not positive.
+        MtvWorldError: the minimum was not reached.
+    """
+    if not len(features) or l2 <= 0:
+        raise ConfigError(
+            f'a logistic is fitted to {len(features)} episodes with l2 = {l2}; it needs at least '
+            'one episode and a positive l2'
+        )
+    num = features.shape[1]
+    centre = np.zeros(num) if prior is None else np.asarray(prior, np.float64)
+
+    def loss(theta: FloatArray) -> tuple[float, FloatArray]:
+        logits, away = features @ theta[:-1] + theta[-1], theta[:-1] - centre
+        value = np.logaddexp(0, logits).sum() - logits[labels].sum() + l2 / 2 * away @ away
+        slope = expit(logits) - labels
+        return float(value), np.append(slope @ features + l2 * away, slope.sum())
+
+    start = np.append(np.maximum(centre, 0.0) if non_negative else centre, 0.0)
+    bounds = [(0.0 if non_negative else None, None)] * num + [(-MAX_BIAS, MAX_BIAS)]
+    # stops at the gradient alone: the value is flat near the minimum
+    options = {'ftol': 0.0, 'gtol': 1e-9, 'maxiter': 10_000, 'maxfun': 100_000, 'maxcor': 30}
+    theta = minimize(loss, start, jac=True, method='L-BFGS-B', bounds=bounds, options=options).x
+    left = _slope_within(theta, loss(theta)[1], bounds)
+    if left > 1e-4 * max(1.0, l2, float(np.abs(features).sum(0).max(initial=0))):
+        raise MtvWorldError(
+            f'the logistic fit to {len(features)} episodes did not reach its minimum (gradient '
+            f'{left:.2g}); set another --l2, now {l2:g}'
+        )
+    return Logistic(weights=theta[:-1], bias=float(theta[-1]))
+
+
+def _slope_within(
+    theta: FloatArray, gradient: FloatArray, bounds: Sequence[tuple[float | None, float | None]]
+) -> float:
+    """The largest slope along which `theta` could still go down without leaving its bounds."""
+    low, high = np.array(bounds, np.float64).T  # None becomes NaN: no bound
+    blocked = ((theta <= low) & (gradient > 0)) | ((theta >= high) & (gradient < 0))
+    return float(np.abs(np.where(blocked, 0.0, gradient)).max())

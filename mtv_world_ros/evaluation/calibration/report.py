@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.evaluation.calibration.fit import AFTER, ALWAYS, BEFORE, Calibrated, FITTED
-from mtv_world_ros.evaluation.metrics.reliability import reliability_bins
-from mtv_world_ros.evaluation.metrics.success_agreement import agreement
+from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.evaluation.report.markup import element, Markup
 from mtv_world_ros.files import share_path, write_json, write_whole
@@ -113,7 +112,7 @@ def _horizon_text(horizon: HorizonCurve) -> str:
     return (
         f'Mean J of the objects that move, over {horizon.num_episodes} whole episodes; known up '
         f'to {len(horizon.values) * horizon.period_s:.1f} s. By the lower end of the 95 % '
-        'bootstrap interval, J is at least\n\n' + _table(['J', 'up to'], rows)
+        'interval, J is at least\n\n' + _table(['J', 'up to'], rows)
     )
 
 

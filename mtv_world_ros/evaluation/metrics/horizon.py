@@ -1,4 +1,4 @@
-"""J against how far ahead was imagined, with bootstrap bands over episodes."""
+"""J against how far ahead was imagined, with 95 % bands over episodes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.evaluation.metrics.scores import ScoreRow
+from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 
 #: frames that fewer than this share of the rollouts reach are left out of pictures
 MIN_SHARE = 1 / 3
@@ -19,7 +20,7 @@ class Curve:
 
     Attributes:
         values: (T,) mean over rows of objects that move.
-        band: (T,) 2.5 and 97.5 percentiles over resampled episodes.
+        band: (T,) 95 % t intervals over episodes; NaN where too few reach the frame.
     """
 
     values: tuple[float, ...]
@@ -32,8 +33,6 @@ def curve(
     field: str,
     *,
     min_share: float = MIN_SHARE,
-    seed: int = 0,
-    num_resamples: int = 500,
 ) -> Curve:
     """Returns J of the moving objects of a view against the horizon; rows weigh equally.
 
@@ -42,13 +41,11 @@ def curve(
         view: its name; None = all.
         field: one of `scores.FRAME_FIELDS`.
         min_share: frames that fewer than this share of the rollouts reach are left out.
-        seed: of the resampling.
-        num_resamples: how often the episodes are drawn with replacement.
     """
     sums, counts = _sums(_moving(episodes, view, field))
     total = counts.sum(0)
     covered = int((total >= max(min_share * total.max(initial=0), 1)).sum())
-    return _resampled(sums[:, :covered], counts[:, :covered], seed, num_resamples)
+    return _curve(sums[:, :covered], counts[:, :covered])
 
 
 def by_chunk(
@@ -56,9 +53,6 @@ def by_chunk(
     view: str | None,
     field: str,
     num_frames: int,
-    *,
-    seed: int = 0,
-    num_resamples: int = 2000,
 ) -> Curve:
     """Returns J of the moving objects of a view for each chunk of its rollouts: how it drifts.
 
@@ -69,8 +63,6 @@ def by_chunk(
         view: its name; None = all.
         field: one of `scores.FRAME_FIELDS`.
         num_frames: T, frames of a chunk.
-        seed: of the resampling.
-        num_resamples: how often the episodes are drawn with replacement.
     """
     sums, counts = _sums(_moving(episodes, view, field))
     missing = -sums.shape[1] % num_frames
@@ -78,7 +70,7 @@ def by_chunk(
         np.pad(of_frames, ((0, 0), (0, missing))).reshape(len(episodes), -1, num_frames).sum(2)
         for of_frames in (sums, counts)
     ]
-    return _resampled(chunks[0], chunks[1], seed, num_resamples)
+    return _curve(chunks[0], chunks[1])
 
 
 def _moving(
@@ -95,17 +87,9 @@ def _moving(
     ]
 
 
-def _resampled(sums: np.ndarray, counts: np.ndarray, seed: int, num_resamples: int) -> Curve:
-    """Means of (E, T) sums over so many values, and what they are with episodes drawn anew."""
-    num_episodes, length = sums.shape
-    if not length:
-        return Curve(values=(), band=())
-    share = np.full(num_episodes, 1 / num_episodes)
-    weights = np.random.default_rng(seed).multinomial(num_episodes, share, size=num_resamples)
-    with np.errstate(invalid='ignore'):
-        drawn = (weights @ sums) / (weights @ counts)
-        values = sums.sum(0) / counts.sum(0)
-    low, high = np.nanpercentile(drawn, [2.5, 97.5], axis=0)
+def _curve(sums: np.ndarray, counts: np.ndarray) -> Curve:
+    """Means of (E, T) sums of so many values, and their intervals."""
+    values, (low, high) = mean_interval(sums, counts)
     return Curve(
         values=tuple(values.tolist()),
         band=tuple(zip(low.tolist(), high.tolist(), strict=True)),

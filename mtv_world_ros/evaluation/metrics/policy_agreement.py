@@ -10,24 +10,13 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError
-
-#: normal quantile of a 95 % interval
-Z95 = 1.959964
-
-Interval = tuple[float, float]
-_UNKNOWN: Interval = (np.nan, np.nan)
-
-
-def wilson(hits: int, count: int) -> Interval:
-    """Returns the 95 % Wilson score interval of a share; (NaN, NaN) where nothing was counted."""
-    if count == 0:
-        return _UNKNOWN
-    share, square = hits / count, Z95**2
-    centre = share + square / (2 * count)
-    half = Z95 * np.sqrt(share * (1 - share) / count + square / (4 * count**2))
-    scale = 1 + square / count
-    low, high = (centre - half) / scale, (centre + half) / scale
-    return max(float(low), 0.0), min(float(high), 1.0)
+from mtv_world_ros.evaluation.metrics.statistics import (
+    Interval,
+    jackknife_interval,
+    MIN_SCENES,
+    t_quantile,
+    UNKNOWN,
+)
 
 
 def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray) -> float:
@@ -81,38 +70,39 @@ def rates(outcomes: FloatArray) -> FloatArray:
         return np.nanmean(flat, axis=1)
 
 
-def bootstrap(
-    score: Callable[[FloatArray, FloatArray], float],
-    judged: FloatArray,
-    true: FloatArray,
-    *,
-    seed: int = 0,
-    num_resamples: int = 2000,
+def agreement_interval(
+    score: Callable[[FloatArray, FloatArray], float], judged: FloatArray, true: FloatArray
 ) -> Interval:
-    """Returns the 95 % bootstrap interval of a score of success rates, over episodes.
+    """Returns the 95 % interval of a score of success rates, over scenes: a jackknife with t.
 
-    An episode is drawn for all policies and in both lists at once: they share its scene. Tasks
-    are kept, episodes are drawn within each. Resamples without a score are left out.
+    A scene (an episode of a task) is left out for all policies and in both lists at once, since
+    they share it. r is transformed as Fisher does, so its interval stays within -1 and 1.
+    In simulated rankings of ten policies it covers 93 to 96 % from 4 episodes a task on; where
+    r is close to 1, 83 to 91 %, and then r is higher than the interval says.
 
     Args:
-        score: of the rates (P,) judged and true, e.g. `pearson`.
+        score: `pearson` or `mean_maximum_rank_violation`.
         judged: (P, K, E) outcomes of P policies on E episodes of each of K tasks; NaN = none.
         true: (P, K, E) true outcomes.
-        seed: of the resampling.
-        num_resamples: how often.
+
+    Returns:
+        (low, high); NaN for fewer than `MIN_SCENES` scenes, where the score is not defined, or
+        where no scene changes it.
     """
-    generator = np.random.default_rng(seed)
-    num_tasks, num_episodes = judged.shape[1:]
-    tasks = np.arange(num_tasks)[:, None]
-    found = []
-    for _ in range(num_resamples if judged.size else 0):
-        drawn = generator.integers(0, num_episodes, (num_tasks, num_episodes))
-        found.append(score(rates(judged[:, tasks, drawn]), rates(true[:, tasks, drawn])))
-    known = np.array(found)[np.isfinite(found)] if found else np.zeros(0)
-    if not len(known):
-        return _UNKNOWN
-    low, high = np.percentile(known, [2.5, 97.5])
-    return float(low), float(high)
+    seen = np.isfinite(true).any(axis=0)
+    flat = [outcomes[:, seen] for outcomes in (judged, true)]
+    sums = [(np.nan_to_num(part), np.isfinite(part)) for part in flat]
+
+    def of_scenes(weights: FloatArray) -> float:
+        with np.errstate(invalid='ignore'):
+            a, b = ((hits @ weights) / (known @ weights) for hits, known in sums)
+        return score(a, b)
+
+    if score is pearson:
+        to, back = lambda r: np.arctanh(np.clip(r, -0.9999, 0.9999)), np.tanh
+    else:
+        to, back = (lambda value: value), (lambda value: np.clip(value, 0.0, 1.0))
+    return jackknife_interval(of_scenes, int(seen.sum()), to=to, back=back)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,8 +110,9 @@ class PoweredMean:
     """A mean from few true values and many predictions.
 
     Attributes:
-        value: the estimate; of a success rate it may leave [0, 1].
-        interval: 95 %, for many true values; NaN where they are less than two or do not vary.
+        value: the estimate, cut to [0, 1].
+        interval: 95 %, with the t quantile of the true values, cut to [0, 1]; NaN where these
+            are fewer than `MIN_SCENES` or do not vary.
         weight: of the predictions (lambda), 0 = the mean of the true values alone.
         num_true: true values.
         num_more: predictions without a true value.
@@ -141,7 +132,7 @@ def powered_mean(
     *,
     weight: float | None = None,
 ) -> PoweredMean:
-    """Returns the prediction-powered estimate of the mean of the true values.
+    """Returns the prediction-powered estimate of the mean of true values in [0, 1].
 
     Unbiased however wrong the predictions are: their error is measured where both are known.
 
@@ -159,9 +150,7 @@ def powered_mean(
     if y.shape != f.shape or y.ndim != 1:
         raise ConfigError(f'{y.shape} true values have {f.shape} predictions; they go in pairs')
     if not len(y):
-        return PoweredMean(
-            value=np.nan, interval=_UNKNOWN, weight=0.0, num_true=0, num_more=len(u)
-        )
+        return PoweredMean(value=np.nan, interval=UNKNOWN, weight=0.0, num_true=0, num_more=len(u))
     if not len(u):
         weight = 0.0
     elif weight is None:
@@ -169,12 +158,13 @@ def powered_mean(
     errors = y - weight * f
     value = float(errors.mean() + (weight * u.mean() if len(u) else 0.0))
     variance = errors.var(ddof=1) / len(y) if len(y) > 1 else 0.0
-    interval = _UNKNOWN
-    if variance > 1e-12:
+    interval = UNKNOWN
+    if len(y) >= MIN_SCENES and variance > 1e-12:
         if len(u) > 1:
             variance += weight**2 * u.var(ddof=1) / len(u)
-        half = Z95 * float(np.sqrt(variance))
-        interval = (value - half, value + half)
+        half = float(t_quantile(len(y) - 1)) * float(np.sqrt(variance))
+        interval = (max(value - half, 0.0), min(value + half, 1.0))
+    value = min(max(value, 0.0), 1.0)
     return PoweredMean(
         value=value, interval=interval, weight=weight, num_true=len(y), num_more=len(u)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -244,3 +244,58 @@ def _union_row(
         j_shuffled_frames=(),
         **_values(scores, lambda found: found.union[v]),
     )
+
+
+#: means over rows of one episode: name -> (field of the row, which rows)
+MEANS = {
+    'j_object_mean': ('j', 'object'),
+    'j_visible': ('j_visible', 'object'),
+    'j_copy_mean': ('j_copy', 'object'),
+    'j_ceiling': ('j_ceiling', 'object'),
+    'j_self': ('j_self', 'object'),
+    'j_union': ('j', 'union'),
+    'j_copy_union': ('j_copy', 'union'),
+    'j_moving': ('j', 'moving'),
+    'j_copy_moving': ('j_copy', 'moving'),
+    'j_shuffled_moving': ('j_shuffled', 'moving'),
+    'j_zero_moving': ('j_zero', 'moving'),
+    'j_mirrored_moving': ('j_mirrored', 'moving'),
+    'j_ceiling_moving': ('j_ceiling', 'moving'),
+    'j_self_moving': ('j_self', 'moving'),
+}
+#: means over frames of one episode that are not of objects
+QUALITY = ('psnr', 'ssim', 'lpips')
+#: functions of the means: name -> (minuend, subtrahend); paired within each episode
+MARGINS = {
+    'margin_moving': ('j_moving', 'j_copy_moving'),
+    'margin_over_shuffled': ('j_moving', 'j_shuffled_moving'),
+    'margin_of_shuffled': ('j_shuffled_moving', 'j_copy_moving'),
+}
+
+
+def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float]:
+    """Returns the `MEANS` and `MARGINS` of one episode; frames weigh equally.
+
+    Only rows with a J count, also in the baselines, so that the differences are paired.
+
+    Args:
+        rows: of the episode.
+        view: name, or None for all views together.
+    """
+    kept = [row for row in rows if view in (None, row.view) and np.isfinite(row.j)]
+    chosen = {
+        'object': [row for row in kept if row.name],
+        'union': [row for row in kept if not row.name],
+        'moving': [row for row in kept if row.name and row.moving],
+    }
+    means = {name: _mean(chosen[which], field) for name, (field, which) in MEANS.items()}
+    for name, (minuend, subtrahend) in MARGINS.items():
+        means[name] = means[minuend] - means[subtrahend]
+    return means
+
+
+def _mean(rows: Sequence[ScoreRow], field: str) -> float:
+    values = np.array([getattr(row, field) for row in rows], np.float64)
+    weights = np.array([row.num_frames for row in rows], np.float64)
+    known = np.isfinite(values)
+    return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.evaluation.metrics.statistics import wilson
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +27,8 @@ class Judgement:
 
 #: equally wide bins of the calibration error
 NUM_BINS = 10
+#: those of the reliability chart
+NUM_CHART_BINS = 5
 
 
 def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
@@ -88,7 +91,7 @@ def _mean(values: np.ndarray) -> float | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bin:
-    """What was said and what came true, of those that were said about the same.
+    """Estimates of about the same probability, and how often they came true.
 
     Attributes:
         middle: of the probabilities that belong here.
@@ -103,3 +106,26 @@ class Bin:
     came_true: float
     interval: tuple[float, float]
     count: int
+
+
+def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
+    """Returns the bins that hold an estimate of known outcome; empty = there is none."""
+    judged = [
+        item
+        for item in judgements
+        if item.outcome in ('success', 'failure') and np.isfinite(item.probability)
+    ]
+    said = np.array([item.probability for item in judged])
+    true = np.array([item.outcome == 'success' for item in judged], bool)
+    place = np.minimum((said * NUM_CHART_BINS).astype(int), NUM_CHART_BINS - 1)
+    return [
+        Bin(
+            middle=(k + 0.5) / NUM_CHART_BINS,
+            said=float(said[place == k].mean()),
+            came_true=float(true[place == k].mean()),
+            interval=wilson(int(true[place == k].sum()), int((place == k).sum())),
+            count=int((place == k).sum()),
+        )
+        for k in range(NUM_CHART_BINS)
+        if (place == k).any()
+    ]

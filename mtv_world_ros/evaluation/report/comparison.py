@@ -8,7 +8,7 @@ import io
 from pathlib import Path
 from typing import NamedTuple
 
-from mtv_world_ros.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
 from mtv_world_ros.evaluation.report import tables
 from mtv_world_ros.evaluation.report.summary import Group, SEEN, Summary
 from mtv_world_ros.files import plain, write_json, write_whole
@@ -18,7 +18,7 @@ TASKS_PER_TABLE = 3
 _COPY = 'First frame held'
 _ABOUT = (
     'J: of the union of all objects, mean over frames and episodes (the paper prints it times '
-    '100). J moving: of the objects that really move. Brackets: 95 % bootstrap over episodes; of '
+    f'100). J moving: of the objects that really move. Brackets: {METHOD}; of '
     'FID and FVD jackknife. A dash is not measured, or a view that the model does not have.'
 )
 

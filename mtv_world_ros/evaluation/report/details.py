@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
-from mtv_world_ros.evaluation.metrics.reliability import reliability_bins
-from mtv_world_ros.evaluation.metrics.success_agreement import Judgement
+from mtv_world_ros.evaluation.metrics.success_agreement import Judgement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.evaluation.report.headline import badge, hue, letter, number
 from mtv_world_ros.evaluation.report.markup import element, join, Markup, table

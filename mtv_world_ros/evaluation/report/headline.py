@@ -7,6 +7,7 @@ from math import isfinite, nan
 from typing import Any
 
 from mtv_world_ros.evaluation.metrics.horizon import curve
+from mtv_world_ros.evaluation.metrics.statistics import METHOD, MIN_EPISODES
 from mtv_world_ros.evaluation.report.charts import Dot, dot_chart, Line, line_chart
 from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
 from mtv_world_ros.evaluation.report.read_back import Evaluated
@@ -39,8 +40,6 @@ _FIELDS = {
     'j_frames': '',
 }
 _NUM_HUES = 6
-#: the bootstrap of fewer episodes says nothing
-_MIN_EPISODES = 3
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -104,7 +103,7 @@ def headline(evaluations: Sequence[Evaluated]) -> Markup:
             'p',
             f'Jaccard index J of the {words}, 1 = the masks agree in every pixel. Held: the '
             "first frame stands still. Shuffled: imagined with another episode's actions. "
-            + ' '.join([*_meanings(evaluations), 'Whiskers: 95 % bootstrap over episodes.']),
+            + ' '.join([*_meanings(evaluations), f'Whiskers: {METHOD}.']),
             class_='faint',
         ),
         element('div', *panels, class_='panels'),
@@ -149,7 +148,7 @@ def _doubt(numbers: Mapping[str, Any], key: str, words: str) -> str:
     if number(numbers.get(key)) == '–':
         return f'{words} not measured'
     count = numbers['num_episodes_with'][key]
-    if count < _MIN_EPISODES:
+    if count < MIN_EPISODES:
         return f'{words} of too few episodes ({count})'
     return '' if interval(numbers, key)[0] > 0 else f'{words} not above 0'
 
@@ -199,7 +198,7 @@ def horizon_section(evaluations: Sequence[Evaluated]) -> Markup | None:
         element('h2', 'J against horizon'),
         element(
             'p',
-            'Objects that really move. Bands: 95 % bootstrap over episodes. Frames that fewer '
+            'Objects that really move. Bands: 95 % t intervals over episodes. Frames that fewer '
             'than a third of the rollouts reach are left out.',
             class_='faint',
         ),
@@ -243,7 +242,7 @@ def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line
     clock = evaluations[0].metrics['model']['fps'] / found.metrics['model']['fps']
     lines = []
     for field, word in _FIELDS.items():
-        drawn = curve(rows, view, field, seed=found.metrics.get('seed', 0))
+        drawn = curve(rows, view, field)
         if not drawn.values:
             continue
         style = _style(index, evaluations, word)

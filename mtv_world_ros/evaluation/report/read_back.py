@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.metrics.statistics import episode_means
+from mtv_world_ros.evaluation.metrics.scores import episode_means
 from mtv_world_ros.evaluation.results import (
     EpisodeResult,
     load_rollout,

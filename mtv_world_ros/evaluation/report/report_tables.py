@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from mtv_world_ros.evaluation.metrics.statistics import METHOD
 from mtv_world_ros.evaluation.report.headline import all_views, letter, number, stacked
 from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
 from mtv_world_ros.evaluation.report.read_back import Evaluated
@@ -125,7 +126,7 @@ def task_section(evaluations: Sequence[Evaluated]) -> Markup:
         element('h2', 'By task'),
         element(
             'p',
-            'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: '
+            f'Brackets: {METHOD}. J moving, persistence and shuffled actions: '
             'of the objects that really move. Skill: (J − J held) / (1 − J held).',
             class_='faint',
         ),

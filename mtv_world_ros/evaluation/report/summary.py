@@ -12,14 +12,14 @@ import numpy as np
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, curve
 from mtv_world_ros.evaluation.metrics.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
-from mtv_world_ros.evaluation.metrics.statistics import Estimate, summarise
+from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD, summarise
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.report import tables
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.files import write_json, write_whole
 
 BRACKETS = (
-    'Brackets: 95 % bootstrap over episodes. J moving, persistence and shuffled actions: of the '
+    f'Brackets: {METHOD}. J moving, persistence and shuffled actions: of the '
     'objects that really move.'
 )
 #: what a set of episodes that the model was trained for is called beside zero-shot sets
@@ -60,8 +60,6 @@ class Summary:
         failed: reason by path of those that could not be.
         provenance: what the results were made with, by heading.
         distances: FID and FVD by (zero-shot set, view), the set None for all episodes.
-        seed: of the bootstrap.
-        num_resamples: of the bootstrap.
     """
 
     name: str
@@ -74,8 +72,6 @@ class Summary:
     distances: Mapping[tuple[str | None, str], Mapping[str, Estimate]] = field(
         default_factory=dict
     )
-    seed: int = 0
-    num_resamples: int = 2000
 
     def with_distances(
         self, distances: Mapping[tuple[str | None, str], Mapping[str, Estimate]]
@@ -111,7 +107,7 @@ class Summary:
     def estimates(self, view: str | None, group: Group = ALL) -> dict[str, Estimate]:
         """Returns the numbers of a view (None = all) and a group."""
         means = [result.means(view) for result in self.chosen(group)]
-        found = summarise(means, seed=self.seed, num_resamples=self.num_resamples)
+        found = summarise(means)
         measured = self.distances.get((group.zero_shot, view or ''), {})
         return {**found, **(measured if group.task is None else {})}
 
@@ -131,8 +127,7 @@ class Summary:
             **self.settings,
             'model': asdict(self.spec),
             'moving_rule': MOVING_RULE.format(source=source),
-            'interval': f'95 % bootstrap over episodes, {self.num_resamples} resamples; of FID '
-            'and FVD jackknife over groups of episodes',
+            'interval': f'{METHOD}; of FID and FVD jackknife over groups of episodes',
             **self._numbers(ALL),
             'tasks': {task: self._group(Group(task=task)) for task in self.tasks},
             'zero_shot': {
@@ -220,7 +215,7 @@ class Summary:
         episodes = [result.rows for result in self.chosen(group)]
         found: dict[str, Any] = {}
         for name in FRAME_FIELDS:
-            drawn = curve(episodes, view, name, min_share=0, seed=self.seed)
+            drawn = curve(episodes, view, name, min_share=0)
             key = f'{name.removesuffix("_frames")}_moving_by_frame'
             found[key], found[f'{key}_interval'] = drawn.values, drawn.band
         if self.num_chunks > 1:
@@ -237,14 +232,7 @@ class Summary:
     def chunk_curve(self, view: str | None, group: Group = ALL) -> Curve:
         """Returns J of moving objects by chunk of a view (None = all), with intervals."""
         episodes = [result.rows for result in self.chosen(group)]
-        return by_chunk(
-            episodes,
-            view,
-            'j_frames',
-            self.spec.num_frames,
-            seed=self.seed,
-            num_resamples=self.num_resamples,
-        )
+        return by_chunk(episodes, view, 'j_frames', self.spec.num_frames)
 
     def _seconds(self) -> dict[str, float]:
         """Mean time of an episode by what it went into [s]."""

@@ -7,10 +7,18 @@ import re
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.special import expit, log_expit
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.evaluation.calibration.fit import AFTER, BEFORE, calibrate, FITTED, Sample
-from mtv_world_ros.evaluation.calibration.logistic import fit_logistic, fit_non_negative
+from mtv_world_ros.evaluation.calibration.fit import (
+    AFTER,
+    BEFORE,
+    calibrate,
+    fit_logistic,
+    FITTED,
+    Sample,
+)
 from mtv_world_ros.evaluation.calibration.report import markdown, write_calibration_report
 from mtv_world_ros.evaluation.metrics.success_agreement import (
     agreement,
@@ -115,7 +123,7 @@ def test_weights_are_not_negative_and_are_the_best_of_those():
     features = rng.normal(size=(200, 3))
     labels = rng.uniform(size=200) < 1 / (1 + np.exp(-2 * features[:, 0] + features[:, 1]))
     prior = np.array([0.5, 0.5, 0.5])
-    found = fit_non_negative(features, labels, l2=1.0, prior=prior)
+    found = fit_logistic(features, labels, l2=1.0, prior=prior, non_negative=True)
     assert found.weights[1] == 0 and found.weights[0] > 1 and found.weights[2] >= 0
 
     def objective(weights, bias):
@@ -127,6 +135,35 @@ def test_weights_are_not_negative_and_are_the_best_of_those():
     for _ in range(500):
         weights = np.maximum(found.weights + rng.normal(scale=0.1, size=3), 0)
         assert objective(weights, found.bias + rng.normal(scale=0.1)) >= best - 1e-9
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_bounded_fit_is_at_the_minimum_that_scipys_slsqp_finds(seed):
+    """Random data sets, every other one against the prior: see benchmark/logistic_fit.py."""
+    rng = np.random.default_rng(seed)
+    num, count, l2 = int(rng.integers(8, 200)), int(rng.integers(1, 7)), 10 ** rng.uniform(-2, 1)
+    prior = np.abs(rng.normal(size=count)) * 10 ** rng.uniform(-1, 1)
+    features = rng.normal(size=(num, count))
+    logits = features @ prior * (-1 if seed % 2 else 1) + rng.normal()
+    signs = np.where(rng.uniform(size=num) < expit(logits), 1.0, -1.0)
+
+    def objective(theta):
+        likelihood = log_expit(signs * (features @ theta[:-1] + theta[-1])).sum()
+        return l2 / 2 * ((theta[:-1] - prior) ** 2).sum() - likelihood
+
+    bounds, other = [(0, None)] * count + [(-30, 30)], np.append(prior, 0.0)
+    for _ in range(3):  # begun anew where its line search gave up
+        options = {'ftol': 1e-14, 'maxiter': 1000}
+        other = minimize(objective, other, method='SLSQP', bounds=bounds, options=options).x
+    found = fit_logistic(features, signs > 0, l2=l2, prior=prior, non_negative=True)
+    ours = np.append(found.weights, found.bias)
+    assert objective(ours) <= objective(other) + 1e-9
+    assert ours == pytest.approx(other, abs=2e-3)
+
+
+def test_one_outcome_alone_has_a_finite_bias():
+    found = fit_logistic(np.ones((5, 1)), np.ones(5, bool))
+    assert 3 < found.bias <= 30
 
 
 def made_samples(num=60, seed=0, tasks=('stack', 'serve', 'shake')):

@@ -1,4 +1,4 @@
-"""J by chunk: the mean over the frames of a chunk, with episodes drawn anew for its interval."""
+"""J by chunk: the mean over the frames of a chunk, with an interval over episodes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_interval_is_that_of_means_over_episodes_drawn_anew() -> None:
     rng = np.random.default_rng(1)
     means = rng.uniform(0.2, 0.8, 40)
     episodes = [[row([m, m, 1.0 - m, 1.0 - m])] for m in means]
-    found = by_chunk(episodes, None, 'j_frames', 2, num_resamples=4000)
+    found = by_chunk(episodes, None, 'j_frames', 2)
     for chunk, values in enumerate((means, 1.0 - means)):
         drawn = rng.choice(values, (4000, 40)).mean(1)
         np.testing.assert_allclose(found.band[chunk], np.percentile(drawn, [2.5, 97.5]), atol=0.01)

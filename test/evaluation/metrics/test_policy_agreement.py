@@ -1,15 +1,16 @@
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.metrics.policy_agreement import (
-    bootstrap,
+    agreement_interval,
     mean_maximum_rank_violation,
     pearson,
     powered_mean,
     rates,
-    wilson,
 )
+from mtv_world_ros.evaluation.metrics.statistics import wilson
 
 # SIMPLER (arXiv 2405.05941), task move_near: rt-2-x, rt-1-converged, rt-1-15pct, rt-1-x,
 # rt-1-begin, octo-base, on the real robot and in simulation; as in its repository
@@ -48,7 +49,7 @@ def test_wilson_interval_is_the_published_one():
     assert np.isnan(wilson(0, 0)).all()
 
 
-def test_bootstrap_holds_the_score_and_narrows_with_episodes():
+def test_interval_holds_the_score_and_narrows_with_episodes():
     generator = np.random.default_rng(0)
     truth = np.linspace(0.1, 0.9, 6)[:, None, None]
 
@@ -59,28 +60,51 @@ def test_bootstrap_holds_the_score_and_narrows_with_episodes():
     widths = []
     for num in (8, 60):
         real, imagined = outcomes(num)
-        low, high = bootstrap(pearson, imagined, real, num_resamples=200)
+        low, high = agreement_interval(pearson, imagined, real)
         assert low <= pearson(rates(imagined), rates(real)) <= high <= 1.0
         widths.append(high - low)
     assert widths[1] < widths[0]
 
 
-def test_bootstrap_draws_an_episode_for_all_policies_and_both_worlds_at_once():
-    """Where imagination is the truth, every resample agrees with itself."""
+def test_imagination_that_is_the_truth_has_no_interval_of_width_zero():
+    """Without any scene the score is the same, so nothing is known of its spread."""
     real = np.random.default_rng(1).integers(0, 2, (5, 2, 10)).astype(float)
-    assert bootstrap(pearson, real, real, num_resamples=50) == pytest.approx((1.0, 1.0))
-    assert bootstrap(mean_maximum_rank_violation, real, real, num_resamples=50) == (0.0, 0.0)
+    for score in (pearson, mean_maximum_rank_violation):
+        assert np.isnan(agreement_interval(score, real, real)).all()
     nothing = np.full((5, 2, 10), np.nan)
-    assert np.isnan(bootstrap(pearson, nothing, real, num_resamples=5)).all()
+    assert np.isnan(agreement_interval(pearson, nothing, real)).all()
+
+
+def test_a_single_episode_of_each_task_is_too_few_for_an_interval():
+    rng = np.random.default_rng(0)
+    real, imagined = rng.integers(0, 2, (2, 6, 3, 1)).astype(float)
+    assert np.isnan(agreement_interval(pearson, imagined, real)).all()
+
+
+@pytest.mark.parametrize('num', [4, 8, 20])
+def test_intervals_of_r_cover_the_truth(num):
+    """Ten policies on three tasks; whether a rollout succeeds depends on its scene too."""
+    rng = np.random.default_rng(num)
+    covered = []
+    for _ in range(300):
+        true = rng.uniform(0.05, 0.95, 10)
+        said = np.clip(0.7 * true + 0.1 + rng.normal(0, 0.25, 10), 0.02, 0.98)
+        scene = rng.normal(size=(1, 3, num))
+        luck = (scene + rng.normal(size=(2, 10, 3, num))) / np.sqrt(2)
+        cut = ndtri(np.stack([said, true]))[:, :, None, None]
+        imagined, real = (luck < cut).astype(float)
+        low, high = agreement_interval(pearson, imagined, real)
+        covered.append(low <= pearson(said, true) <= high)
+    assert 0.9 <= np.mean(covered) <= 0.98
 
 
 def test_powered_mean_is_the_one_computed_by_hand():
     # mean of more = 5/8; errors 0, 0, 1, 0: mean 1/4, variance 1/4; variance of more 15/56;
-    # 0.625 + 0.25 and 1.959964 sqrt(1/16 + 15/448)
+    # 0.625 + 0.25 and 3.18 sqrt(1/16 + 15/448), cut to a rate's range
     found = powered_mean([1, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 0, 1, 0, 1, 1], weight=1.0)
     assert found.value == pytest.approx(0.875)
-    half = 1.959964 * (1 / 16 + 15 / 448) ** 0.5
-    assert found.interval == pytest.approx((0.875 - half, 0.875 + half))
+    half = 3.182446 * (1 / 16 + 15 / 448) ** 0.5  # t of three degrees, from a table
+    assert found.interval == pytest.approx((max(0.875 - half, 0.0), 1.0))
     assert (found.num_true, found.num_more) == (4, 8)
 
 
@@ -106,8 +130,9 @@ def test_powered_intervals_cover_and_are_shorter_than_the_classical_ones(bias):
         said = np.clip(chance + 0.1 * generator.normal(size=len(chance)) + bias, 0, 1)
         found = powered_mean(true[:num_real], said[:num_real], said[num_real:])
         plain = powered_mean(true[:num_real], said[:num_real], [])
+        values.append(found.value)
+        assert 0.0 <= found.interval[0] <= found.value <= found.interval[1] <= 1.0
         covered += found.interval[0] <= 0.5 <= found.interval[1]
         shorter += np.diff(found.interval)[0] < np.diff(plain.interval)[0]
-        values.append(found.value)
     assert 0.91 < covered / 400 < 0.98 and shorter > 380
     assert np.mean(values) == pytest.approx(0.5, abs=0.015)

@@ -14,7 +14,7 @@ from mtv_world_ros.evaluation.report.comparison import (
     write_comparison,
 )
 
-QUIET = {'show_progress': False, 'num_resamples': 50}
+QUIET = {'show_progress': False}
 
 
 @pytest.fixture

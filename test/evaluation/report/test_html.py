@@ -43,7 +43,7 @@ class Page(HTMLParser):
 
 
 def scored(pipeline, episodes, out, **options):
-    evaluate(pipeline, episodes, out, show_progress=False, num_resamples=100, **options)
+    evaluate(pipeline, episodes, out, show_progress=False, **options)
     return out
 
 
@@ -201,7 +201,6 @@ def test_folder_of_several_checkpoints_is_one_report(make_pipeline, episodes, he
             name=f'{label} (1234)',
             zero_shot={episodes[0]: kind} if kind else {},
             show_progress=False,
-            num_resamples=10,
         )
         for label, kind in (('second', 'object'), ('first', ''))
     ]

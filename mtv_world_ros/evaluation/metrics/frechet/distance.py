@@ -8,6 +8,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES, t_quantile, UNKNOWN
 
 #: most groups of episodes that are left out in turn for an interval
 MAX_GROUPS = 10
@@ -72,12 +73,12 @@ def frechet_interval(
         predicted: (M, D) features of each episode, in the same order.
 
     Returns:
-        The distance of all -/+ 1.96 jackknife standard errors, not below 0; NaN with fewer than
-        three episodes.
+        The distance of all -/+ the t quantile of the groups times the jackknife standard error,
+        not below 0; NaN with fewer than `MIN_EPISODES` episodes.
     """
     count = len(real)
-    if count < 3:
-        return (np.nan, np.nan)
+    if count < MIN_EPISODES:
+        return UNKNOWN
     whole = frechet_distance(np.concatenate(real), np.concatenate(predicted))
     groups = np.array_split(np.arange(count), min(count, MAX_GROUPS))
     left = []
@@ -87,4 +88,5 @@ def frechet_interval(
         left.append(frechet_distance(*parts))
     share = (len(groups) - 1) / len(groups)
     error = np.sqrt(share * ((np.array(left) - np.mean(left)) ** 2).sum())
-    return (max(whole - 1.96 * float(error), 0.0), whole + 1.96 * float(error))
+    half = float(t_quantile(len(groups) - 1) * error)
+    return (max(whole - half, 0.0), whole + half)

@@ -62,7 +62,7 @@ def test_distances_reach_metrics_and_are_kept_for_the_next_run(
 ):
     module = 'mtv_world_ros.evaluation.evaluate'
     monkeypatch.setattr(f'{module}.frame_features', lambda path, device: mean_colour)
-    options = {'fid_weights': tmp_path / 'w.pth', 'show_progress': False, 'num_resamples': 10}
+    options = {'fid_weights': tmp_path / 'w.pth', 'show_progress': False}
     pipeline = make_pipeline(oracle)
     evaluate(pipeline, episodes, tmp_path, name='x', **options)
     metrics = json.loads((tmp_path / 'metrics.json').read_text())
