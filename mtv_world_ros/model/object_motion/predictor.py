@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from safetensors.torch import load_file, save_file
@@ -31,46 +32,19 @@ FOLDER = 'object_motion'
 _CONFIG, _WEIGHTS = 'config.json', 'model.safetensors'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrackedObjects:
-    """Objects on their way: what one chunk hands to the next.
-
-    Attributes:
-        reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
-        scene_features: (O, V, F) of `object_shapes`.
-        memory: of the network.
-        tools: (A, 4, 4) T_base_tool one step before.
-        openings: (A,) one step before.
-    """
-
-    reference: FloatArray
-    scene_features: FloatArray
-    memory: Memory | None = None
-    tools: FloatArray | None = None
-    openings: FloatArray | None = None
-
-
 class ObjectMotionPredictor:
-    """Where named objects go under commanded joints.
+    """Finds objects in a frame; `TrackedObjects` says where they go.
 
     Args:
         network: trained.
         robot: gives tools and grippers.
     """
 
-    #: time between the joint positions that `advance` takes [s]
-    step_s = STEP_S
-
     def __init__(self, network: ObjectMotionNetwork, robot: RobotModel) -> None:
-        self._network, self._robot = network.eval(), robot
+        self.network, self.robot = network.eval(), robot
 
     def find(
-        self,
-        masks: BoolArray,
-        cameras: Sequence[CameraModel],
-        poses: Sequence[FloatArray],
-        noise_m: float = 0.0,
-        seed: int = 0,
+        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
     ) -> TrackedObjects:
         """Returns the objects of masks (V, O, H, W), best of the camera's own size.
 
@@ -78,8 +52,6 @@ class ObjectMotionPredictor:
             masks: of one frame.
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
-            noise_m: standard deviation of a disturbance of their places, for an ensemble [m].
-            seed: of the disturbance.
         """
         pixels = centroids(masks)
         points = np.full((masks.shape[1], 3), np.nan)
@@ -87,47 +59,63 @@ class ObjectMotionPredictor:
             found = locate(cameras, poses, pixels[:, item])
             if found is not None:
                 points[item] = found.point
-        shapes = object_shapes(masks, points, cameras, poses)
-        if noise_m:
-            points = points + np.random.default_rng(seed).normal(0.0, noise_m, points.shape)
-        return TrackedObjects(reference=points, scene_features=shapes.features)
+        features = object_shapes(masks, points, cameras, poses).features
+        return TrackedObjects(model=self, reference=points, features=features)
 
-    def advance(
-        self, tracked: TrackedObjects, positions: FloatArray
-    ) -> tuple[ObjectMotion, TrackedObjects]:
-        """Returns where the objects are at each of (1 + T, J) positions, `step_s` apart.
 
-        Row 0 is where the last call ended, or where the objects were found.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackedObjects:
+    """Objects on their way; what one chunk hands to the next.
+
+    Attributes:
+        model: says where they go.
+        reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
+        features: (O, V, F) of `object_shapes`.
+        memory: of the network; None = nothing has moved yet.
+        tools: (A, 4, 4) T_base_tool one step before.
+        openings: (A,) one step before.
+    """
+
+    model: ObjectMotionPredictor
+    reference: FloatArray
+    features: FloatArray
+    memory: Memory | None = None
+    tools: FloatArray | None = None
+    openings: FloatArray | None = None
+
+    #: between the joint positions that `advance` takes [s]
+    step_s: ClassVar[float] = STEP_S
+
+    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
+        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
+
+        Row 0 is where they are now.
         """
-        tools = self._robot.tool_poses(positions).transpose(1, 0, 2, 3)
-        openings = self._robot.gripper_openings(positions).T
-        first = tools[:1] if tracked.tools is None else tracked.tools[None]
-        first_openings = openings[:1] if tracked.openings is None else tracked.openings[None]
-        known = np.isfinite(tracked.reference).all(-1)
+        robot = self.model.robot
+        tools = robot.tool_poses(positions).transpose(1, 0, 2, 3)
+        openings = robot.gripper_openings(positions).T
+        before = tools[0] if self.tools is None else self.tools
+        opened = openings[0] if self.openings is None else self.openings
+        tools = np.concatenate([before[None], tools])
+        openings = np.concatenate([opened[None], openings])
+        known = np.isfinite(self.reference).all(-1)
         scene = Scene(
-            points=_tensor(np.where(known[:, None], tracked.reference, 0.0)),
-            features=_tensor(tracked.scene_features),
+            points=_tensor(np.where(known[:, None], self.reference, 0.0)),
+            features=_tensor(self.features),
             present=torch.from_numpy(known)[None],
-            tools=_tensor(np.concatenate([first, tools])),
-            openings=_tensor(np.concatenate([first_openings, openings])),
+            tools=_tensor(tools),
+            openings=_tensor(openings),
         )
         with torch.inference_mode():
-            motion, memory = self._network.roll(scene, tracked.memory, skip=1)
+            motion, memory = self.model.network.roll(scene, self.memory, skip=1)
         points = motion.points[0].double().numpy()
         points[:, ~known] = np.nan
-        result = ObjectMotion(
-            reference=tracked.reference,
+        moved = ObjectMotion(
+            reference=self.reference,
             points=points,
             rotations=motion.rotations[0].double().numpy(),
         )
-        later = TrackedObjects(
-            reference=tracked.reference,
-            scene_features=tracked.scene_features,
-            memory=memory,
-            tools=tools[-2] if len(tools) > 1 else first[0],
-            openings=openings[-2] if len(openings) > 1 else first_openings[0],
-        )
-        return result, later
+        return moved, replace(self, memory=memory, tools=tools[-2], openings=openings[-2])
 
 
 def _tensor(values: FloatArray) -> Tensor:
