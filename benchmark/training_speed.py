@@ -38,9 +38,8 @@ from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions, transformer_arguments
 from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.training.loss import batch_loss
 from mtv_world_ros.training.run import load_recordings, spread
-from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.trainer import batch_loss, Trainer
 
 _WARM_UP = 2
 

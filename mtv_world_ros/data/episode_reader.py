@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+import re
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.images import (
@@ -16,26 +19,40 @@ from mtv_world_ros.data.bag.images import (
     compressed_to_rgb,
     raw_to_rgb,
 )
+from mtv_world_ros.data.bag.messages import COMPRESSED_IMAGE, IMAGE
 from mtv_world_ros.data.bag.reader import BagReader, iter_messages
 from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
     Episode,
     EpisodeInfo,
+    image_topic,
+    INSTRUCTION,
+    JOINT_STATES,
+    JOINT_TRAJECTORY,
+    JointStates,
     METADATA_NAME,
+    OBJECT_POSES,
     ObjectPoses,
     parse_info,
     Track,
 )
-from mtv_world_ros.data.episode_topics import EpisodeTopics, find_topics, ViewTopics
-from mtv_world_ros.data.tracks import in_order, LazyFrames, merge_joint_states
 from mtv_world_ros.data_types import ByteArray, CameraModel
-from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError
+from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled, with_camera_info
 
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 
 Stamped = list[tuple[int, Any]]
+#: keys of a topic map that are not views, and the topics they stand for
+STREAMS = {
+    'joint_states': JOINT_STATES,
+    'joint_trajectory': JOINT_TRAJECTORY,
+    'instruction': INSTRUCTION,
+    'object_poses': OBJECT_POSES,
+}
+_PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed)?')
+Item = TypeVar('Item')
 
 
 def read_episode(
@@ -305,3 +322,193 @@ def _to_rgb(message: Any) -> ByteArray:
 
 def _to_ids(message: Any) -> ByteArray:
     return compressed_to_ids(message.format, message.data)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewTopics:
+    """Topics of one view: images (raw or compressed), CameraInfo, masks."""
+
+    image: str
+    camera_info: str
+    mask: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeTopics:
+    """Topics of an episode."""
+
+    views: Mapping[str, ViewTopics]
+    joint_states: str
+    joint_trajectory: str
+    instruction: str
+    object_poses: str
+
+    def names(self, *, with_masks: bool) -> set[str]:
+        """All of them."""
+        names = {self.joint_states, self.joint_trajectory, self.instruction, self.object_poses}
+        for view in self.views.values():
+            names |= {view.image, view.camera_info, *([view.mask] if with_masks else [])}
+        return names
+
+
+def find_topics(
+    path: Path,
+    found: Mapping[str, str],
+    views: Sequence[str] | None,
+    named: Mapping[str, str],
+) -> EpisodeTopics:
+    """Chooses the topics of an episode.
+
+    A view's images are at `/<view>/image_raw` or `/<view>/image_raw/compressed` (raw is taken
+    where both are there) unless `named` says otherwise; CameraInfo and masks lie beside them.
+
+    Args:
+        path: the bag, for error texts.
+        found: message type of each topic in the bag.
+        views: views wanted; None = those of `named`, else all that are there.
+        named: topic by view name or by `joint_states`, `joint_trajectory`, `instruction`.
+
+    Raises:
+        EpisodeError: a view is not there, or `named` has a key that is neither.
+    """
+    images = [topic for topic, kind in found.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+    if views is None:
+        views = [key for key in named if key not in STREAMS] or _plain_views(images)
+    unknown = [key for key in named if key not in STREAMS and key not in views]
+    if unknown:
+        known = [*views, *STREAMS]
+        raise EpisodeError(
+            f"topics: '{unknown[0]}' is neither a view nor a stream; known are "
+            f'{", ".join(known)}{nearest(unknown[0], known)}'
+        )
+    if not views:
+        raise EpisodeError(
+            f"'{path}' has no topic /<view>/image_raw or /<view>/image_raw/compressed; its image "
+            f'topics are {_listed(images)}: name the views in `topics`'
+        )
+    return EpisodeTopics(
+        views={view: _view_topics(path, view, images, named) for view in views},
+        **{key: named.get(key, topic) for key, topic in STREAMS.items()},
+    )
+
+
+def _plain_views(images: Sequence[str]) -> list[str]:
+    matches = [_PLAIN_VIEW.fullmatch(topic) for topic in images]
+    return list(dict.fromkeys(match[1] for match in matches if match))
+
+
+def _view_topics(
+    path: Path, view: str, images: Sequence[str], named: Mapping[str, str]
+) -> ViewTopics:
+    wanted = named.get(view, image_topic(view))
+    image = next((t for t in (wanted, f'{wanted}/compressed') if t in images), None)
+    if image is None:
+        there = _plain_views(images)
+        raise EpisodeError(
+            f"'{path}' has no view '{view}': there are no images at '{wanted}' or "
+            f"'{wanted}/compressed'; its views are {_listed(there)}{nearest(view, there)}, its "
+            f'image topics {_listed(images)} (map a view to a topic in `topics`)'
+        )
+    camera = image.removesuffix('/compressed').rpartition('/')[0]
+    return ViewTopics(
+        image=image, camera_info=f'{camera}/camera_info', mask=f'{camera}/mask/compressed'
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ', '.join(names) or 'none'
+
+
+class LazyFrames:
+    """Frames that are decoded when asked for (`episode.Frames`).
+
+    Args:
+        topic: where they come from, for error texts.
+        messages: the image messages.
+        decode: message to frame.
+    """
+
+    def __init__(
+        self, topic: str, messages: Sequence[Any], decode: Callable[[Any], ByteArray]
+    ) -> None:
+        self._topic = topic
+        self._messages = messages
+        self._decode = decode
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def __getitem__(self, index: Any) -> ByteArray:
+        chosen = np.arange(len(self))[index]
+        if chosen.ndim == 0:
+            return self._frame(int(chosen))
+        return self._stack([self._frame(int(i)) for i in chosen])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        frames = self[:]
+        return frames if dtype is None else frames.astype(dtype, copy=False)
+
+    def _frame(self, index: int) -> ByteArray:
+        try:
+            return self._decode(self._messages[index])
+        except MtvWorldError as error:
+            raise EpisodeError(f"'{self._topic}', frame {index}: {error}") from error
+
+    def _stack(self, frames: list[ByteArray]) -> ByteArray:
+        sizes = sorted({frame.shape[:2] for frame in frames})
+        if len(sizes) > 1:
+            raise EpisodeError(f"'{self._topic}': the frames have several sizes (H, W): {sizes}")
+        return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
+
+
+def in_order(
+    topic: str, items: Iterable[tuple[int, Item]], warnings: list[str]
+) -> list[tuple[int, Item]]:
+    """Sorts (stamp, item) by stamp and keeps the last of equal stamps; says so in `warnings`."""
+    given = list(items)
+    stamps = [stamp for stamp, _ in given]
+    late = sum(b < a for a, b in zip(stamps, stamps[1:], strict=False))
+    kept = dict(sorted(given, key=lambda item: item[0]))
+    if late:
+        warnings.append(f"'{topic}': {late} messages were out of order and have been sorted")
+    if len(kept) < len(given):
+        repeated = len(given) - len(kept)
+        warnings.append(f"'{topic}': {repeated} stamps came twice; the later message was kept")
+    return list(kept.items())
+
+
+def merge_joint_states(
+    topic: str, messages: Sequence[tuple[int, Any]], warnings: list[str]
+) -> JointStates | None:
+    """One table of sensor_msgs/JointState messages, also of several publishers.
+
+    Joints that a message does not name keep their last position; rows before every joint was
+    named once are left out.
+
+    Returns:
+        None where no row is left.
+    """
+    ordered = sorted(messages, key=lambda item: item[0])
+    whole = [(s, m) for s, m in ordered if len(m.name) == len(m.position) > 0]
+    if len(whole) < len(ordered):
+        count = len(ordered) - len(whole)
+        warnings.append(f"'{topic}': {count} messages without a position per joint were left out")
+    names = tuple(dict.fromkeys(name for _, message in whole for name in message.name))
+    column = {name: index for index, name in enumerate(names)}
+    current = np.full(len(names), np.nan)
+    seen = np.zeros(len(names), bool)
+    rows: list[tuple[int, NDArray[np.float64]]] = []
+    for stamp, message in whole:
+        columns = [column[name] for name in message.name]
+        current[columns] = message.position
+        seen[columns] = True
+        if seen.all():
+            rows.append((stamp, current.copy()))
+    kept = in_order(topic, rows, warnings)
+    if not kept:
+        return None
+    return JointStates(
+        stamps_ns=np.array([stamp for stamp, _ in kept], np.int64),
+        joint_names=names,
+        positions=np.stack([row for _, row in kept]),
+    )

@@ -11,10 +11,10 @@ import numpy as np
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.sim.collect.record import START_NS
-from mtv_world_ros.sim.tasks.predicates import ever_and_final
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
+from mtv_world_ros.success.task import ever_and_final
 
-#: between the instants at which the success predicate is asked, as in recorded episodes [s]
+#: between the instants at which success is judged, as in recorded episodes [s]
 _LOOK_S = 0.1
 
 
@@ -85,7 +85,7 @@ class SimulatedWorld:
 
     def outcome(self) -> tuple[bool, bool]:
         """Returns whether the task's predicate ever held, and held at the end."""
-        return ever_and_final(self._sim.task.succeeds(self._sim.history()))
+        return ever_and_final(self._sim.task.succeeds(self._sim.situation()))
 
     def _advance(self, targets: FloatArray, number: int, is_frame: bool) -> SimObservation | None:
         """One control period; what is seen after it, if a picture is due."""

@@ -31,8 +31,17 @@ from mtv_world_ros.rendering.glow import (
     Stamps,
     Trail,
 )
-from mtv_world_ros.rendering.links import ArmLinks
-from mtv_world_ros.rendering.tool_motion import tool_motion, ToolMotion
+
+#: how much of a finger is drawn [m]
+_FINGER_LENGTH_M = 0.03
+#: most trail points from one frame to the next
+_MOST_POINTS = 32
+#: a link is drawn in so many pieces, so that it bends with the lens and ends behind the camera
+_PIECES = 4
+#: fractional bits of pixel positions
+_SHIFT = 4
+#: pieces that end further than this many image sizes away are left out
+_FARTHEST = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +101,7 @@ _CORE_SHARE = 0.55
 _LEAST_CORE_PX = 0.7
 #: brightness of an arm's lines, as a share of its trail's
 _LINK_SHARE = 0.5
-#: points nearer than this are drawn as large as at this depth [m]
+#: points and lines nearer than this are drawn as large as at this depth [m]
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
 #: of an arm's two fingers
@@ -306,3 +315,120 @@ class _Paint:
             rest = cv2.applyColorMap(levels, self._rest)
             painted = cv2.add(painted, cv2.multiply(part, rest, scale=1 / 255))
         part[...] = painted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToolMotion:
+    """Tool points over time.
+
+    Attributes:
+        times: (N,) [s].
+        points: (A, N, 3) in the base frame [m].
+        closed: (A, T) 0 open .. 1 closed, at the frames.
+        shown_at: (T,) index of each frame's own point.
+        fingers: two of each arm: (2, T, 3) the ends of a line along the finger, at the frames [m];
+            NaN where it is not known how the fingers travel.
+    """
+
+    times: FloatArray
+    points: FloatArray
+    closed: FloatArray
+    shown_at: np.ndarray
+    fingers: tuple[FloatArray, ...]
+
+
+def tool_motion(
+    robot: RobotModel,
+    positions: FloatArray,
+    times: FloatArray,
+    points_per_frame: int,
+    max_gap_m: float | None,
+) -> ToolMotion:
+    """Interpolates the joints between the frames, so that trails follow the arms' arcs.
+
+    Args:
+        robot: gives the tool points.
+        positions: (T, J) at the frames [rad or m].
+        times: (T,) of the frames [s].
+        points_per_frame: least number of points from one frame to the next.
+        max_gap_m: largest distance of neighbouring points [m]; None = any.
+    """
+    counts = np.full(len(times) - 1, points_per_frame)
+    if max_gap_m is not None:
+        points = robot.tool_poses(positions)[..., :3, 3]
+        steps = np.linalg.norm(np.diff(points, axis=1), axis=-1).max(axis=0, initial=0.0)
+        needed = np.ceil(np.minimum(steps / max_gap_m, _MOST_POINTS)).astype(int)
+        counts = np.maximum(counts, needed)
+    shown_at = np.concatenate([[0], np.cumsum(counts)])
+    fine = np.interp(np.arange(shown_at[-1] + 1), shown_at, np.arange(len(times)))
+    left = np.minimum(fine.astype(int), max(len(times) - 2, 0))
+    right, share = np.minimum(left + 1, len(times) - 1), fine - left
+    dense = (1 - share)[:, None] * positions[left] + share[:, None] * positions[right]
+    return ToolMotion(
+        times=(1 - share) * times[left] + share * times[right],
+        points=robot.tool_poses(dense)[..., :3, 3],
+        closed=1.0 - robot.gripper_openings(positions),
+        fingers=_fingers(robot, positions),
+        shown_at=shown_at,
+    )
+
+
+def _fingers(robot: RobotModel, positions: FloatArray) -> tuple[FloatArray, ...]:
+    """Two points along each finger, (2, T, 3) [m]: of each arm the left, then the right one."""
+    poses, openings = robot.tool_poses(positions), robot.gripper_openings(positions)
+    lines = []
+    for tool, pose, opening in zip(robot.tools, poses, openings, strict=True):
+        apart = np.full(len(positions), np.nan)
+        if tool.finger_travel_m is not None:
+            apart = tool.finger_travel_m * opening
+        for side in (1.0, -1.0):
+            tip = pose[:, :3, 3] + (side * apart)[:, None] * pose[:, :3, 1]
+            lines.append(np.stack([tip, tip - _FINGER_LENGTH_M * pose[:, :3, 2]]))
+    return tuple(lines)
+
+
+class ArmLinks:
+    """Lines along the arms in one view.
+
+    Args:
+        camera: the view.
+        poses: (T, 4, 4) T_base_camera.
+        arms: for each arm (N, T, 3) points along it, in the base frame [m].
+        width_m: of the lines [m].
+    """
+
+    def __init__(
+        self, camera: CameraModel, poses: FloatArray, arms: Sequence[FloatArray], width_m: float
+    ) -> None:
+        focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
+        size = np.array([camera.width, camera.height])
+        self._pixels, self._widths = [], []
+        for points in arms:
+            pixels, depths = project(camera, poses, _in_pieces(points))
+            far = np.any(np.abs(pixels - size / 2) > _FARTHEST * size, axis=-1, keepdims=True)
+            self._pixels.append(np.where(far, np.nan, pixels))
+            self._widths.append(width_m * focal / np.maximum(depths, _NEAREST_SIZE_M))
+
+    def draw(self, image: ByteArray, arm: int, frame: int, colour: FloatArray) -> None:
+        """Draws one arm onto an (H, W, 3) image; what is behind the camera is left out.
+
+        Args:
+            image: drawn upon.
+            arm: which.
+            frame: of the T.
+            colour: (3,) RGB in 0 .. 1.
+        """
+        pixels, widths = self._pixels[arm][:, frame], self._widths[arm][:, frame]
+        seen = np.isfinite(pixels).all(axis=-1)
+        paint = [float(value) for value in np.rint(255 * colour)]
+        ends = np.rint(np.where(seen[:, None], pixels, 0) * 2**_SHIFT).astype(int).tolist()
+        for n in np.flatnonzero(seen[:-1] & seen[1:]):
+            width = max(1, round(float(widths[n])))
+            cv2.line(image, ends[n], ends[n + 1], paint, width, cv2.LINE_AA, _SHIFT)
+
+
+def _in_pieces(points: FloatArray) -> FloatArray:
+    """Points (N, T, 3) with those between them: (_PIECES * (N - 1) + 1, T, 3)."""
+    shares = np.arange(_PIECES)[None, :, None, None] / _PIECES
+    between = points[:-1, None] * (1 - shares) + points[1:, None] * shares
+    return np.concatenate([between.reshape(-1, *points.shape[1:]), points[-1:]])

@@ -16,16 +16,15 @@ from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.footage import Footage
 from mtv_world_ros.success.goal_pictures import PictureMasks
+from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import remember, RolloutMemory
-from mtv_world_ros.success.situation import CannotTell, Margin
+from mtv_world_ros.success.situation import CannotTell, grippers_open
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.success.views import EvidenceConfig, Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 __all__ = ['EstimatorConfig', 'Judged', 'SuccessEstimator', 'load_tasks']
 
-#: a gripper at least this open has let go
-OPEN_GRIPPER = 0.8
 #: probability at most, of a task that cannot be done yet: it asks for open grippers while one is
 #: closed, or something that has to move has not
 UNDONE_PROBABILITY = 0.1
@@ -199,7 +198,7 @@ def _released(task: TaskSpec, openings: FloatArray | None) -> float:
     """Whether the grippers are as open as the task asks; NaN = not known, or it does not ask."""
     if openings is None or task.gripper != 'open':
         return nan
-    return float(np.min(openings[:, -1]) >= OPEN_GRIPPER)
+    return float(grippers_open(openings)[-1])
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:
@@ -231,9 +230,9 @@ def _jaccard(views: Views, goals: Mapping[int, FloatArray], subjects: Sequence[i
 
 def _margin_text(margin: Margin, spread: float, task: TaskSpec) -> str:
     """The condition nearest to failing, in words; `spread` in units of its softness."""
-    held = 'held' if margin.value >= 0 else 'missed'
+    held = 'held' if margin.end >= 0 else 'missed'
     if margin.unit != 'm':
-        return f"'{margin.condition}' {held} by {abs(margin.value):.2g} {margin.unit}"
+        return f"'{margin.condition}' {held} by {abs(margin.end):.2g} {margin.unit}"
     known = 1000 * spread * (margin.soft or task.softness_m)
-    away = 1000 * abs(margin.value)
+    away = 1000 * abs(margin.end)
     return f"'{margin.condition}' {held} by {away:.0f} mm, known to {known:.0f} mm"

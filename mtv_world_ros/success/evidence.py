@@ -10,11 +10,17 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.success.goal_pictures import PictureMasks
-from mtv_world_ros.success.imagined_scene import Placed
-from mtv_world_ros.success.pictured import AsPictured, InRegion
-from mtv_world_ros.success.relations import Inside, Relation, Within
+from mtv_world_ros.success.imagined_scene import ImaginedScene
+from mtv_world_ros.success.relations import (
+    AsPictured,
+    InRegion,
+    Inside,
+    Margin,
+    Relation,
+    ServedOn,
+    Within,
+)
 from mtv_world_ros.success.rollout_memory import Grasp
-from mtv_world_ros.success.situation import Margin
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -69,30 +75,30 @@ def gather(
     Raises:
         CannotTell: objects lost, rays that miss each other, views that disagree.
     """
-    placed = Placed(views, bound, picture_masks)
+    scene = ImaginedScene(views, bound, picture_masks, task.sizes_m)
     for role in task.movers:
-        views.check_visible(placed.item(role))
-    margins = [margin for relation in task.relations for margin in relation.margins(placed)]
+        views.check_visible(scene.item(role))
+    margins = [margin for relation in task.relations for margin in relation.margins(scene)]
     scores = [_score(margin, task) for margin in margins]
     worst = margins[int(np.argmin(scores))]
-    goals, gains = _goals(placed, task)
-    grasp, carry = _grasps(placed, task)
+    goals, gains = _goals(scene, task)
+    grasp, carry = _grasps(scene, task)
     features = {
         'margin': min(scores),
         'mean_margin': float(np.mean(scores)),
         'goal': gains,
-        'contained': _contained(placed, task),
+        'contained': _contained(scene, task),
         'grasp': grasp,
         'carry': carry,
-        'moved': _moved(placed, task),
+        'moved': _moved(scene, task),
     }
-    sigma = float(np.hypot.reduce(sorted(placed.sigmas.values())[-2:])) if placed.sigmas else 0.0
+    sigma = float(np.hypot.reduce(sorted(scene.sigmas.values())[-2:])) if scene.sigmas else 0.0
     return Evidence(
         worst=worst,
         features=features,
         sigma=sigma / (worst.soft or task.softness_m) if worst.unit == 'm' else 0.0,
         goal_jaccard=goals,
-        notes=tuple(placed.notes),
+        notes=tuple(scene.notes),
     )
 
 
@@ -102,10 +108,10 @@ def clipped(score: float) -> float:
 
 
 def _score(margin: Margin, task: TaskSpec) -> float:
-    return clipped(margin.value / (margin.soft or task.softness_m))
+    return clipped(margin.end / (margin.soft or task.softness_m))
 
 
-def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float]:
+def _goals(scene: ImaginedScene, task: TaskSpec) -> tuple[dict[int, FloatArray], float]:
     """J of every subject with its goal mask, and their mean gain over the start, in -1..1.
 
     The start counts as at most `MAX_START_JACCARD`: what was in its goal from the first frame on
@@ -114,39 +120,39 @@ def _goals(placed: Placed, task: TaskSpec) -> tuple[dict[int, FloatArray], float
     found: dict[int, FloatArray] = {}
     gains = []
     for relation in task.relations:
-        masks = _goal_masks(placed, relation)
+        masks = _goal_masks(scene, relation)
         if masks is None:
             continue
-        item = placed.item(relation.subject)
-        found[item], before = placed.views.goal_jaccard(item, masks)
+        item = scene.item(relation.subject)
+        found[item], before = scene.views.goal_jaccard(item, masks)
         before = np.minimum(before, MAX_START_JACCARD)
         gain = (found[item] - before) / (1 - before)
         gains.append(view_mean(np.clip(2 * gain - 1, -1, 1)))
     return found, float(mean_of_known(np.array(gains))) if gains else nan
 
 
-def _goal_masks(placed: Placed, relation: Relation) -> BoolArray | None:
+def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
     """(V, H, W) masks of the subject where it should be, if that is one place."""
     if isinstance(relation, AsPictured):
-        return placed.pictured(relation.subject, relation.pictures)
-    goal = relation.goal(placed)
+        return scene.pictured(relation.subject, relation.pictures)
+    goal = relation.goal(scene)
     if goal is None:
         return None
-    masks = placed.views.goal_masks(placed.item(goal[0]), goal[1])
+    masks = scene.views.goal_masks(scene.item(goal[0]), goal[1])
     if masks is None:
-        placed.notes[f"no goal mask: '{placed.bound[goal[0]]}' has no known start"] = None
+        scene.notes[f"no goal mask: '{scene.bound[goal[0]]}' has no known start"] = None
     return masks
 
 
-def _contained(placed: Placed, task: TaskSpec) -> float:
+def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
     """How much of the subjects lies on what they are to be in or on, in -1..1; the least."""
     shares = [
-        placed.views.containment(placed.item(relation.subject), placed.item(relation.target))
+        scene.views.containment(scene.item(relation.subject), scene.item(relation.target))
         for relation in task.relations
-        if isinstance(relation, Within | Inside)
+        if isinstance(relation, Within | Inside | ServedOn)
     ]
     shares += [
-        placed.share_inside(relation.subject, relation.regions)
+        scene.share_inside(relation.subject, relation.regions)
         for relation in task.relations
         if isinstance(relation, InRegion)
     ]
@@ -154,66 +160,64 @@ def _contained(placed: Placed, task: TaskSpec) -> float:
     return 2 * min(known) - 1 if known else nan
 
 
-def _grasps(placed: Placed, task: TaskSpec) -> tuple[float, float]:
+def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
     """How well grasps explain that the movers moved: by their place, and by the way they went.
 
     Positive = explained, at most 1; an object that did not move needs no grasp. NaN = the robot's
     motion is not known.
     """
-    if placed.views.memory.levels is None:
+    if scene.views.memory.levels is None:
         return nan, nan
     near, along = [1.0], [1.0]
     for role in task.movers:
-        if not _has_moved(placed, role):
+        if not _has_moved(scene, role):
             continue
-        off, error = _nearest_grasp(
-            placed, role, is_rim=placed.bound[role].split()[-1] in task.rims
-        )
+        off, error = _nearest_grasp(scene, role, is_rim=scene.bound[role].split()[-1] in task.rims)
         near.append(1 - off)
         along.append(1 - error / CARRY_ERROR_M)
         if off > 1:
             text = 'is imagined to move, but no gripper closed where it could hold it'
-            placed.notes[f"'{placed.bound[role]}' {text}"] = None
+            scene.notes[f"'{scene.bound[role]}' {text}"] = None
     return max(min(near), -MAX_MARGIN), max(min(along), -MAX_MARGIN)
 
 
-def _moved(placed: Placed, task: TaskSpec) -> float:
+def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
     """0 where something that the task moves is known to be where it was, else 1."""
     for role in task.movers:
-        trail = placed.views.memory.points[placed.item(role)]
+        trail = scene.views.memory.points[scene.item(role)]
         known = np.isfinite(trail).all(1)
-        if known.sum() > 2 and known[0] and not _has_moved(placed, role):
-            placed.notes[f"'{placed.bound[role]}' has not moved"] = None
+        if known.sum() > 2 and known[0] and not _has_moved(scene, role):
+            scene.notes[f"'{scene.bound[role]}' has not moved"] = None
             return 0.0
     return 1.0
 
 
-def _nearest_grasp(placed: Placed, role: str, *, is_rim: bool) -> tuple[float, float]:
+def _nearest_grasp(scene: ImaginedScene, role: str, *, is_rim: bool) -> tuple[float, float]:
     """How far off the nearest grasp was (1 = the limit), and by how much its way differs [m]."""
-    item = placed.item(role)
+    item = scene.item(role)
     best, error = np.inf, np.inf
-    for grasp in placed.views.memory.grasps:
+    for grasp in scene.views.memory.grasps:
         away = float(np.hypot(*(grasp.closed_at - grasp.points[item])[:2])) / GRASP_M
         off = max(float(grasp.gaps_m[item]), 0.0) / RIM_GAP_M if is_rim else away
         if off < best:  # NaN is not
-            best, error = off, _carry_error(placed, role, grasp)
+            best, error = off, _carry_error(scene, role, grasp)
     return best, error
 
 
-def _carry_error(placed: Placed, role: str, grasp: Grasp) -> float:
+def _carry_error(scene: ImaginedScene, role: str, grasp: Grasp) -> float:
     """Distance in the table plane from where the grasp would have carried the object [m]."""
     until = grasp.released_at
     if until is None:
-        tools = placed.views.footage.tools
+        tools = scene.views.footage.tools
         assert tools is not None
         until = tools[grasp.arm, -1]
-    way = placed.end(role) - grasp.points[placed.item(role)]
+    way = scene.centres(role)[-1] - grasp.points[scene.item(role)]
     return float(np.hypot(*(way - (until - grasp.closed_at))[:2]))
 
 
-def _has_moved(placed: Placed, role: str) -> bool:
+def _has_moved(scene: ImaginedScene, role: str) -> bool:
     """Whether the object was away from its start in three frames; unknown ones do not tell."""
-    trail = placed.views.memory.points[placed.item(role)]
+    trail = scene.views.memory.points[scene.item(role)]
     return _is_away(np.linalg.norm(trail - trail[0], axis=1))
 
 

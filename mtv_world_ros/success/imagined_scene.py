@@ -1,4 +1,4 @@
-"""Where the objects of a task are at the end of a rollout, each found once."""
+"""Where the objects of a task are in imagined pictures, by their masks: the seen situation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,26 @@ from mtv_world_ros.vision.jaccard import mean_of_known
 
 
 @dataclass(slots=True)
-class Placed:
-    """Where the bound objects are; a `Situation`. Each is located once, when it is asked for."""
+class ImaginedScene:
+    """A `Situation` seen in masks; each object is located once, when it is asked for.
+
+    Centres are those of the end (T = 1); clearances and reversals are of all frames so far. How
+    an object is turned is not seen.
+
+    Attributes:
+        views: masks of the rollout.
+        bound: placeholder -> name of its object.
+        picture_masks: finds objects in the task's pictures.
+        sizes: placeholder -> usual extents (3,) of its object [m]; not there = taken as a cube
+            and measured.
+        notes: assumptions made on the way, in order.
+        sigmas: placeholder -> standard error of where its object is at the end [m].
+    """
 
     views: Views
     bound: Mapping[str, str]
     picture_masks: PictureMasks
+    sizes: Mapping[str, FloatArray] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
     sigmas: dict[str, float] = field(default_factory=dict)
     _ends: dict[str, Location] = field(default_factory=dict)
@@ -30,7 +44,7 @@ class Placed:
         """Returns the index of a placeholder's object."""
         return self.views.index(self.bound[role])
 
-    def end(self, role: str) -> FloatArray:
+    def centres(self, role: str) -> FloatArray:
         """See `Situation`."""
         if role not in self._ends:
             found, hidden = self.views.end(self.item(role))
@@ -38,7 +52,11 @@ class Placed:
                 name = self.bound[role]
                 self.notes[f"'{name}' is partly hidden: taken to stand where it stood"] = None
             self._ends[role], self.sigmas[role] = found, found.sigma_m
-        return self._ends[role].point
+        return self._ends[role].point[None]
+
+    def offsets(self, role: str, target: str) -> FloatArray:
+        """See `Situation`; the target's sides are taken to lie along x and y."""
+        return self.centres(role) - self.centres(target)
 
     def start(self, role: str) -> FloatArray:
         """See `Situation`."""
@@ -47,33 +65,39 @@ class Placed:
             raise CannotTell(f"where '{self.bound[role]}' was at the start is not known")
         return point
 
-    def stack_height(self, upper: str, lower: str) -> float:
-        """See `Situation`; both are taken as cubes, of the size that was last seen whole."""
-        memory, footage = self.views.memory, self.views.footage
-        edges = []
-        for role in (upper, lower):
-            item = self.item(role)
-            areas = memory.seen_masks[:, item].sum((-2, -1)).astype(np.float64)
-            point = memory.seen_points[item]
-            if not np.isfinite(point).all():
-                point = self.end(role)
-            edges.append(block_size(footage.cameras, tuple(footage.poses[:, -1]), areas, point))
-        return float(np.mean(edges))
+    def goal(self, role: str) -> FloatArray:
+        """See `Situation`; no picture shows it."""
+        raise CannotTell(f"where '{self.bound[role]}' is to go is not known")
 
-    def lift(self, role: str) -> float:
-        """See `Situation`."""
-        heights = self.views.memory.points[self.item(role), :, 2]
-        return float(np.nanmax(heights) - self.start(role)[2])
+    def size(self, role: str) -> FloatArray:
+        """See `Situation`; a cube is measured where it was last seen whole."""
+        if role in self.sizes:
+            return self.sizes[role]
+        memory, footage, item = self.views.memory, self.views.footage, self.item(role)
+        areas = memory.seen_masks[:, item].sum((-2, -1)).astype(np.float64)
+        point = memory.seen_points[item]
+        if not np.isfinite(point).all():
+            point = self.centres(role)[0]
+        edge = block_size(footage.cameras, tuple(footage.poses[:, -1]), areas, point)
+        return np.full(3, edge)
 
-    def swings(self, role: str, swing: float) -> int:
+    def clearances(self, role: str) -> FloatArray:
+        """See `Situation`; how far the centre is over its start, where the object stood."""
+        heights = self.views.memory.points[self.item(role), :, 2] - self.start(role)[2]
+        frames, known = np.arange(len(heights)), np.isfinite(heights)
+        return np.interp(frames, frames[known], heights[known])
+
+    def reversals(self, role: str, swing: float) -> FloatArray:
         """See `Situation`; what the view tells that shows most of them."""
-        counts = []
+        found = np.zeros(self.views.memory.leans.shape[2])
         for leans in self.views.memory.leans[:, self.item(role)]:
-            known = leans[np.isfinite(leans)]
-            if len(known):
-                reversals = count_reversals(np.unwrap(known, period=np.pi), swing)
-                counts.append(int(reversals[-1]))
-        return max(counts, default=0)
+            known = np.isfinite(leans)
+            if known.any():
+                counts = count_reversals(np.unwrap(leans[known], period=np.pi), swing)
+                last_known = np.cumsum(known)
+                counts = np.concatenate([[0.0], counts])[last_known]
+                found = max(found, counts, key=lambda values: values[-1])
+        return found
 
     def pictured(self, role: str, pictures: Mapping[str, Picture]) -> BoolArray:
         """Returns (V, H, W) masks of an object in pictures; empty where a view has none."""

@@ -1,13 +1,59 @@
-"""Relations between objects that a task may ask for, and by how much each of them holds."""
+"""Relations between objects that a task may ask for, and by how much each of them holds.
+
+The defaults are the benchmark's thresholds, and written nowhere else. Lengths in metres, x to the
+right, y away from the robot, z up. A distance in the plane is that of the centres in x and y.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.success.pictured import AsPictured, InRegion
-from mtv_world_ros.success.situation import Goal, Margin, Situation
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.success.goal_pictures import Picture
+from mtv_world_ros.success.situation import Situation
+
+#: thickness of the floor of plates and containers [m]
+FLOOR_M = 0.005
+#: an object in a container may lean on its wall: its centre is at most this far over the wall [m]
+OVER_WALL_M = 0.03
+#: a J, or a share of an area, that counts as one in the margins
+_SOFT_SHARE = 0.1
+
+#: a placeholder, and where the centre (3,) of its object should be at the end [m]
+Goal = tuple[str, FloatArray]
+
+
+class Margin(NamedTuple):
+    """By how much a condition holds.
+
+    Attributes:
+        condition: in words.
+        values: (T,) of a situation's samples; positive = the condition holds.
+        unit: of the values: `m`, or what is counted or measured.
+        soft: value that counts as one; None = the task's softness [m].
+        is_required: False = no part of the definition of success, but evidence against it where
+            poses are estimated from pictures.
+    """
+
+    condition: str
+    values: FloatArray
+    unit: str = 'm'
+    soft: float | None = None
+    is_required: bool = True
+
+    @property
+    def end(self) -> float:
+        """The value at the end."""
+        return float(self.values[-1])
+
+
+def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Returns the (T,) distance of centres (T, 3) or (3,) in x and y [m]."""
+    return np.linalg.norm((np.asarray(a) - np.asarray(b))[..., :2], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,9 +64,10 @@ class Beside:
         kind: `left_of` or `right_of`.
         subject: placeholder of the object that moves.
         target: placeholder of the object it is placed by.
-        distance_m: smallest and largest distance of the centres in the table plane.
-        max_across_m: largest |dy|.
-        max_rise_m: largest |dz|.
+        distance_m: smallest and largest distance of the centres in the plane.
+        max_across_m: largest |dy| of the centres.
+        max_rise_m: largest |dz| of the centres. Not required: an object in the air is still held,
+            which the grippers tell where they are known.
         goal_distance_m: dx at which the goal mask is drawn.
     """
 
@@ -35,18 +82,18 @@ class Beside:
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
         way = np.array([self._side() * self.goal_distance_m, 0.0, 0.0])
-        return self.subject, at.end(self.target) + way
+        return self.subject, at.centres(self.target)[-1] + way
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
-        dx, dy, dz = (at.end(self.subject) - at.end(self.target)).tolist()
-        distance = float(np.hypot(dx, dy))
+        a, b = at.centres(self.subject), at.centres(self.target)
+        distance, (dx, dy, dz) = plane_distance(a, b), (a - b).T
         return [
             Margin('far enough', distance - self.distance_m[0]),
             Margin('near enough', self.distance_m[1] - distance),
             Margin('on the right side', self._side() * dx),
-            Margin('in line', self.max_across_m - abs(dy)),
-            Margin('on the table', self.max_rise_m - abs(dz)),
+            Margin('in line', self.max_across_m - np.abs(dy)),
+            Margin('on the table', self.max_rise_m - np.abs(dz), is_required=False),
         ]
 
     def _side(self) -> float:
@@ -71,28 +118,86 @@ class OnTop:
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
-        rise = np.array([0.0, 0.0, at.stack_height(self.subject, self.target)])
-        return self.subject, at.end(self.target) + rise
+        return self.subject, at.centres(self.target)[-1] + self._rise(at)
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
-        goal = self.goal(at)
-        assert goal is not None
-        room = np.asarray(self.max_offset_m) - np.abs(at.end(self.subject) - goal[1])
+        offset = at.centres(self.subject) - at.centres(self.target) - self._rise(at)
+        room = np.asarray(self.max_offset_m) - np.abs(offset)
         names = ('over it in x', 'over it in y', 'at its top')
-        return [Margin(name, value) for name, value in zip(names, room.tolist(), strict=True)]
+        return [Margin(name, values) for name, values in zip(names, room.T, strict=True)]
+
+    def _rise(self, at: Situation) -> FloatArray:
+        rise = (at.size(self.subject)[2] + at.size(self.target)[2]) / 2
+        return np.array([0.0, 0.0, rise])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServedOn:
+    """The subject stands on the floor of a plate, near its middle.
+
+    Attributes:
+        kind: `served_on`.
+        subject: placeholder of the object that moves.
+        target: placeholder of the plate.
+        max_distance_m: largest distance of the centres in the plane.
+        max_rise_m: largest difference in height from where it stands on the floor.
+    """
+
+    kind: str
+    subject: str
+    target: str
+    max_distance_m: float = 0.035
+    max_rise_m: float = 0.015
+
+    def goal(self, at: Situation) -> Goal | None:
+        """Returns where the subject's centre should be (3,) [m]."""
+        rise = np.array([0.0, 0.0, self._rise(at)])
+        return self.subject, at.centres(self.target)[-1] + rise
+
+    def margins(self, at: Situation) -> list[Margin]:
+        """Returns by how much each condition holds."""
+        a, b = at.centres(self.subject), at.centres(self.target)
+        rise = (a - b)[:, 2] - self._rise(at)
+        return [
+            Margin('near its middle', self.max_distance_m - plane_distance(a, b)),
+            Margin('not below it', rise + self.max_rise_m),
+            Margin('not above it', self.max_rise_m - rise),
+        ]
+
+    def _rise(self, at: Situation) -> float:
+        """Height of the subject's centre over the target's [m]."""
+        return float((at.size(self.subject)[2] - at.size(self.target)[2]) / 2 + FLOOR_M)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NestedOn(ServedOn):
+    """The subject, a plate, lies in or on the target, another plate.
+
+    Attributes:
+        kind: `nested_on`.
+        max_distance_m: largest distance of the centres in the plane.
+        max_rise_m: largest difference in height from halfway between lying in it and on it.
+    """
+
+    max_distance_m: float = 0.04
+    max_rise_m: float = 0.02
+
+    def _rise(self, at: Situation) -> float:
+        return float(at.size(self.target)[2] / 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Within:
-    """The subject is in or on the target, near its middle: a basket, a tray, a plate.
+    """The subject is in or on a container (basket, tray), near its middle.
 
     Attributes:
         kind: `within`.
         subject: placeholder of the object that moves.
-        target: placeholder of what it is put into or onto.
-        max_distance_m: largest distance of the centres in the table plane.
-        rise_m: lowest and highest height of the subject's centre over the target's.
+        target: placeholder of the container.
+        max_distance_m: largest distance of the centres in the plane.
+        rise_m: lowest and highest height of the subject's centre over the target's; not given =
+            over the container's floor, and at most `OVER_WALL_M` over its wall.
         goal_rise_m: height over the target's centre at which the goal mask is drawn; not given =
             no goal mask, as where several things share the middle.
     """
@@ -100,8 +205,8 @@ class Within:
     kind: str
     subject: str
     target: str
-    max_distance_m: float
-    rise_m: tuple[float, float]
+    max_distance_m: float = 0.05
+    rise_m: tuple[float, float] | None = None
     goal_rise_m: float | None = None
 
     def goal(self, at: Situation) -> Goal | None:
@@ -109,35 +214,37 @@ class Within:
         if self.goal_rise_m is None:
             return None
         rise = np.array([0.0, 0.0, self.goal_rise_m])
-        return self.subject, at.end(self.target) + rise
+        return self.subject, at.centres(self.target)[-1] + rise
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
-        dx, dy, dz = (at.end(self.subject) - at.end(self.target)).tolist()
+        distance = plane_distance(at.centres(self.subject), at.centres(self.target))
         return [
-            Margin('near its middle', self.max_distance_m - float(np.hypot(dx, dy))),
-            Margin('not below it', dz - self.rise_m[0]),
-            Margin('not above it', self.rise_m[1] - dz),
+            Margin('near its middle', self.max_distance_m - distance),
+            *_height_margins(at, self.subject, self.target, self.rise_m),
         ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inside:
-    """The subject is inside the target's rectangle, whose sides lie along x and y.
+    """The subject is inside a container's rectangle.
 
     Attributes:
         kind: `inside`.
         subject: placeholder of the object that moves.
         target: placeholder of the container.
-        half_size_m: how far the subject's centre may be from the target's in x and y.
-        rise_m: lowest and highest height of the subject's centre over the target's.
+        half_size_m: how far the subject's centre may be from the target's along the target's
+            sides; not given = half the target's size.
+        whole: the whole subject is inside, not only its centre; without `half_size_m`.
+        rise_m: as in `Within`.
     """
 
     kind: str
     subject: str
     target: str
-    half_size_m: tuple[float, float]
-    rise_m: tuple[float, float]
+    half_size_m: tuple[float, float] | None = None
+    whole: bool = False
+    rise_m: tuple[float, float] | None = None
 
     def goal(self, at: Situation) -> Goal | None:
         """Nothing: it may be anywhere inside."""
@@ -146,30 +253,49 @@ class Inside:
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
-        dx, dy, dz = (at.end(self.subject) - at.end(self.target)).tolist()
+        room = (self._room(at) - np.abs(at.offsets(self.subject, self.target)[:, :2])).T
         return [
-            Margin('inside in x', self.half_size_m[0] - abs(dx)),
-            Margin('inside in y', self.half_size_m[1] - abs(dy)),
-            Margin('not below it', dz - self.rise_m[0]),
-            Margin('not above it', self.rise_m[1] - dz),
+            Margin('inside in x', room[0]),
+            Margin('inside in y', room[1]),
+            *_height_margins(at, self.subject, self.target, self.rise_m),
         ]
+
+    def _room(self, at: Situation) -> FloatArray:
+        if self.half_size_m is not None:
+            return np.asarray(self.half_size_m)
+        half = at.size(self.target)[:2] / 2
+        return half - at.size(self.subject)[:2].max() / 2 if self.whole else half
+
+
+def _height_margins(
+    at: Situation, subject: str, target: str, rise_m: tuple[float, float] | None
+) -> list[Margin]:
+    """By how much the subject is at the height of what lies in a container."""
+    if rise_m is not None:
+        rise = (at.centres(subject) - at.centres(target))[:, 2]
+        low, high = rise_m
+    else:
+        wall = at.size(target)[2]
+        rise = at.offsets(subject, target)[:, 2] + wall / 2
+        low, high = FLOOR_M, wall + OVER_WALL_M
+    return [Margin('not below it', rise - low), Margin('not above it', high - rise)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Apart:
-    """Two objects stand apart in the table plane.
+    """Two objects stand apart.
 
     Attributes:
         kind: `apart`.
         subject: placeholder of the one.
         target: placeholder of the other.
-        min_distance_m: of their centres.
+        min_distance_m: of their centres in the plane.
     """
 
     kind: str
     subject: str
     target: str
-    min_distance_m: float
+    min_distance_m: float = 0.06
 
     def goal(self, at: Situation) -> Goal | None:
         """Nothing: there is no one place for it."""
@@ -178,8 +304,8 @@ class Apart:
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
-        offset = at.end(self.subject) - at.end(self.target)
-        return [Margin('apart', float(np.hypot(*offset[:2])) - self.min_distance_m)]
+        distance = plane_distance(at.centres(self.subject), at.centres(self.target))
+        return [Margin('apart', distance - self.min_distance_m)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,12 +315,12 @@ class Moved:
     Attributes:
         kind: `moved`.
         subject: placeholder of the object that moves.
-        min_distance_m: in the table plane.
+        min_distance_m: in the plane.
     """
 
     kind: str
     subject: str
-    min_distance_m: float
+    min_distance_m: float = 0.1
 
     def goal(self, at: Situation) -> Goal | None:
         """Nothing: there is no one place for it."""
@@ -203,56 +329,72 @@ class Moved:
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
-        way = at.end(self.subject) - at.start(self.subject)
-        return [Margin('moved away', float(np.hypot(*way[:2])) - self.min_distance_m)]
+        way = plane_distance(at.centres(self.subject), at.start(self.subject))
+        return [Margin('moved away', way - self.min_distance_m)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shifted:
-    """The subject stands at a given offset from where it started.
+class AtGoal:
+    """The subject stands where the scene wants it.
 
     Attributes:
-        kind: `shifted`.
+        kind: `at_goal`.
         subject: placeholder of the object that moves.
-        offset_m: x, y, z of the goal from the start.
-        max_distance_m: largest distance from the goal in the table plane.
+        max_distance_m: largest distance from the goal in the plane.
         max_rise_m: largest |dz| from the goal.
     """
 
     kind: str
     subject: str
-    offset_m: tuple[float, float, float]
-    max_distance_m: float
-    max_rise_m: float
+    max_distance_m: float = 0.03
+    max_rise_m: float = 0.03
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
-        return self.subject, at.start(self.subject) + np.asarray(self.offset_m)
+        return self.subject, self._goal(at)
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
-        way = at.end(self.subject) - at.start(self.subject) - np.asarray(self.offset_m)
+        centres, goal = at.centres(self.subject), self._goal(at)
         return [
-            Margin('at its goal', self.max_distance_m - float(np.hypot(*way[:2]))),
-            Margin('on the table', self.max_rise_m - abs(float(way[2]))),
+            Margin('at its goal', self.max_distance_m - plane_distance(centres, goal)),
+            Margin('on the table', self.max_rise_m - np.abs(centres[:, 2] - goal[2])),
         ]
+
+    def _goal(self, at: Situation) -> FloatArray:
+        return at.goal(self.subject)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shifted(AtGoal):
+    """The subject stands at a given offset from where it started.
+
+    Attributes:
+        kind: `shifted`.
+        offset_m: x, y, z of the goal from the start.
+    """
+
+    offset_m: tuple[float, float, float]
+
+    def _goal(self, at: Situation) -> FloatArray:
+        return at.start(self.subject) + np.asarray(self.offset_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shaken:
-    """The subject was lifted and swung to and fro at some time.
+    """The subject was lifted and, up there, swung to and fro; that stays true from then on.
 
     Attributes:
         kind: `shaken`.
         subject: placeholder of the object that is shaken.
-        min_lift_m: how far its centre rises over its start.
-        num_reversals: how often its lean turns back.
+        min_lift_m: height of its lowest point over the table.
+        num_reversals: how often its lean turns back while it is lifted.
         min_swing_rad: smaller turns do not count.
     """
 
     kind: str
     subject: str
-    min_lift_m: float
+    min_lift_m: float = 0.06
     num_reversals: int = 2
     min_swing_rad: float = 0.15
 
@@ -263,24 +405,93 @@ class Shaken:
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds; a reversal more or less counts as two."""
-        counted = at.swings(self.subject, self.min_swing_rad) - self.num_reversals + 0.5
+        room = at.clearances(self.subject) - self.min_lift_m
+        turns = np.diff(at.reversals(self.subject, self.min_swing_rad), prepend=0.0)
+        counted = np.cumsum(turns * (room > 0)) - self.num_reversals + 0.5
         return [
-            Margin('lifted', at.lift(self.subject) - self.min_lift_m),
+            Margin('lifted', np.maximum.accumulate(room)),
             Margin('swung to and fro', counted, 'reversals', 0.5),
         ]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AsPictured:
+    """The subject lies as in pictures of the task done; its mask in them is the goal mask.
+
+    Attributes:
+        kind: `as_pictured`.
+        subject: placeholder of the object that moves.
+        pictures: view -> picture of the task done, by the calibrated camera; one view will do.
+        min_jaccard: J of the subject's mask with that in the pictures, mean over the views.
+    """
+
+    kind: str
+    subject: str
+    pictures: Mapping[str, Picture]
+    min_jaccard: float = 0.5
+
+    def goal(self, at: Situation) -> Goal | None:
+        """Nothing: the place is known in the pictures alone."""
+        del at
+        return None
+
+    def margins(self, at: Situation) -> list[Margin]:
+        """Returns by how much the condition holds."""
+        reached = at.pictured_jaccard(self.subject, self.pictures) - self.min_jaccard
+        return [Margin('as in the goal picture', np.array([reached]), 'J', _SOFT_SHARE)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InRegion:
+    """The subject is seen within a region of the views that was painted.
+
+    Attributes:
+        kind: `in_region`.
+        subject: placeholder of the object that moves.
+        regions: view -> picture, white where the subject belongs, black elsewhere.
+        min_share: of the subject's mask that is in the region, in every one of these views.
+    """
+
+    kind: str
+    subject: str
+    regions: Mapping[str, Picture]
+    min_share: float = 0.8
+
+    def goal(self, at: Situation) -> Goal | None:
+        """Nothing: it may be anywhere in the region."""
+        del at
+        return None
+
+    def margins(self, at: Situation) -> list[Margin]:
+        """Returns by how much the condition holds."""
+        inside = at.share_inside(self.subject, self.regions) - self.min_share
+        return [Margin('in the painted region', np.array([inside]), 'of its area', _SOFT_SHARE)]
+
+
 Relation = (
-    Beside | OnTop | Within | Inside | Apart | Moved | Shifted | Shaken | AsPictured | InRegion
+    Beside
+    | OnTop
+    | ServedOn
+    | Within
+    | Inside
+    | Apart
+    | Moved
+    | AtGoal
+    | Shaken
+    | AsPictured
+    | InRegion
 )
 KINDS: dict[str, type[Relation]] = {
     'left_of': Beside,
     'right_of': Beside,
     'on_top_of': OnTop,
+    'served_on': ServedOn,
+    'nested_on': NestedOn,
     'within': Within,
     'inside': Inside,
     'apart': Apart,
     'moved': Moved,
+    'at_goal': AtGoal,
     'shifted': Shifted,
     'shaken': Shaken,
     'as_pictured': AsPictured,

@@ -1,66 +1,137 @@
-"""What a relation asks of a rollout: where its objects are; and what it answers: margins."""
+"""What relations are evaluated on: poses and sizes of objects, and gripper openings, over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol, TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import Protocol, TYPE_CHECKING
 
-from mtv_world_ros.data_types import FloatArray
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.geometry.mask_geometry import count_reversals
 
 if TYPE_CHECKING:
     from mtv_world_ros.success.goal_pictures import Picture
 
-#: a placeholder, and where the centre (3,) of its object should be [m]
-Goal = tuple[str, FloatArray]
+#: a gripper counts as open above this share of its range
+OPEN_SHARE = 0.8
 
 
 class CannotTell(Exception):
-    """Why there is no evidence; caught by the estimator, never a user's error."""
-
-
-class Margin(NamedTuple):
-    """By how much a condition holds.
-
-    Attributes:
-        condition: in words.
-        value: negative = violated.
-        unit: of the value: `m`, or what is counted or measured.
-        soft: value that counts as one; None = the task's softness [m].
-    """
-
-    condition: str
-    value: float
-    unit: str = 'm'
-    soft: float | None = None
+    """Why something about a situation is not known; the estimator abstains with this reason."""
 
 
 class Situation(Protocol):
-    """Where the objects are, by their placeholders; raises CannotTell where it is not known."""
+    """Objects by their role in the task, over T samples; the last sample is the end.
 
-    def end(self, role: str) -> FloatArray:
-        """Returns the centre (3,) at the end [m]."""
+    Lengths in metres in the base frame: x to the right, y away from the robot, z up from the
+    table. A situation may know where objects are only at the end; then T = 1. Every method raises
+    CannotTell where the answer is not known.
+    """
+
+    def centres(self, role: str) -> FloatArray:
+        """Returns the object's centre (T, 3) [m]."""
+        ...
+
+    def offsets(self, role: str, target: str) -> FloatArray:
+        """Returns the object's centre (T, 3) from the target's, in the target's own frame [m]."""
         ...
 
     def start(self, role: str) -> FloatArray:
-        """Returns the centre (3,) at the start of the rollout [m]."""
+        """Returns the object's centre (3,) at the start of the episode [m]."""
         ...
 
-    def stack_height(self, upper: str, lower: str) -> float:
-        """Returns the height of one centre over the other when stacked [m]."""
+    def goal(self, role: str) -> FloatArray:
+        """Returns where the object's centre (3,) is to be, if the scene came with a goal [m]."""
         ...
 
-    def lift(self, role: str) -> float:
-        """Returns how far the object was raised over its start at most [m]."""
+    def size(self, role: str) -> FloatArray:
+        """Returns the full extents (3,) of the object in its own frame [m]."""
         ...
 
-    def swings(self, role: str, swing: float) -> int:
-        """Returns how often the object turned back by more than `swing` [rad]."""
+    def clearances(self, role: str) -> FloatArray:
+        """Returns the height (T,) of the object's lowest point over the table [m]."""
+        ...
+
+    def reversals(self, role: str, swing: float) -> FloatArray:
+        """Returns (T,) how often the object's lean has turned back by more than `swing` [rad]."""
         ...
 
     def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
-        """Returns J of the object's mask at the end with its mask in pictures, by view; a mean."""
+        """Returns J of the object's mask at the end with that in pictures; mean over views."""
         ...
 
     def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
-        """Returns the share of the object's mask at the end in regions, by view; the least."""
+        """Returns the share of the object's mask at the end in regions; the least of the views."""
         ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruePoses:
+    """A `Situation` whose poses are known, of T samples and A grippers: a simulator's.
+
+    Attributes:
+        positions: role -> (T, 3) centre of the object in the base frame [m].
+        rotations: role -> (T, 3, 3) rotation of T_base_object.
+        sizes: role -> (x, y, z) full extents of the object in its own frame [m].
+        openings: (A, T) gripper openings in 0..1.
+        goals: role -> (3,) where the object's centre is to be [m]; of tasks whose goal is drawn
+            with the scene.
+    """
+
+    positions: Mapping[str, FloatArray]
+    rotations: Mapping[str, FloatArray]
+    sizes: Mapping[str, tuple[float, float, float]]
+    openings: FloatArray
+    goals: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def centres(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        return self.positions[role]
+
+    def offsets(self, role: str, target: str) -> FloatArray:
+        """See `Situation`."""
+        offset = self.positions[role] - self.positions[target]
+        return np.einsum('tji,tj->ti', self.rotations[target], offset)
+
+    def start(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        return self.positions[role][0]
+
+    def goal(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        if role not in self.goals:
+            raise CannotTell(f"the scene has no goal for '{role}'")
+        return self.goals[role]
+
+    def size(self, role: str) -> FloatArray:
+        """See `Situation`."""
+        return np.asarray(self.sizes[role])
+
+    def clearances(self, role: str) -> FloatArray:
+        """See `Situation`; the object is taken as an upright cylinder."""
+        width, _, height = self.sizes[role]
+        tilt = np.arccos(np.clip(self.rotations[role][:, 2, 2], -1, 1))
+        drop = height / 2 * np.cos(tilt) + width / 2 * np.sin(tilt)
+        return self.positions[role][:, 2] - drop
+
+    def reversals(self, role: str, swing: float) -> FloatArray:
+        """See `Situation`; the lean is that of the object's z axis, where it swings most."""
+        axis = self.rotations[role][:, :, 2]
+        lean = axis[:, :2]
+        direction = np.linalg.svd(lean - lean.mean(0))[2][0]
+        return count_reversals(np.arctan2(lean @ direction, axis[:, 2]), swing)
+
+    def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
+        """See `Situation`; there are no masks."""
+        raise CannotTell(f"'{role}' has a pose, but no mask to compare with pictures")
+
+    def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
+        """See `Situation`; there are no masks."""
+        raise CannotTell(f"'{role}' has a pose, but no mask to compare with regions")
+
+
+def grippers_open(openings: FloatArray) -> BoolArray:
+    """Returns (T,) where every gripper of (A, T) `openings` is open."""
+    return np.all(np.asarray(openings) > OPEN_SHARE, axis=0)

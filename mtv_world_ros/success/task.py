@@ -8,13 +8,19 @@ from pathlib import Path
 import re
 from typing import Any
 
+import numpy as np
+
 from mtv_world_ros.config import check_keys, number, read_yaml
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.relations import KINDS, Relation, roles_of
+from mtv_world_ros.success.situation import grippers_open, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
 
 GRIPPERS = ('open', 'any')
+#: `final` means true in each of this many last samples (0.5 s at 10 Hz)
+HELD_SAMPLES = 5
 #: keys of relations whose values are picture files by view, and what reads them
 PICTURES = {'pictures': load_pictures, 'regions': load_regions}
 
@@ -27,6 +33,8 @@ class TaskSpec:
         name: e.g. `stack_blocks_two`.
         instruction: template with placeholders for the objects, `stack the {a} on the {b}`.
         relations: what must hold between the objects at the end, all of it.
+        sizes_m: usual extents (x, y, z) of a placeholder's object, for where they are not known:
+            from pictures, an object that is not named here is taken as a cube [m].
         nouns: what a placeholder's object may be called, by its last word; not given = anything.
             Tells tasks of one template apart.
         rims: last words of the names of objects that are held by their rim, not across the middle.
@@ -38,6 +46,7 @@ class TaskSpec:
     name: str
     instruction: str
     relations: tuple[Relation, ...]
+    sizes_m: Mapping[str, FloatArray] = field(default_factory=dict)
     nouns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     rims: tuple[str, ...] = ()
     gripper: str = 'open'
@@ -60,6 +69,26 @@ class TaskSpec:
         """Views and their pictures, of all relations."""
         named = [getattr(relation, key, {}) for relation in self.relations for key in PICTURES]
         return tuple(item for by_view in named for item in by_view.items())
+
+    def holds(self, at: Situation, openings: FloatArray) -> BoolArray:
+        """Returns (T,) whether the task is done at each sample.
+
+        Args:
+            at: where the objects are.
+            openings: (A, T) of the grippers, 0 closed to 1 open.
+
+        Raises:
+            CannotTell: the situation does not know what a relation asks for.
+        """
+        held = [
+            margin.values > 0
+            for relation in self.relations
+            for margin in relation.margins(at)
+            if margin.is_required
+        ]
+        if self.gripper == 'open':
+            held.append(grippers_open(openings))
+        return np.all(held, axis=0)
 
     def bind(self, instruction: str) -> dict[str, str] | None:
         """Returns the placeholders' objects if the instruction fits the template, else None."""
@@ -88,6 +117,11 @@ def match_task(
     return max(found, key=lambda pair: len(pair[0].nouns), default=None)
 
 
+def ever_and_final(success: BoolArray, held: int = HELD_SAMPLES) -> tuple[bool, bool]:
+    """Returns whether (T,) `success` held at any sample, and in each of the last `held`."""
+    return bool(success.any()), bool(len(success) >= held and success[-held:].all())
+
+
 def load_task(path: Path) -> TaskSpec:
     """Reads one task.
 
@@ -103,7 +137,8 @@ def load_task(path: Path) -> TaskSpec:
         _relation(item, Path(path).parent, f'{path}: relations[{index}]')
         for index, item in enumerate(given)
     )
-    values = _numeric(values, str(path))
+    sizes = _sizes(values.pop('sizes_m', {}), str(path))
+    values = {**_numeric(values, str(path)), 'sizes_m': sizes}
     values['nouns'] = _nouns(values.get('nouns', {}), str(path))
     for key in ('views', 'rims'):
         values[key] = _names(values.get(key, []), f"{path}: '{key}'")
@@ -128,10 +163,10 @@ def load_tasks(folder: Path) -> tuple[TaskSpec, ...]:
 
 def _check(task: TaskSpec, path: Path) -> None:
     """Refuses placeholders that the instruction does not hold, and an unknown gripper word."""
-    for role in (*task.roles, *task.nouns):
+    for role in (*task.roles, *task.nouns, *task.sizes_m):
         if f'{{{role}}}' not in task.instruction:
             raise ConfigError(
-                f"{path}: the relations or nouns are about '{role}', which the instruction "
+                f"{path}: the relations, nouns or sizes are about '{role}', which the instruction "
                 f"'{task.instruction}' does not hold as {{{role}}}"
             )
     if task.gripper not in GRIPPERS:
@@ -163,7 +198,14 @@ def _checked(kind: type, data: Any, where: str) -> dict[str, Any]:
 
 
 #: numbers a key holds; a single number where it is not named
-_LENGTHS = {'distance_m': 2, 'max_offset_m': 3, 'half_size_m': 2, 'rise_m': 2, 'offset_m': 3}
+_LENGTHS = {
+    'distance_m': 2,
+    'half_size_m': 2,
+    'max_offset_m': 3,
+    'offset_m': 3,
+    'rise_m': 2,
+    'sizes_m': 3,
+}
 #: keys of shares, above 0 and at most 1
 _SHARES = ('min_jaccard', 'min_share')
 #: keys whose lengths may be negative
@@ -174,10 +216,11 @@ def _numeric(values: dict[str, Any], where: str) -> dict[str, Any]:
     """The mapping with every number checked to be the finite one, or list, it should be."""
     checked = dict(values)
     for key, value in values.items():
-        if key == 'num_reversals':
-            if type(value) is not int or value < 1:
-                raise ConfigError(f"{where}: '{key}' is {value!r}; expected a count of at least 1")
-        elif key.endswith(('_m', '_rad')):
+        if key == 'num_reversals' and (type(value) is not int or value < 1):
+            raise ConfigError(f"{where}: '{key}' is {value!r}; expected a count of at least 1")
+        if key == 'whole' and type(value) is not bool:
+            raise ConfigError(f"{where}: '{key}' is {value!r}; expected true or false")
+        if key.endswith(('_m', '_rad')):
             checked[key] = _lengths(key, value, where)
         elif key in _SHARES:
             checked[key] = number(values, key, 0.0, where)
@@ -187,17 +230,27 @@ def _numeric(values: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _lengths(key: str, value: Any, where: str) -> float | tuple[float, ...]:
-    count = _LENGTHS.get(key, 1)
+    kind = key.split('.')[0]
+    count, is_list = _LENGTHS.get(kind, 1), kind in _LENGTHS
     numbers = value if isinstance(value, list) else [value]
     low = -1e3 if key in _SIGNED else 0.0
-    fits = len(numbers) == count and isinstance(value, list) == (key in _LENGTHS)
+    fits = len(numbers) == count and isinstance(value, list) == is_list
     if not fits or not all(isinstance(n, int | float) and low < n < 1e3 for n in numbers):
         sort = '' if key in _SIGNED else 'positive '
         unit = 'radians' if key.endswith('_rad') else 'metres'
         raise ConfigError(
             f"{where}: '{key}' is {value!r}; expected {count} {sort}length(s) in {unit}"
         )
-    return tuple(map(float, numbers)) if key in _LENGTHS else float(numbers[0])
+    return tuple(map(float, numbers)) if is_list else float(numbers[0])
+
+
+def _sizes(data: Any, where: str) -> dict[str, FloatArray]:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: 'sizes_m' is {data!r}; expected lengths by placeholder")
+    return {
+        str(role): np.atleast_1d(_lengths(f'sizes_m.{role}', size, where))
+        for role, size in data.items()
+    }
 
 
 def _nouns(data: Any, where: str) -> dict[str, tuple[str, ...]]:

@@ -23,8 +23,7 @@ from mtv_world_ros.training.clips.fit_actions import kept_actions
 from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.held_out import HeldOut
-from mtv_world_ros.training.latent_cache.cached_batches import CachedSource
-from mtv_world_ros.training.latent_cache.latent_run import cached
+from mtv_world_ros.training.latent_cache.clips import cached, CachedSource
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.training.resume import disk_errors_named, DiskError

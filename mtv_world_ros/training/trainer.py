@@ -1,9 +1,9 @@
-"""The trainer: one loop, resumable at any step, in one process or many."""
+"""The trainer: one loop, resumable at any step, in one process or many; its loss and export."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -11,11 +11,15 @@ import time
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.model.action_features import EE_MLP
 from mtv_world_ros.model.actions import ActionEncoding
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.card import OPTIONAL_KEYS
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.history_tokens import check_history
+from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer.stem import with_new_source
@@ -26,11 +30,15 @@ from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
-from mtv_world_ros.training.encoding import EncodedBatch, Encoders
-from mtv_world_ros.training.export import export_adapter, export_checkpoint
-from mtv_world_ros.training.latent_cache.cached_batches import CachedSource
-from mtv_world_ros.training.loss import batch_loss
-from mtv_world_ros.training.objective import Loss
+from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
+from mtv_world_ros.training.latent_cache.clips import CachedSource
+from mtv_world_ros.training.objective import (
+    add_noise,
+    draw_sigmas,
+    Loss,
+    sample_loss,
+    sigma_weights,
+)
 from mtv_world_ros.training.processes import memory_errors_named, Processes
 from mtv_world_ros.training.resume import check_card, load_state, read_card, save_state, STATE
 from mtv_world_ros.training.self_rollout import SelfRollout
@@ -288,9 +296,102 @@ class Trainer:
         return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
-        """Writes the averaged weights, see `export.py`."""
+        """Writes the averaged weights, see `export_checkpoint`."""
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
         if self.config.lora.rank:
             return export_adapter(folder, self.weights, card, self.base)
         parts = (self.config, self.encoders, self.actions)
         export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)
+
+
+def export_adapter(
+    folder: Path, weights: Weights, card: Mapping[str, Any], base: Base | None
+) -> None:
+    """Writes the averaged adapter in float32, with what is trained beside it and its card."""
+    save_adapter(weights.worker, folder, weights=weights.averages(), card=_with_text(card, base))
+
+
+def export_checkpoint(
+    folder: Path,
+    weights: Weights,
+    card: Mapping[str, Any],
+    base: Base | None,
+    config: TrainingConfig,
+    encoders: Encoders,
+    actions: ActionEncoding | None,
+    dtype: torch.dtype,
+) -> None:
+    """Writes the averaged weights in a number format, with all other parts beside them."""
+    parts = Checkpoint(
+        transformer=weights.averaged(),
+        autoencoder=encoders.autoencoder,
+        scheduler=build_scheduler(config.scheduler),
+        card=_with_text(card, base),
+        actions=actions,
+        text_encoder=base and base.checkpoint.text_encoder,
+        image_encoder=base and base.checkpoint.image_encoder,
+    )
+    save_checkpoint(parts, folder, dtype=dtype)
+
+
+def _with_text(card: Mapping[str, Any], base: Base | None) -> dict[str, Any]:
+    """With the prompt and guidance that the base has."""
+    theirs = base.checkpoint.card if base else {}
+    return {**card, **{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs}}
+
+
+def batch_loss(
+    transformer: MultiViewWanTransformer,
+    encoders: Encoders,
+    batch: Batch | EncodedBatch,
+    config: TrainingConfig,
+    draws: Draws,
+    device: torch.device,
+) -> Loss:
+    """Returns the loss of a batch, as sums over its clips.
+
+    Args:
+        transformer: on `device`, in the number format of forward and backward.
+        encoders: on `device`.
+        batch: clips, or what a latent cache holds of them.
+        config: the preset.
+        draws: of its clips; noise levels, noise and what is dropped come from them.
+        device: where to compute.
+    """
+    objective, dtype = config.objective, transformer.dtype
+    if isinstance(batch, Batch):
+        batch = encode_batch(encoders, batch, objective, device)
+    clean = batch.clean
+    sigmas = draw_sigmas(draws, objective)
+    noise = draws.normal(*clean.shape[1:]).to(device)
+    noisy = add_noise(clean, noise, sigmas.to(device))
+    kept = _kept(draws, config, device)
+    cond = drop_conditions(batch.conditioning, config.augment, draws)
+    if cond.history is not None:
+        cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
+    cond = cond.in_dtype(dtype)
+    predicted = transformer(
+        noisy.to(dtype),
+        (sigmas * 1000).to(device),
+        control=cond.control,
+        start=cond.start,
+        reference=cond.reference,
+        start_control=cond.start_control,
+        encoder_hidden_states=None if cond.text is None else cond.text.to(dtype),
+        encoder_hidden_states_image=None if cond.image is None else cond.image.to(dtype),
+        actions=cond.actions,
+        actions_kept=kept,
+        anchor=cond.anchor,
+        history=cond.history,
+        history_timestep=cond.history_timestep,
+    )
+    target = clean if transformer.prediction == 'sample' else noise - clean
+    by_sigma = sigma_weights(sigmas, objective).to(device)
+    return sample_loss(predicted, target, batch.weights, objective.huber_delta, by_sigma)
+
+
+def _kept(draws: Draws, config: TrainingConfig, device: torch.device) -> Tensor | None:
+    """(B,) bool, False where a sample goes without its actions."""
+    if config.video.control != EE_MLP:
+        return None
+    return (draws.uniform() >= config.augment.action_dropout).to(device)

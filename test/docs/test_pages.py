@@ -41,6 +41,12 @@ def test_the_index_of_benchmarks_has_every_page():
         assert f'(../benchmark/results/{page.name})' in index, page.name
 
 
+def test_every_example_is_run():
+    page = (ROOT / 'docs' / 'python_api.md').read_text()
+    for script in (ROOT / 'examples').glob('*.py'):
+        assert f'\npython examples/{script.name}' in page, script.name
+
+
 def test_the_fault_catalogue_has_a_row_for_every_kind():
     page = (ROOT / 'docs' / 'ranking.md').read_text()
     rows = re.findall(r'^\| `(\w+)` \| (\w+) \| (\w+) \|', page, re.M)

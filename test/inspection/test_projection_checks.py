@@ -5,7 +5,7 @@ import pytest
 
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.inspection.projection_checks import check_visibility, tool_visibility
+from mtv_world_ros.inspection.inspect import check_visibility, tool_visibility
 
 ROBOT = """
 name: slider

@@ -1,14 +1,13 @@
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.sim.tasks.predicates import History
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of
-from mtv_world_ros.sim.world.scene import rotation_of
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
@@ -19,30 +18,15 @@ relations: [{kind: left_of, subject: a, target: b, distance_m: [0.08, 0.2]}]
 """
 
 
-@dataclass
-class Known:
-    """A situation where everything is known."""
-
-    ends: dict
-    starts: dict = field(default_factory=dict)
-    height: float = 0.04
-    raised: float = 0.0
-    reversals: int = 0
-
-    def end(self, role):
-        return np.array(self.ends[role], float)
-
-    def start(self, role):
-        return np.array(self.starts[role], float)
-
-    def stack_height(self, upper, lower):
-        return self.height
-
-    def lift(self, role):
-        return self.raised
-
-    def swings(self, role, swing):
-        return self.reversals
+def poses(ends, starts=None, size=(0.04, 0.04, 0.04)):
+    """Objects of one size at their starts and then at their ends, upright; grippers open."""
+    starts = ends if starts is None else starts
+    return TruePoses(
+        positions={role: np.array([starts[role], ends[role]], float) for role in ends},
+        rotations={role: np.repeat(np.eye(3)[None], 2, axis=0) for role in ends},
+        sizes=dict.fromkeys(ends, size),
+        openings=np.ones((2, 2)),
+    )
 
 
 @pytest.fixture(scope='module')
@@ -51,8 +35,8 @@ def bundled():
 
 
 def holds(task, situation):
-    """Whether all conditions of all relations hold."""
-    return all(m.value > 0 for relation in task.relations for m in relation.margins(situation))
+    """Whether all conditions of all relations hold at the end."""
+    return all(m.end > 0 for relation in task.relations for m in relation.margins(situation))
 
 
 def write(tmp_path, text):
@@ -94,47 +78,24 @@ def test_every_task_of_the_simulator_is_known_by_what_it_says(bundled, name, see
     assert set(spec.movers) == {move.subject for move in task.moves}
 
 
-def history(scene, positions, up=None):
-    """What the simulator's predicate looks at, objects at rest for six samples."""
-    roles = {item.role: item for item in scene.objects}
-    centres = {
-        r: np.repeat(np.array([positions.get(r, i.position)], float), 6, axis=0)
-        for r, i in roles.items()
-    }
-    return History(
-        positions=centres,
-        rotations={r: np.repeat(rotation_of(i)[None], 6, axis=0) for r, i in roles.items()},
-        sizes={r: i.size for r, i in roles.items()},
-        openings=np.ones((2, 6)),
-        starts={r: np.array(i.position) for r, i in roles.items()},
-        goals=tuple(np.asarray(goal) for goal in scene.goals),
-    )
-
-
 @pytest.mark.parametrize('name', [t.name for t in tasks_named('all') if t.name != 'shake_bottle'])
-def test_relations_hold_where_the_simulator_sees_a_success(bundled, name):
+def test_usual_sizes_serve_in_place_of_exact_ones(bundled, name):
+    """The estimator takes the sizes of the task file, and measures those of blocks."""
     task, spec = task_named(name), bundled[name]
     agreed, rng = [], np.random.default_rng(7)
     for seed in range(4):
         scene = draw_scene(task, np.random.default_rng(seed))
-        roles = {item.role: item for item in scene.objects}
-        starts = {role: np.array(item.position) for role, item in roles.items()}
+        starts = {item.role: np.array(item.position) for item in scene.objects}
         goals = {move.subject: goal for move, goal in zip(task.moves, scene.goals, strict=True)}
-        for noise in (0.0, 0.0, 0.005, 0.01, 0.03, 0.03, 0.06, 0.1):
-            ends = {
-                **starts,
-                **{
-                    r: np.array(g) + noise * rng.normal(size=3) * (1, 1, 0.2)
-                    for r, g in goals.items()
-                },
-            }
-            pair = [r for r in spec.relations if r.kind == 'on_top_of']
-            height = (roles['a'].size[2] + roles['b'].size[2]) / 2 if pair else 0.0
-            truth = bool(task.succeeds(history(scene, ends)).all())
-            agreed.append((truth, holds(spec, Known(ends, starts, height))))
-        agreed.append(
-            (bool(task.succeeds(history(scene, {})).all()), holds(spec, Known(starts, starts)))
-        )
+        sizes = {item.role: item.size for item in scene.objects}
+        for noise in (None, 0.0, 0.0, 0.005, 0.01, 0.03, 0.03, 0.06, 0.1):
+            ends = starts if noise is None else starts | {
+                role: np.array(goal) + noise * rng.normal(size=3) * (1, 1, 0.2)
+                for role, goal in goals.items()
+            }  # fmt: skip
+            exact = replace(poses(ends, starts), sizes=sizes)
+            usual = replace(exact, sizes=sizes | dict(spec.sizes_m))
+            agreed.append((bool(task.succeeds(exact)[-1]), holds(spec, usual)))
     truth, found = np.array(agreed).T
     assert truth.any() and not truth.all()
     assert (truth == found).mean() >= 0.9, agreed
@@ -153,7 +114,7 @@ def test_relations_hold_where_the_simulator_sees_a_success(bundled, name):
 )
 def test_left_of_holds_where_the_published_predicate_does(bundled, delta, expected):
     target = np.array([0.1, 0.3, 0.02])
-    at = Known({'a': target + delta, 'b': target})
+    at = poses({'a': target + delta, 'b': target})
     assert holds(bundled['place_block_a2b_left'], at) == expected
 
 
@@ -170,7 +131,7 @@ def test_left_of_holds_where_the_published_predicate_does(bundled, delta, expect
 )
 def test_on_holds_where_the_published_predicate_does(bundled, delta, expected):
     target = np.array([0.1, 0.3, 0.02])
-    at = Known({'a': target + delta, 'b': target})
+    at = poses({'a': target + delta, 'b': target})
     assert holds(bundled['stack_blocks_two'], at) == expected
 
 
@@ -179,11 +140,12 @@ def test_goal_satisfies_its_own_relation(bundled):
     num_goals = 0
     for task in bundled.values():
         for relation in task.relations:
-            goal = relation.goal(Known(ends, ends))
+            given = replace(poses(ends), goals={'a': np.array([0.1, 0.1, 0.02])})
+            goal = relation.goal(given)
             if goal is None:
                 continue
-            at = Known({**ends, goal[0]: goal[1]}, ends)
-            assert min(margin.value for margin in relation.margins(at)) > 0.01
+            at = replace(poses({**ends, goal[0]: goal[1]}, ends), goals=given.goals)
+            assert min(margin.end for margin in relation.margins(at)) > 0.01
             num_goals += 1
     assert num_goals > 12
 
@@ -193,7 +155,16 @@ def test_goal_satisfies_its_own_relation(bundled):
     [(0.075, 2, True), (0.075, 4, True), (0.075, 1, False), (0.02, 3, False)],
 )
 def test_shaken_needs_both_the_lift_and_the_swings(bundled, lift, reversals, expected):
-    at = Known({}, raised=lift, reversals=reversals)
+    lean = np.array([0.0, *[0.4, 0.0] * 3][: reversals + 2])
+    rotations = np.repeat(np.eye(3)[None], len(lean), axis=0)
+    rotations[:, :, 2] = np.column_stack([np.sin(lean), 0 * lean, np.cos(lean)])
+    at = TruePoses(
+        positions={'a': np.repeat([[0.0, 0.3, 0.05 + lift]], len(lean), axis=0)},
+        rotations={'a': rotations},
+        sizes={'a': (0.047, 0.047, 0.1)},
+        openings=np.zeros((2, len(lean))),
+    )
+    assert at.reversals('a', 0.15)[-1] == reversals
     assert holds(bundled['shake_bottle'], at) == expected
 
 
@@ -226,6 +197,17 @@ def test_nouns_tell_tasks_of_one_template_apart(bundled, instruction, name):
         (('[0.08, 0.2]', '[0.08, -1]'), 'positive length'),
         (('name: left', ''), "key 'name' is missing"),
         (('subject: a', 'subject: c'), "about 'c'"),
+        (('name:', 'sizes_m: {z: [1, 1, 1]}\nname:'), "about 'z'"),
+        (('name:', 'sizes_m: {a: [1, 1]}\nname:'), "'sizes_m.a' is .* expected 3 positive"),
+        (('name:', 'sizes_m: [1]\nname:'), "'sizes_m' is .* expected lengths by placeholder"),
+        (('left_of', 'inside'), r"unknown key 'distance_m'"),
+        (
+            (
+                'left_of, subject: a, target: b, distance_m: [0.08, 0.2]',
+                'inside, subject: a, target: b, whole: 1',
+            ),
+            "'whole' is 1; expected true or false",
+        ),
     ],
 )
 def test_wrong_task_files_say_what_is_wrong(tmp_path, change, message):

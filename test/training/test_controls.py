@@ -21,9 +21,9 @@ from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.fit_actions import fit_actions
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.loss import _kept
 from mtv_world_ros.training.objective import pooled_weights
 from mtv_world_ros.training.run import train
+from mtv_world_ros.training.trainer import _kept
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']

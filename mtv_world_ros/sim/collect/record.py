@@ -14,9 +14,9 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import ScriptedPolicy
-from mtv_world_ros.sim.tasks.predicates import ever_and_final
 from mtv_world_ros.sim.tasks.tasks import Task
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
+from mtv_world_ros.success.task import ever_and_final
 
 #: stamp of every episode's first frame [ns]; ROS takes zero for "not set"
 START_NS = 1_700_000_000_000_000_000
@@ -64,8 +64,8 @@ class Take:
         observations: T, one a frame.
         control_positions: (C, J) measured joints at every control period.
         commands: what the policy commanded.
-        ever: the task's predicate held in some frame.
-        final: it held in each of the last frames.
+        ever: the task was done in some frame.
+        final: it was done in each of the last frames.
         moved: role -> distance of the object from its start at the end [m].
         missed: role of the object that the gripper is to miss; None = none.
         any_outcome: the policy has faults, and what comes of them is as wanted.
@@ -145,8 +145,8 @@ def simulate(
             before = time.process_time()
             observations.append(sim.observe(rendering=config.pictures == 'all'))
             rendering += time.process_time() - before
-    history = sim.history()
-    ever, final = ever_and_final(task.succeeds(history))
+    situation = sim.situation()
+    ever, final = ever_and_final(task.succeeds(situation))
     return Take(
         observations=tuple(observations),
         control_positions=np.asarray(measured),
@@ -155,7 +155,7 @@ def simulate(
         final=final,
         moved={
             role: float(np.linalg.norm(centres[-1] - centres[0]))
-            for role, centres in history.positions.items()
+            for role, centres in situation.positions.items()
         },
         missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
         any_outcome=variant is not None,

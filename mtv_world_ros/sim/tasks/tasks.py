@@ -1,12 +1,23 @@
-"""The benchmark's tasks, each one declarative description."""
+"""Scenes of the benchmark's tasks: what lies on the table, and what the expert does.
+
+What is said and what succeeds stands in `config/tasks/<name>.yaml`; of tasks whose goal only the
+simulator knows, in `config/tasks/zero_shot`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import nearest, SimulatorError
-from mtv_world_ros.sim.tasks import predicates as is_true
-from mtv_world_ros.sim.tasks.predicates import Predicate
+from mtv_world_ros.files import share_path
+from mtv_world_ros.success.situation import TruePoses
+from mtv_world_ros.success.task import load_task, TaskSpec
 
 Range = tuple[float, float]
 #: `PickPlace.reference`: the goal is relative to where the subject started
@@ -20,7 +31,7 @@ class ObjectRole:
     """An object that a task asks for.
 
     Attributes:
-        role: its part in the task; the key of `History.positions`.
+        role: its part in the task; the placeholder of the task's instruction and relations.
         shapes: keys of `SHAPES`, one of which is drawn; also the noun of its name (`red block`).
         size_share: which sizes between the shape's smallest (0) and largest (1) are drawn.
         x_range: where its centre may start, to the right of the table's middle [m].
@@ -82,25 +93,46 @@ Move = PickPlace | Shake
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One task: what lies on the table, what is said, what the expert does, what succeeds.
+    """One task's scenes.
 
     Attributes:
-        name: key in `TASKS`.
-        instruction: template with one field per role, filled with the objects' names.
+        name: key in `TASKS`, and name of the file that defines the task.
         roles: objects; required roles come before distractors.
         moves: the expert's moves, in order.
-        succeeds: History -> (T,) bool.
         mirrored: left and right of the whole scene are exchanged in every second episode.
         zero_shot: no part of the 15 tasks; for the zero-shot sets.
     """
 
     name: str
-    instruction: str
     roles: tuple[ObjectRole, ...]
     moves: tuple[Move, ...]
-    succeeds: Predicate
     mirrored: bool = False
     zero_shot: bool = False
+
+    @property
+    def definition(self) -> TaskSpec:
+        """What is said, and the relations that must hold at the end."""
+        folder = ('config', 'tasks', *(['zero_shot'] if self.zero_shot else []))
+        return _read(share_path(*folder, f'{self.name}.yaml'))
+
+    @property
+    def instruction(self) -> str:
+        """Template with one field per role, filled with the objects' names."""
+        return self.definition.instruction
+
+    def succeeds(self, poses: TruePoses) -> BoolArray:
+        """Returns (T,) whether the task is done at each sample."""
+        return self.definition.holds(poses, poses.openings)
+
+    def goals(self, places: Sequence[tuple[float, float, float]]) -> dict[str, FloatArray]:
+        """Returns role -> goal (3,) of the goals of the moves [m]."""
+        pairs = zip(self.moves, places, strict=True)
+        return {move.subject: np.asarray(place) for move, place in pairs}
+
+
+@cache
+def _read(path: Path) -> TaskSpec:
+    return load_task(path)
 
 
 _FOOD = ('bread', 'carrot', 'eggplant', 'corn')
@@ -111,7 +143,7 @@ _TWO_BLOCKS = (ObjectRole(role='a'), ObjectRole(role='b'), _DISTRACTOR)
 _SMALL = (0.0, 0.3)
 
 
-def _collect(name: str, instruction: str, shapes: tuple[str, ...], container: str) -> Task:
+def _collect(name: str, shapes: tuple[str, ...], container: str) -> Task:
     """Two things from either side go into a container in the middle."""
     roles = (
         ObjectRole(role='a', shapes=shapes, x_range=_LEFT, y_range=(0.2, 0.31)),
@@ -122,51 +154,34 @@ def _collect(name: str, instruction: str, shapes: tuple[str, ...], container: st
         ),
     )  # fmt: skip
     rest = 'on' if container == 'tray' else 'in'
-    test = is_true.are_collected(('a', 'b'), 'c')
-    if container == 'tray':
-        test = is_true.all_of(test, is_true.are_inside(('a', 'b'), 'c', footprint=True))
-    if container == 'bin':
-        test = is_true.are_inside(('a', 'b'), 'c')
     return Task(
         name=name,
-        instruction=instruction,
         roles=roles,
         moves=tuple(
             PickPlace(subject=role, reference='c', offset=(side * 0.038, 0.0), rest=rest)
             for role, side in (('a', -1), ('b', 1))
         ),
-        succeeds=is_true.all_of(test),
         mirrored=True,
     )
 
 
 def _beside(name: str, side: float) -> Task:
     """One block goes to the left (-1) or the right (+1) of another."""
-    word = 'left' if side < 0 else 'right'
     return Task(
         name=name,
-        instruction=f'place the {{a}} to the {word} of the {{b}}',
         roles=_TWO_BLOCKS,
         moves=(PickPlace(subject='a', reference='b', offset=(side * 0.13, 0.0)),),
-        succeeds=is_true.all_of(is_true.is_beside('a', 'b', side)),
     )
 
 
 def _both_beside(name: str, side: float) -> Task:
     """Two blocks go to one side of a third, the farther one first."""
-    word = 'left' if side < 0 else 'right'
     return Task(
         name=name,
-        instruction=f'place the {{a}} and the {{b}} to the {word} of the {{c}}',
         roles=tuple(ObjectRole(role=role, size_share=_SMALL) for role in 'abc'),
         moves=(
             PickPlace(subject='a', reference='c', offset=(side * 0.18, 0.015)),
             PickPlace(subject='b', reference='c', offset=(side * 0.1, -0.015)),
-        ),
-        succeeds=is_true.all_of(
-            is_true.is_beside('a', 'c', side),
-            is_true.is_beside('b', 'c', side),
-            is_true.is_apart('a', 'b'),
         ),
     )
 
@@ -175,26 +190,22 @@ def _serve(name: str, item: str) -> Task:
     """Bread or a cup goes onto a plate."""
     return Task(
         name=name,
-        instruction='place the {a} on the {b}',
         roles=(
             ObjectRole(role='a', shapes=(item,)),
             ObjectRole(role='b', shapes=('plate',), y_range=(0.22, 0.32)),
             _DISTRACTOR,
         ),
         moves=(PickPlace(subject='a', reference='b', rest='on'),),
-        succeeds=is_true.all_of(is_true.is_served('a', 'b')),
     )
 
 
 _ALL = (
-    _collect('bussing_table', 'clear the table: put the {a} and the {b} into the {c}',
-             ('cup', 'bread', 'corn'), 'bin'),
-    _collect('collect_food', 'collect the {a} and the {b} in the {c}', _FOOD, 'basket'),
-    _collect('collect_tableware', 'put the {a} and the {b} on the {c}', ('cup',), 'tray'),
-    _collect('collect_toy', 'put the {a} and the {b} away into the {c}', _TOYS, 'basket'),
+    _collect('bussing_table', ('cup', 'bread', 'corn'), 'bin'),
+    _collect('collect_food', _FOOD, 'basket'),
+    _collect('collect_tableware', ('cup',), 'tray'),
+    _collect('collect_toy', _TOYS, 'basket'),
     Task(
         name='move_stack_block_ab',
-        instruction='move the {a} to the middle and stack the {b} on it',
         roles=(
             ObjectRole(role='a', x_range=(-0.21, -0.15), y_range=(0.2, 0.33)),
             ObjectRole(role='b', x_range=(0.12, 0.21), y_range=(0.2, 0.33)),
@@ -204,29 +215,24 @@ _ALL = (
             PickPlace(subject='a', reference=TABLE, offset=(0.0, 0.225), spread=(0.02, 0.015)),
             PickPlace(subject='b', reference='a', rest='on'),
         ),
-        succeeds=is_true.all_of(is_true.is_stacked('b', 'a'), is_true.has_moved('a')),
         mirrored=True,
     ),
     Task(
         name='move_stack_plate',
-        instruction='stack the {a} on the {b}',
         roles=(
             ObjectRole(role='a', shapes=('plate',), y_range=(0.22, 0.3)),
             ObjectRole(role='b', shapes=('plate',), y_range=(0.22, 0.3)),
         ),
         moves=(PickPlace(subject='a', reference='b', rest='on'),),
-        succeeds=is_true.all_of(is_true.are_plates_stacked('a', 'b')),
     ),
     Task(
         name='move_object_two',
-        instruction='move the {a} and the {b} towards the robot',
         roles=tuple(
             ObjectRole(role=role, shapes=('block', 'cup', 'car', 'bread', 'bowl'), x_range=x_range,
                        y_range=(0.29, 0.35))
             for role, x_range in (('a', (-0.2, -0.07)), ('b', (0.07, 0.2)))
         ),
         moves=tuple(PickPlace(subject=role, reference=START, offset=(0, -0.1)) for role in 'ab'),
-        succeeds=is_true.all_of(is_true.is_at_goal(0, 'a'), is_true.is_at_goal(1, 'b')),
         mirrored=True,
     ),
     _beside('place_block_a2b_left', -1),
@@ -237,26 +243,21 @@ _ALL = (
     _serve('place_cup_plate', 'cup'),
     Task(
         name='shake_bottle',
-        instruction='shake the {a}',
         roles=(
             ObjectRole(role='a', shapes=('bottle',), x_range=(-0.2, -0.05), y_range=(0.23, 0.29)),
             ObjectRole(role='b', shapes=('block', 'cup')),
             _DISTRACTOR,
         ),
         moves=(Shake(subject='a'),),
-        succeeds=is_true.is_shaken('a'),
         mirrored=True,
     ),
     Task(
         name='stack_blocks_two',
-        instruction='stack the {a} on the {b}',
         roles=_TWO_BLOCKS,
         moves=(PickPlace(subject='a', reference='b', rest='on'),),
-        succeeds=is_true.all_of(is_true.is_stacked('a', 'b')),
     ),
     Task(
         name='random_pick_place',
-        instruction='pick up the {a} and put it down somewhere else',
         roles=(
             *(
                 ObjectRole(role=role, shapes=('bowl', 'cup', *_FOOD, *_TOYS),
@@ -270,7 +271,6 @@ _ALL = (
                 subject='a', reference=TABLE, offset=(0.0, 0.27), spread=(0.22, 0.07), least=0.08
             ),
         ),
-        succeeds=is_true.all_of(is_true.is_at_goal(0, 'a')),
         zero_shot=True,
     ),
 )  # fmt: skip

@@ -10,7 +10,6 @@ import numpy as np
 
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.shapes import SHAPES
-from mtv_world_ros.sim.tasks.predicates import History
 from mtv_world_ros.sim.tasks.tasks import ObjectRole, Task
 from mtv_world_ros.sim.world.cameras import (
     camera_model,
@@ -28,6 +27,7 @@ from mtv_world_ros.sim.world.scene import (
     SceneLook,
     SceneObject,
 )
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.vision.colour_words import PALETTE
 
 MAX_DRAWS = 4000
@@ -96,16 +96,16 @@ def _draw_look(rng: np.random.Generator) -> SceneLook:
     )
 
 
-def start_history(items: dict[str, SceneObject], goals: Sequence[Place] = ()) -> History:
-    """Returns the one-sample history of the start poses, grippers open."""
-    positions = {role: np.array([item.position]) for role, item in items.items()}
-    return History(
-        positions=positions,
+def start_situation(
+    task: Task, items: dict[str, SceneObject], goals: Sequence[Place]
+) -> TruePoses:
+    """Returns the start poses (T = 1), grippers open."""
+    return TruePoses(
+        positions={role: np.array([item.position]) for role, item in items.items()},
         rotations={role: rotation_of(item)[None] for role, item in items.items()},
         sizes={role: item.size for role, item in items.items()},
         openings=np.ones((2, 1)),
-        starts={role: centres[0] for role, centres in positions.items()},
-        goals=tuple(np.asarray(goal) for goal in goals),
+        goals=task.goals(goals),
     )
 
 
@@ -125,7 +125,7 @@ def draw_scene(
         goals = goals_of(task, items, shifts)
         if not is_feasible(task, items, goals, config.placement):
             continue
-        if not task.succeeds(start_history(items, goals)).any():
+        if not task.succeeds(start_situation(task, items, goals)).any():
             break
     else:
         raise SimulatorError(

@@ -10,12 +10,12 @@ import numpy as np
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.sim.tasks.predicates import History
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
 from mtv_world_ros.sim.world.arm import ARMS, velocity_gains
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, RandomizationConfig
 from mtv_world_ros.sim.world.scene import Scene, scene_xml, TIMESTEP_S
+from mtv_world_ros.success.situation import TruePoses
 
 CONTROL_PERIOD_S = 0.02
 
@@ -29,7 +29,7 @@ class SimObservation:
         images: view -> (H, W, 3) uint8 RGB.
         masks: view -> (H, W) uint8; 0 = none, i + 1 = scene.objects[i]; empty without masks.
         positions: (J,) measured joint positions in the robot's order [rad or m].
-        success: the task's predicate holds at this instant.
+        success: the task is done at this instant.
     """
 
     time_s: float
@@ -168,21 +168,19 @@ class SimEpisode:
         """Returns T_base_object (T, O, 4, 4) [m] at every observation since reset."""
         return np.array([poses for poses, _ in self._seen])
 
-    def history(self) -> History:
-        """Returns what predicates look at: all that was observed since reset."""
-        poses = np.array([poses for poses, _ in self._seen])
-        scene = self.scene
-        return History(
+    def situation(self) -> TruePoses:
+        """Returns what the task's relations are evaluated on, at every observation since reset."""
+        poses, scene = self.seen_poses(), self.scene
+        return TruePoses(
             positions={item.role: poses[:, i, :3, 3] for i, item in enumerate(scene.objects)},
             rotations={item.role: poses[:, i, :3, :3] for i, item in enumerate(scene.objects)},
             sizes={item.role: item.size for item in scene.objects},
             openings=self.robot.gripper_openings(np.array([seen for _, seen in self._seen])),
-            starts={item.role: poses[0, i, :3, 3] for i, item in enumerate(scene.objects)},
-            goals=tuple(np.asarray(goal) for goal in scene.goals),
+            goals=self.task.goals(scene.goals),
         )
 
     def observe(self, *, rendering: bool = True) -> SimObservation:
-        """Renders all views, unless told not to, and evaluates the task's predicate now."""
+        """Renders all views, unless told not to, and says whether the task is done now."""
         positions = self.positions()
         self._seen.append((self.object_poses(), positions))
         images, masks = self._render() if self._rendering and rendering else ({}, {})
@@ -191,7 +189,7 @@ class SimEpisode:
             images=images,
             masks=masks,
             positions=positions,
-            success=bool(self.task.succeeds(self.history())[-1]),
+            success=bool(self.task.succeeds(self.situation())[-1]),
         )
 
     def _render(self) -> tuple[dict[str, ByteArray], dict[str, ByteArray]]:

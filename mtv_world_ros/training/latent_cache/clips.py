@@ -1,4 +1,4 @@
-"""Latents of a training's clips, encoded once into a cache.
+"""Latents of a training's clips, encoded once into a cache, and batches from it.
 
 Shape letters: B batch, V views, C latent channels, F latent frames, h w latent size, N tokens.
 """
@@ -15,21 +15,25 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
-from mtv_world_ros.data.recording import cut_clip, Recording
+from mtv_world_ros.data.recording import commanded, cut_clip, Recording
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import content_digest
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
 from mtv_world_ros.model.actions import collate
-from mtv_world_ros.training.clips.batches import Batch, pasts
+from mtv_world_ros.model.conditioning import Conditioning, start_slot
+from mtv_world_ros.training.base import Base
+from mtv_world_ros.training.clips.batches import Batch, BatchSource, pasts
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.training.clips.past import draw_past, history_before
 from mtv_world_ros.training.config import HistoryConfig, ObjectiveConfig, TrainingConfig
-from mtv_world_ros.training.encoding import encode_batch, Encoders
+from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.latent_cache.store import digest_of, LatentCache
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
+from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
 #: raised when what is stored, or how it is computed, changes
@@ -37,6 +41,8 @@ _VERSION = 1
 #: what pixels weigh more for, in the order of a cache's `shares`
 WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
 _NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
+#: stale clips that are named
+_MOST_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,3 +234,194 @@ def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
         weights = pixel_weights(batch.frames, batch.object_ids, one)
         parts.append(pooled_weights(weights, shape)[:, :, 0] - 1)
     return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)
+
+
+def cached(
+    source: BatchSource,
+    root: Path,
+    config: TrainingConfig,
+    base: Base | None,
+    *,
+    seed: int,
+    dtype: torch.dtype,
+    processes: Processes,
+) -> CachedSource:
+    """Encodes what the cache lacks, says what it did, and returns batches from the cache.
+
+    Args:
+        source: of the same clips, not cached; it is closed.
+        root: of caches.
+        config: the preset.
+        base: whose encoders are used.
+        seed: of the clips' order.
+        dtype: that latents are kept in.
+        processes: that train together.
+
+    Raises:
+        ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
+        TrainingError: the disk is full.
+    """
+    _check(config)
+    assert base is not None
+    source.close()
+    controls, spec = source.controls, config.spec
+    settings = settings_of(config, base.folder, controls.robot, controls.segmenter.name, dtype)
+    cache = LatentCache(root, settings)
+    clips = list_clips(source.starts)
+    for note in [*cache.notes, *_changed(cache, clips)]:
+        tqdm.write(f'latent cache: {note}')
+    steps = fill(
+        cache,
+        clips,
+        lambda clip: read_clip(clip, spec, controls, config.history),
+        base.encoders,
+        processes.device,
+        dtype,
+    )
+    held = sum(clip.key in cache for clip in clips)
+    made = 'none to encode'
+    for build in tqdm(steps, total=len(clips) - held, desc='encoding clips', unit='clip'):
+        made = (
+            f'{build.num_encoded} encoded in {build.seconds:.1f} s ({build.clips_per_s:.2f} '
+            f'clips/s, {build.clip_bytes / 1e6:.2f} MB each)'
+        )
+    tqdm.write(f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}")
+    return CachedSource(
+        cache,
+        clips,
+        objective=config.objective,
+        text=base.encoders.text,
+        batch_size=config.optimizer.batch_size,
+        seed=seed,
+        numbers=processes.share(config.optimizer.batch_size),
+        device=processes.device,
+        controls=controls,
+        spec=spec,
+    )
+
+
+def _check(config: TrainingConfig) -> None:
+    """Raises ConfigError where latents that are kept are not what training would see."""
+    if config.autoencoder.get('_class_name', 'SpaceToDepthAutoencoder') != 'AutoencoderKLWan':
+        raise ConfigError(
+            "--latent-cache is for presets with Wan's autoencoder; this one's only rearranges "
+            'pixels, which costs less than reading latents: leave --latent-cache out'
+        )
+    augment = config.augment
+    disturbed = {
+        'augment.start_noise': augment.start_noise,
+        'augment.colour_permutation': augment.colour_permutation,
+        'augment.failure_share': augment.failure_share,
+        'self_rollout.share': config.self_rollout.share,
+    }
+    for name, value in disturbed.items():
+        if value:
+            raise ConfigError(
+                f'{name} is {value}, but a latent cache holds every clip once, as it was '
+                f'recorded: set {name} to 0, or leave --latent-cache out'
+            )
+
+
+def _changed(cache: LatentCache, clips: list[CachedClip]) -> list[str]:
+    """A note on clips whose episodes are no longer what was encoded."""
+    stale = cache.changed({clip.key: clip.label for clip in clips})
+    if not stale:
+        return []
+    named = ', '.join(stale[:_MOST_NAMED]) + (', ...' if len(stale) > _MOST_NAMED else '')
+    return [f'{len(stale)} clips are not used, their episodes have changed: {named}']
+
+
+class CachedSource:
+    """Batches from a cache: every clip once an epoch, in an order of its own each epoch.
+
+    Args:
+        cache: has all clips.
+        clips: of the training.
+        objective: how much pixels weigh.
+        text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
+        batch_size: clips of a step, over all processes.
+        seed: of the order.
+        numbers: the clips of a step that this process takes; None: all.
+        device: where batches go.
+        controls: encodes actions that are not drawn.
+        spec: what the model takes and gives.
+    """
+
+    def __init__(
+        self,
+        cache: LatentCache,
+        clips: Sequence[CachedClip],
+        *,
+        objective: ObjectiveConfig,
+        text: Tensor | None,
+        batch_size: int,
+        seed: int,
+        numbers: Sequence[int] | None = None,
+        device: torch.device,
+        controls: ControlMaker,
+        spec: WorldModelSpec,
+    ) -> None:
+        self.controls = controls
+        self._cache, self._clips, self._objective = cache, clips, objective
+        self._text, self._device, self._spec = text, device, spec
+        self._batch_size, self._seed = batch_size, seed
+        self._numbers = range(batch_size) if numbers is None else numbers
+
+    @property
+    def num_clips(self) -> int:
+        """Clips of an epoch."""
+        return len(self._clips)
+
+    def batch(self, step: int) -> EncodedBatch:
+        """Returns the batch of a step."""
+        clips = [self._clip(step, number) for number in self._numbers]
+        rows = [self._cache.read(clip.key) for clip in clips]
+        held = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        held = {name: tensor.to(self._device) for name, tensor in held.items()}
+        clean, reference = held['clean'], held['reference']
+        control = held.get('control', torch.zeros_like(clean))
+        cond = Conditioning(
+            control=control,
+            start_control=control[:, :, :, 0],
+            start=start_slot(reference, clean.shape[3], includes_start=True),
+            reference=reference,
+            actions=self._encoded(clips),
+            text=self._repeated(self._text, len(rows)),
+            image=held.get('image'),
+            anchor=held.get('anchor'),
+            history=held.get('history'),
+            history_sigmas=held.get('history_sigma'),
+        )
+        return EncodedBatch(
+            step=step,
+            numbers=self._numbers,
+            clean=clean.float(),
+            conditioning=cond,
+            weights=self._weights(held['shares'], clean.shape),
+        )
+
+    def close(self) -> None:
+        """Nothing to end; sources have it."""
+
+    def _clip(self, step: int, number: int) -> CachedClip:
+        epoch, place = divmod(step * self._batch_size + number, len(self._clips))
+        order = np.random.default_rng((self._seed, epoch)).permutation(len(self._clips))
+        return self._clips[order[place]]
+
+    def _encoded(self, clips: Sequence[CachedClip]) -> Tensor | None:
+        encoding = self.controls.actions
+        if encoding is None:
+            return None
+        times = np.arange(self._spec.num_frames + 1) / self._spec.fps
+        chunks = [commanded(clip.recording, clip.start, times) for clip in clips]
+        encoded = [encoding.encode(self.controls.robot, chunk) for chunk in chunks]
+        return torch.from_numpy(collate(encoded)).to(self._device)
+
+    def _repeated(self, text: Tensor | None, count: int) -> Tensor | None:
+        return None if text is None else text.to(self._device).expand(count, -1, -1)
+
+    def _weights(self, shares: Tensor, shape: Sequence[int]) -> Tensor:
+        weights = torch.ones_like(shares[:, 0], dtype=torch.float32)
+        for index, name in enumerate(WEIGHTS):
+            weights += getattr(self._objective, name) * shares[:, index].float() / 255
+        return weights.unsqueeze(2).expand(*shape)

@@ -48,10 +48,9 @@ def test_what_is_carried_ends_near_its_goal_and_containers_stay(sim, expert, nam
         for seed in range(5)
         if (take := _simulate(sim, expert, task, seed, miss=False)) and take.is_as_wanted()
     )
-    history = sim.history()
-    last_goal = {move.subject: goal for move, goal in zip(task.moves, history.goals, strict=True)}
-    for role, centres in history.positions.items():
-        goal = last_goal.get(role, history.starts[role])
+    situation = sim.situation()
+    for role, centres in situation.positions.items():
+        goal = situation.goals.get(role, centres[0])
         assert np.linalg.norm((centres[-1] - goal)[:2]) < 0.03, role
         # nothing sinks into the table or floats over it
         assert centres[:, 2].min() > 0.005 and take.observations[-1].success

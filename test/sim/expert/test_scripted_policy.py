@@ -9,8 +9,8 @@ from mtv_world_ros.geometry.robot import check_positions
 from mtv_world_ros.sim.expert.expert import HOME_TOOL
 from mtv_world_ros.sim.expert.faults import parse_variant, PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
-from mtv_world_ros.sim.tasks.predicates import ever_and_final
 from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.success.task import ever_and_final
 
 TASK = 'stack_blocks_two'
 START_NS = 1_700_000_000_000_000_000
@@ -54,7 +54,7 @@ def _succeeds(sim, policy, seed):
         sim.advance(policy.plan.positions[min(k, last)])
         if k % 5 == 0:
             sim.observe()
-    return ever_and_final(policy.task.succeeds(sim.history()))[1]
+    return ever_and_final(policy.task.succeeds(sim.situation()))[1]
 
 
 def test_names_and_variants_are_the_same_thing():

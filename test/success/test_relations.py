@@ -1,34 +1,34 @@
-"""Each predicate on hand-made poses, on both sides of each threshold."""
+"""Each relation on hand-made poses, on both sides of each threshold of the benchmark."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mtv_world_ros.sim.tasks.predicates import (
-    all_of,
-    are_collected,
-    are_inside,
-    are_plates_stacked,
-    beside,
-    ever_and_final,
-    grippers_open,
-    has_moved,
-    History,
-    is_apart,
-    is_at_goal,
-    is_beside,
-    is_served,
-    is_shaken,
-    is_stacked,
-    num_reversals,
-    stacked,
+from mtv_world_ros.sim import shape_geoms
+from mtv_world_ros.success.relations import (
+    Apart,
+    AsPictured,
+    AtGoal,
+    Beside,
+    FLOOR_M,
+    InRegion,
+    Inside,
+    Moved,
+    NestedOn,
+    OnTop,
+    ServedOn,
+    Shaken,
+    Shifted,
+    Within,
 )
+from mtv_world_ros.success.situation import CannotTell, grippers_open, TruePoses
+from mtv_world_ros.success.task import ever_and_final, TaskSpec
 
 B = np.array([[0.1, 0.3, 0.025]])
 
 
-def _history(places, *, sizes=None, openings=None, starts=None, goals=()):
+def situation(places, *, sizes=None, openings=None, goals=None):
     """One object or more standing still; places: role -> (x, y, z) or (T, 3)."""
     positions = {role: np.atleast_2d(np.asarray(p, float)) for role, p in places.items()}
     num = max(len(p) for p in positions.values())
@@ -36,14 +36,22 @@ def _history(places, *, sizes=None, openings=None, starts=None, goals=()):
         role: np.repeat(p, num, 0) if len(p) < num else p for role, p in positions.items()
     }
     sizes = dict.fromkeys(places, (0.05, 0.05, 0.05)) | (sizes or {})
-    return History(
+    return TruePoses(
         positions=positions,
         rotations={role: np.repeat(np.eye(3)[None], num, 0) for role in places},
         sizes=sizes,
         openings=np.ones((2, num)) if openings is None else np.asarray(openings, float),
-        starts={role: p[0] for role, p in positions.items()} | (starts or {}),
-        goals=tuple(np.asarray(goal, float) for goal in goals),
+        goals={role: np.asarray(goal, float) for role, goal in (goals or {}).items()},
     )
+
+
+def holds(relation, at):
+    """(T,) whether all that the relation requires holds."""
+    return np.all([m.values > 0 for m in relation.margins(at) if m.is_required], axis=0)
+
+
+def beside(side):
+    return Beside(kind='left_of' if side < 0 else 'right_of', subject='a', target='b')
 
 
 def _turned(history, role, yaw):
@@ -70,14 +78,24 @@ def _turned(history, role, yaw):
 )
 def test_beside_holds_between_its_thresholds_on_either_side(dx, dy, succeeds):
     for side in (-1.0, 1.0):
-        history = _history({'a': B + [[side * dx, dy, 0.0]], 'b': B})
-        assert bool(is_beside('a', 'b', side)(history)[0]) is succeeds
+        history = situation({'a': B + [[side * dx, dy, 0.0]], 'b': B})
+        assert bool(holds(beside(side), history)[0]) is succeeds
 
 
 def test_beside_measures_distance_in_the_plane_not_along_x():
     # dx alone would be too near, the distance is not
-    assert beside(B + [[-0.07, 0.045, 0.0]], B, -1)
-    assert not beside(B + [[-0.065, 0.045, 0.0]], B, -1)
+    assert holds(beside(-1), situation({'a': B + [[-0.07, 0.045, 0.0]], 'b': B}))
+    assert not holds(beside(-1), situation({'a': B + [[-0.065, 0.045, 0.0]], 'b': B}))
+
+
+def test_beside_in_the_air_is_a_doubt_and_no_condition():
+    # the benchmark asks for open grippers, not for a height; pictures may not show the grippers
+    at = situation({'a': B + [[-0.13, 0.0, 0.08]], 'b': B})
+    assert holds(beside(-1), at)
+    assert min(margin.end for margin in beside(-1).margins(at)) == pytest.approx(-0.05)
+
+
+ON_TOP = OnTop(kind='on_top_of', subject='a', target='b')
 
 
 @pytest.mark.parametrize(
@@ -94,15 +112,14 @@ def test_beside_measures_distance_in_the_plane_not_along_x():
     ],
 )
 def test_stacked_holds_within_its_tolerances(offset, succeeds):
-    assert bool(stacked(B + [offset], B, 0.05)[0]) is succeeds
+    at = situation({'a': B + [offset], 'b': B})
+    assert bool(holds(ON_TOP, at)[0]) is succeeds
 
 
 def test_stack_height_is_the_mean_of_both_blocks():
     sizes = {'a': (0.03, 0.03, 0.03), 'b': (0.05, 0.05, 0.05)}
-    assert is_stacked('a', 'b')(_history({'a': B + [[0, 0, 0.04]], 'b': B}, sizes=sizes)).all()
-    assert not is_stacked('a', 'b')(
-        _history({'a': B + [[0, 0, 0.055]], 'b': B}, sizes=sizes)
-    ).any()
+    assert holds(ON_TOP, situation({'a': B + [[0, 0, 0.04]], 'b': B}, sizes=sizes)).all()
+    assert not holds(ON_TOP, situation({'a': B + [[0, 0, 0.055]], 'b': B}, sizes=sizes)).any()
 
 
 def test_grippers_count_as_open_only_if_both_are():
@@ -110,24 +127,26 @@ def test_grippers_count_as_open_only_if_both_are():
     assert grippers_open(openings).tolist() == [True, False, False]
 
 
-def test_tasks_want_all_their_conditions_and_open_grippers():
+def test_tasks_want_all_their_relations_and_open_grippers():
     places = {'a': np.repeat(B + [[-0.13, 0, 0]], 2, 0), 'b': B}
-    history = _history(places, openings=[[0.5, 1.0], [1.0, 1.0]])
-    assert all_of(is_beside('a', 'b', -1))(history).tolist() == [False, True]
-    both = all_of(is_beside('a', 'b', -1), is_beside('a', 'b', 1))
-    assert not both(history).any()
+    at = situation(places, openings=[[0.5, 1.0], [1.0, 1.0]])
+    task = TaskSpec(name='t', instruction='{a} {b}', relations=(beside(-1),))
+    assert task.holds(at, at.openings).tolist() == [False, True]
+    assert replace(task, gripper='any').holds(at, at.openings).tolist() == [True, True]
+    both = replace(task, relations=(beside(-1), beside(1)))
+    assert not both.holds(at, at.openings).any()
 
 
 @pytest.mark.parametrize(('distance', 'succeeds'), [(0.059, False), (0.061, True)])
 def test_apart(distance, succeeds):
-    history = _history({'a': B, 'b': B + [[0.6 * distance, 0.8 * distance, 0.0]]})
-    assert bool(is_apart('a', 'b')(history)[0]) is succeeds
+    history = situation({'a': B, 'b': B + [[0.6 * distance, 0.8 * distance, 0.0]]})
+    assert bool(holds(Apart(kind='apart', subject='a', target='b'), history)[0]) is succeeds
 
 
 @pytest.mark.parametrize(('distance', 'succeeds'), [(0.099, False), (0.101, True)])
 def test_moved_away_from_its_start(distance, succeeds):
-    history = _history({'a': B + [[0.0, distance, 0.0]]}, starts={'a': B[0]})
-    assert bool(has_moved('a')(history)[0]) is succeeds
+    history = situation({'a': np.concatenate([B, B + [[0.0, distance, 0.0]]])})
+    assert holds(Moved(kind='moved', subject='a'), history).tolist() == [False, succeeds]
 
 
 @pytest.mark.parametrize(
@@ -141,8 +160,21 @@ def test_moved_away_from_its_start(distance, succeeds):
     ],
 )
 def test_at_its_goal(offset, succeeds):
-    history = _history({'a': B + [offset]}, goals=[(9, 9, 9), B[0]])
-    assert bool(is_at_goal(1, 'a')(history)[0]) is succeeds
+    at = situation({'a': B + [offset]}, goals={'a': B[0], 'b': (9, 9, 9)})
+    assert bool(holds(AtGoal(kind='at_goal', subject='a'), at)[0]) is succeeds
+    at = situation({'a': np.concatenate([B + [[0.0, 0.1, 0.0]], B + [offset]])})
+    shifted = Shifted(kind='shifted', subject='a', offset_m=(0.0, -0.1, 0.0))
+    assert holds(shifted, at).tolist() == [False, succeeds]
+
+
+def test_what_poses_do_not_tell_is_said():
+    at = situation({'a': B})
+    with pytest.raises(CannotTell, match="no goal for 'a'"):
+        AtGoal(kind='at_goal', subject='a').margins(at)
+    with pytest.raises(CannotTell, match='no mask'):
+        AsPictured(kind='as_pictured', subject='a', pictures={}).margins(at)
+    with pytest.raises(CannotTell, match='no mask'):
+        InRegion(kind='in_region', subject='a', regions={}).margins(at)
 
 
 PLATE = {'p': (0.11, 0.11, 0.02)}
@@ -163,10 +195,16 @@ PLATE = {'p': (0.11, 0.11, 0.02)}
 def test_served_on_the_floor_of_a_plate(offset, succeeds):
     # a cup of 6 cm whose bottom is on the plate's floor, 5 mm over the table
     rest = np.array([0.0, 0.3, 0.005 + 0.03])
-    history = _history(
+    history = situation(
         {'a': rest + offset, 'p': (0.0, 0.3, 0.01)}, sizes=PLATE | {'a': (0.05, 0.05, 0.06)}
     )
-    assert bool(is_served('a', 'p')(history)[0]) is succeeds
+    served = ServedOn(kind='served_on', subject='a', target='p')
+    assert bool(holds(served, history)[0]) is succeeds
+    assert served.goal(history)[1] == pytest.approx(rest)
+
+
+def test_floors_are_as_thick_as_those_that_are_simulated():
+    assert shape_geoms.FLOOR_M == FLOOR_M
 
 
 @pytest.mark.parametrize(
@@ -183,8 +221,9 @@ def test_served_on_the_floor_of_a_plate(offset, succeeds):
 )
 def test_plates_stacked(offset, succeeds):
     lower = np.array([0.0, 0.3, 0.01])
-    history = _history({'a': lower + offset, 'p': lower}, sizes=PLATE | {'a': (0.11, 0.11, 0.02)})
-    assert bool(are_plates_stacked('a', 'p')(history)[0]) is succeeds
+    history = situation({'a': lower + offset, 'p': lower}, sizes=PLATE | {'a': (0.11, 0.11, 0.02)})
+    nested = NestedOn(kind='nested_on', subject='a', target='p')
+    assert bool(holds(nested, history)[0]) is succeeds
 
 
 BASKET = {'c': (0.15, 0.12, 0.05)}
@@ -204,9 +243,9 @@ CENTRE = np.array([0.0, 0.3, 0.025])
     ],
 )
 def test_collected_near_the_middle_and_in_the_height_band(offset, succeeds):
-    history = _history({'a': CENTRE + offset, 'b': CENTRE, 'c': CENTRE}, sizes=BASKET)
-    assert bool(are_collected(('a', 'b'), 'c')(history)[0]) is succeeds
-    assert bool(are_collected(('b', 'a'), 'c')(history)[0]) is succeeds
+    history = situation({'a': CENTRE + offset, 'c': CENTRE}, sizes=BASKET)
+    within = Within(kind='within', subject='a', target='c')
+    assert bool(holds(within, history)[0]) is succeeds
 
 
 @pytest.mark.parametrize(
@@ -226,9 +265,19 @@ def test_inside_by_centre_or_by_footprint_also_where_the_container_is_turned(
     for yaw in (0.0, 0.7):
         cos, sin = np.cos(yaw), np.sin(yaw)
         turned = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]]) @ offset
-        history = _turned(_history({'a': CENTRE + turned, 'c': CENTRE}, sizes=sizes), 'c', yaw)
-        assert bool(are_inside(('a',), 'c')(history)[0]) is inside
-        assert bool(are_inside(('a',), 'c', footprint=True)(history)[0]) is wholly
+        history = _turned(situation({'a': CENTRE + turned, 'c': CENTRE}, sizes=sizes), 'c', yaw)
+        relation = Inside(kind='inside', subject='a', target='c')
+        assert bool(holds(relation, history)[0]) is inside
+        assert bool(holds(replace(relation, whole=True), history)[0]) is wholly
+
+
+def test_lengths_of_a_task_file_go_before_sizes():
+    at = situation({'a': CENTRE + [0.06, 0.0, 0.04], 'c': CENTRE}, sizes=BASKET)
+    within = Within(kind='within', subject='a', target='c', max_distance_m=0.07)
+    inside = Inside(kind='inside', subject='a', target='c')
+    assert holds(within, at) and holds(inside, at)
+    assert not holds(replace(within, rise_m=(-0.02, 0.03)), at)
+    assert not holds(replace(inside, half_size_m=(0.05, 0.05)), at)
 
 
 def _swinging(angles):
@@ -238,22 +287,33 @@ def _swinging(angles):
     return np.column_stack([np.sin(angles)[:, None] * along, np.cos(angles)])
 
 
-def test_reversals_count_turns_back_by_more_than_the_swing():
-    assert num_reversals(_swinging([0, 0.2, 0.4, 0.3, 0.1])).tolist() == [0, 0, 0, 0, 1]
-    assert num_reversals(_swinging([0, 0.4, 0.0, 0.4, 0.0]))[-1] == 3
-    assert num_reversals(_swinging([0, 0.4, 0.26, 0.4, 0.26]))[-1] == 0  # by 0.14 only
-    assert num_reversals(_swinging([0, 0.1, 0.2, 0.3, 0.4]))[-1] == 0
-    assert num_reversals(_swinging([0.0]))[-1] == 0
+def _leaning(angles, places=(0.0, 0.0, 0.1)):
+    """A bottle that leans by `angles`."""
+    at = situation(
+        {'a': np.broadcast_to(places, (len(angles), 3))}, sizes={'a': (0.05, 0.05, 0.1)}
+    )
+    rotations = np.repeat(np.eye(3)[None], len(angles), 0)
+    rotations[:, :, 2] = _swinging(angles)
+    return replace(at, rotations={'a': rotations})
+
+
+@pytest.mark.parametrize(
+    ('angles', 'counts'),
+    [
+        ([0, 0.2, 0.4, 0.3, 0.1], [0, 0, 0, 0, 1]),
+        ([0, 0.4, 0.0, 0.4, 0.0], [0, 0, 1, 2, 3]),
+        ([0, 0.4, 0.26, 0.4, 0.26], [0] * 5),  # by 0.14 only
+        ([0, 0.1, 0.2, 0.3, 0.4], [0] * 5),
+        ([0.0], [0]),
+    ],
+)
+def test_reversals_count_turns_back_by_more_than_the_swing(angles, counts):
+    assert _leaning(angles).reversals('a', 0.15).tolist() == counts
 
 
 def _shaken(angles, heights):
-    angles = np.asarray(angles, float)
     places = np.column_stack([np.zeros((len(angles), 2)), heights])
-    history = _history({'a': places}, sizes={'a': (0.05, 0.05, 0.1)})
-    axes = _swinging(angles)
-    rotations = np.repeat(np.eye(3)[None], len(angles), 0)
-    rotations[:, :, 2] = axes
-    return is_shaken('a')(replace(history, rotations={'a': rotations}))
+    return holds(Shaken(kind='shaken', subject='a'), _leaning(angles, places))
 
 
 def test_shaken_wants_two_reversals_while_lifted_and_stays_true():

@@ -1,0 +1,60 @@
+"""Scores an imagined video against the recorded one: Jaccard index of every object.
+
+    python examples/score_predicted_video.py [EPISODE]
+
+Both videos are segmented from the same masks of the first frame. The first frame, held, is the
+score to beat.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.data.recording import commands_from, load_recording
+from mtv_world_ros.data_types import Observation
+from mtv_world_ros.files import share_path
+from mtv_world_ros.vision.jaccard import jaccard
+
+parser = argparse.ArgumentParser()
+parser.add_argument(
+    'episode', type=Path, nargs='?', default=share_path('resource', 'demo_episode')
+)
+options = parser.parse_args()
+
+pipeline = load_pipeline('bundled')
+recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
+observation = Observation(
+    cameras=recording.cameras,
+    frames=recording.frames[:, 0],
+    positions=recording.positions[0],
+    stamp_ns=recording.stamp_ns,
+)
+prediction = next(
+    iter(
+        pipeline.imagine(
+            observation, commands_from(recording, 0), instruction=recording.instruction
+        )
+    )
+)
+
+# the recorded frames at the predicted times, segmented as the prediction was
+nearest = np.abs(recording.times[:, None] - prediction.rollout.video.times).argmin(axis=0)
+start = prediction.start_masks.masks[:, :, 0]  # (V, O, H, W)
+names = prediction.masks.names
+real = pipeline.segmenter.segment(
+    recording.frames[:, nearest], names, first_masks=start, first_frames=observation.frames
+)
+imagined_j = jaccard(prediction.masks.masks, real.masks)  # (V, O, T)
+held_j = jaccard(np.broadcast_to(start[:, :, None], real.masks.shape), real.masks)
+
+print('view  object          status    J imagined  J first frame held')
+for row, view in enumerate(pipeline.spec.views):
+    for column, name in enumerate(names):
+        print(
+            f'{view:<5} {name:<15} {real.status[row][column]:<9} '
+            f'{imagined_j[row, column].mean():10.2f} {held_j[row, column].mean():19.2f}'
+        )
