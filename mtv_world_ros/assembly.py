@@ -24,6 +24,8 @@ from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 if TYPE_CHECKING:
+    from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
+    from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
     from mtv_world_ros.vision.describers.config import DescriberConfig
     from mtv_world_ros.vision.describers.vlm import Chat
 
@@ -113,6 +115,8 @@ def load_pipeline(
         CheckpointError, ConfigError, RobotError: see their messages.
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
+    from mtv_world_ros.model.object_motion.predictor import FOLDER as OBJECT_MOTION
+    from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -139,6 +143,7 @@ def load_pipeline(
         segmenter=assemble_segmenter(segmenter, device=device),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
+        object_motion=load_network(checkpoint_path(checkpoint) / OBJECT_MOTION),
     )
 
 
@@ -152,15 +157,16 @@ def assemble(
     segmenter: Segmenter | None = None,
     calibration: Calibration | None = None,
     horizon: HorizonCurve | None = None,
+    object_motion: ObjectMotionNetwork | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says.
 
     Raises:
         CheckpointError: the robot is not the one the model was trained with.
     """
-    segmenter = segmenter or assemble_segmenter()
+    segmenter, model = segmenter or assemble_segmenter(), _robot_of(card, robot)
     return Pipeline(
-        robot=_robot_of(card, robot),
+        robot=model,
         world_model=world_model,
         segmenter=segmenter,
         estimator=SuccessEstimator(
@@ -172,7 +178,18 @@ def assemble(
         object_mask=card['object_mask'],
         objects=objects,
         horizon=horizon,
+        object_motion=_predictor(object_motion, model),
     )
+
+
+def _predictor(
+    network: ObjectMotionNetwork | None, robot: RobotModel
+) -> ObjectMotionPredictor | None:
+    if network is None:
+        return None
+    from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
+
+    return ObjectMotionPredictor(network, robot)
 
 
 def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
 from types import MappingProxyType
@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from mtv_world_ros.data_types import (
+    BoolArray,
     ByteArray,
     CameraModel,
     FloatArray,
@@ -23,7 +24,8 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ObservationError, RolloutPreempted
-from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
@@ -82,6 +84,29 @@ class WorldModel(Protocol):
         ...
 
 
+class TrackedObjects(Protocol):
+    """Objects on their way; what one chunk hands to the next."""
+
+    step_s: float
+
+    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
+        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
+
+        Row 0 is where they are now.
+        """
+        ...
+
+
+class ObjectMotionModel(Protocol):
+    """Says where objects go under commanded joints."""
+
+    def find(
+        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+    ) -> TrackedObjects:
+        """Returns the objects of masks (V, O, H, W), seen by cameras at T_base_camera (4, 4)."""
+        ...
+
+
 def _never() -> bool:
     return False
 
@@ -99,6 +124,8 @@ class Pipeline:
         object_mask: whether trajectory videos carry the object masks.
         objects: names of the objects; empty = the ones the instruction names.
         horizon: how J falls with the horizon, where it was measured.
+        object_motion: where objects go, for models whose trajectory videos show that; None = the
+            trajectory video shows them where they were.
     """
 
     robot: RobotModel
@@ -109,6 +136,7 @@ class Pipeline:
     object_mask: bool = True
     objects: tuple[str, ...] = ()
     horizon: HorizonCurve | None = None
+    object_motion: ObjectMotionModel | None = None
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -144,7 +172,13 @@ class Pipeline:
             num_inference_steps=num_inference_steps,
             limit_tolerance=limit_tolerance,
             should_stop=should_stop,
-            _rollouts=(_RolloutState(observation=start, history=History.begin(start.frames)),),
+            _rollouts=(
+                _RolloutState(
+                    observation=start,
+                    history=History.begin(start.frames),
+                    source=observation,
+                ),
+            ),
         )
 
     def draw(
@@ -153,14 +187,24 @@ class Pipeline:
         positions: FloatArray,
         times: FloatArray,
         start_masks: ObjectMasks,
+        objects: ByteArray | None = None,
     ) -> MultiViewVideo:
-        """Returns the 1 + T frames of the trajectory video, at the cameras' size."""
+        """Returns the 1 + T frames of the trajectory video, at the cameras' size.
+
+        Args:
+            cameras: V cameras.
+            positions: (1 + T, J) [rad or m].
+            times: (1 + T,) [s].
+            start_masks: of the start frame.
+            objects: (V, 1 + T, H, W, 4) of `moved_pictures`, in place of the masks.
+        """
         return render_trajectory_video(
             cameras=cameras,
             robot=self.robot,
             positions=positions,
             times=times,
             object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
+            objects=objects,
             config=self.rendering,
         )
 
@@ -253,7 +297,7 @@ class ImaginedEpisode:
             stamp_ns=state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9),
         )
         state = state.after(frames, end, memory, spec.num_history)
-        self._rollouts = (replace(state, num_imagined=0),)
+        self._rollouts = (replace(state, num_imagined=0, objects=None, source=end),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
 
     def _plan_chunks(self, trajectory: JointTrajectory) -> list[_ChunkPlan]:
@@ -273,6 +317,8 @@ class ImaginedEpisode:
                 stamp_ns=start.stamp_ns,
                 chunk=chunk,
                 num_chunks=num_chunks,
+                trajectory=trajectory,
+                current=start.positions,
             )
             for chunk, first in enumerate(range(0, total, spec.num_frames))
         ]
@@ -285,7 +331,9 @@ class ImaginedEpisode:
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
         start_masks = self._find_start_masks(state)
         clock.lap('start masks')
-        control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks)
+        state, pictures = self._move_objects(state, plan)
+        clock.lap('object motion')
+        control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks, pictures)
         clock.lap('trajectory video')
         frames = pipeline.world_model.predict(
             start.frames,
@@ -329,6 +377,46 @@ class ImaginedEpisode:
             seconds=MappingProxyType(clock.seconds),
         )
         return prediction, state
+
+    def _move_objects(
+        self, state: _RolloutState, plan: _ChunkPlan
+    ) -> tuple[_RolloutState, ByteArray | None]:
+        """Where the plan takes the objects: the state then, and their pictures on the way.
+
+        Pictures are (V, 1 + T, H, W, 4); None where the model is not shown them.
+        """
+        pipeline = self.pipeline
+        if pipeline.object_motion is None or not pipeline.rendering.object_motion:
+            return state, None
+        found = state.objects or self._find_objects(state, pipeline.object_motion)
+        motion, tracked = found.tracked.advance(plan.fine_positions(found.tracked.step_s))
+        rows = np.rint((plan.times - plan.times[0]) / found.tracked.step_s).astype(int)
+        pictures = moved_pictures(
+            found.frames,
+            found.masks,
+            motion[np.minimum(rows, len(motion.points) - 1)],
+            state.observation.cameras,
+            found.poses,
+            self._camera_poses(plan.positions),
+        )
+        return replace(state, objects=replace(found, tracked=tracked)), pictures
+
+    def _find_objects(self, state: _RolloutState, model: ObjectMotionModel) -> _FoundObjects:
+        """The objects in the last real frame; their places are found at its own size."""
+        start, source = state.observation, state.source
+        poses = self._camera_poses(start.positions[None])[:, 0]
+        sharp = self.pipeline.segmenter.segment(source.frames[:, None], self.names)
+        return _FoundObjects(
+            frames=start.frames,
+            masks=self._find_start_masks(state).masks[:, :, 0],
+            poses=poses,
+            tracked=model.find(sharp.masks[:, :, 0], source.cameras, list(poses)),
+        )
+
+    def _camera_poses(self, positions: FloatArray) -> FloatArray:
+        """(V, N, 4, 4) T_base_camera at positions (N, J)."""
+        cameras, robot = self.observation.cameras, self.pipeline.robot
+        return np.stack([camera_poses(camera, robot, positions) for camera in cameras])
 
     def _find_start_masks(self, state: _RolloutState) -> ObjectMasks:
         """Masks of the frame that a chunk starts from (T = 1)."""
@@ -374,12 +462,16 @@ class _RolloutState:
     Attributes:
         observation: its last frame, at the model's size.
         history: the frames before that one.
+        source: the last real observation, at its own size.
+        objects: where the named objects are; None before the first chunk after `source`.
         memory: what the estimate remembers; None before the first chunk.
         num_imagined: frames since the last real one.
     """
 
     observation: Observation
     history: History
+    source: Observation
+    objects: _FoundObjects | None = None
     memory: RolloutMemory | None = None
     num_imagined: int = 0
 
@@ -387,12 +479,30 @@ class _RolloutState:
         self, frames: ByteArray, end: Observation, memory: RolloutMemory, num_history: int
     ) -> _RolloutState:
         """Returns the state at the last of the frames (V, T, H, W, 3), which is also in `end`."""
-        return _RolloutState(
+        return replace(
+            self,
             observation=end,
             history=self.history.after(self.observation.frames, frames, num_history),
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _FoundObjects:
+    """The named objects as the last real frame shows them, and where they are now.
+
+    Attributes:
+        frames: (V, H, W, 3) that frame, at the model's size.
+        masks: (V, O, H, W) in it.
+        poses: (V, 4, 4) T_base_camera then.
+        tracked: where they are now.
+    """
+
+    frames: ByteArray
+    masks: BoolArray
+    poses: FloatArray
+    tracked: TrackedObjects
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -406,6 +516,8 @@ class _ChunkPlan:
         stamp_ns: of the observation that the trajectory started from [ns].
         chunk: its index in the trajectory.
         num_chunks: of the trajectory.
+        trajectory: the whole, in the robot's joint order.
+        current: (J,) where the robot stood when it began.
     """
 
     times: FloatArray
@@ -414,6 +526,14 @@ class _ChunkPlan:
     stamp_ns: int
     chunk: int
     num_chunks: int
+    trajectory: JointTrajectory
+    current: FloatArray
+
+    def fine_positions(self, step_s: float) -> FloatArray:
+        """Returns the joints (N, J) of the whole chunk, `step_s` apart; row 0 its start."""
+        count = round((self.times[-1] - self.times[0]) / step_s)
+        times = self.times[0] + step_s * np.arange(count + 1)
+        return resample(self.trajectory, self.current, times)
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:

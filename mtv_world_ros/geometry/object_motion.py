@@ -29,7 +29,7 @@ class ObjectMotion:
     points: FloatArray
     rotations: FloatArray
 
-    def __getitem__(self, frames: slice) -> ObjectMotion:
+    def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
         return ObjectMotion(
             reference=self.reference,
