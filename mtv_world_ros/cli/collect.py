@@ -51,15 +51,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         '--faults',
-        choices=('train', 'calibrate', 'test'),
-        help='random faulty policies, of the fault kinds of this split, keeping successes and '
-        'failures alike',
+        metavar='KINDS',
+        help='random faulty policies: the fault kinds of a split (train, calibrate, test), or a '
+        'comma-separated list of kinds; keeps successes and failures alike',
     )
     parser.add_argument(
         '--pictures',
         choices=('all', 'first'),
         default='all',
-        help='first: render the first frame only, for training the contact model',
+        help='first: render the first frame only, for train-motion',
     )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
@@ -76,7 +76,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect.collect import collect
     from mtv_world_ros.sim.collect.episode_maker import CollectConfig
     from mtv_world_ros.sim.collect.record import RecordConfig
-    from mtv_world_ros.sim.expert.faults import kinds_of
+    from mtv_world_ros.sim.expert.faults import kinds_named
     from mtv_world_ros.sim.world.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
@@ -92,7 +92,7 @@ def _collect(arguments: argparse.Namespace) -> int:
             randomization=size,
             moved_share=arguments.moved_cameras,
             policies=arguments.policies,
-            kinds=kinds_of(arguments.faults) if arguments.faults else (),
+            kinds=kinds_named(arguments.faults) if arguments.faults else (),
             record=RecordConfig(pictures=arguments.pictures),
         ),
         sheets=arguments.sheets,

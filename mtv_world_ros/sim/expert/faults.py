@@ -93,12 +93,23 @@ FAULTS: Mapping[str, FaultKind] = {
     'along': _kind(
         'lateral', 'calibrate', 0.015, 0.08, 'm', "a grasp is shifted along the fingers' travel"
     ),
+    'wander': _kind(
+        'lateral', 'train', 0.015, 0.08, 'm', 'standard deviation of every way point, in x, y, z'
+    ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
     'lean': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
     # opening
     'loose': _kind(
         'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
+    ),
+    'fumble': _kind(
+        'opening',
+        'train',
+        0.3,
+        1.0,
+        '',
+        'standard deviation of a slow error of how far the grippers open, as a share',
     ),
     'narrow': _kind(
         'opening', 'test', 0.5, 1.0, '', 'share of its opening that lacks before a grasp; 1 = shut'
@@ -173,6 +184,24 @@ FAULTS: Mapping[str, FaultKind] = {
         'it puts the object down this far off and grasps where it was',
     ),
 }
+
+
+def kinds_named(text: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split, or of a comma-separated list.
+
+    Raises:
+        PolicyError: no such split or kind; the text names the nearest known one.
+    """
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    if not names or names[0] in SPLITS:
+        return kinds_of(text.strip())
+    for name in names:
+        if name not in FAULTS:
+            raise PolicyError(
+                f"unknown fault kind '{name}'{nearest(name, FAULTS)}; known are the splits "
+                f'{", ".join(SPLITS)} and the kinds {", ".join(FAULTS)}'
+            )
+    return names
 
 
 def kinds_of(split: str) -> tuple[str, ...]:
@@ -267,7 +296,7 @@ def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVarian
         kinds: to choose from.
         rng: draws.
     """
-    count = int(rng.choice([0, 1, 2], p=[0.15, 0.6, 0.25]))
+    count = int(rng.choice([0, 1, 2], p=[0.12, 0.5, 0.38]))
     chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
     sizes = {}
     for kind in map(str, chosen):

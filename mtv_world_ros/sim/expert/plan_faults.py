@@ -42,6 +42,14 @@ def with_faults(
         error = _slow_noise(times, len(robot.joint_names), variant.size('noise'), rng)
         error[:, grippers] = 0.0
         positions = np.clip(positions + error, robot.lower, robot.upper)
+    if variant.size('fumble'):
+        error = _slow_noise(times, len(robot.joint_names), variant.size('fumble'), rng)
+        travel = np.array([tool.gripper_open - tool.gripper_closed for tool in tools])
+        positions[:, grippers] = np.clip(
+            positions[:, grippers] + error[:, grippers] * travel,
+            robot.lower[grippers],
+            robot.upper[grippers],
+        )
     if variant.size('stop') < 1:
         last = int(variant.size('stop') * (len(positions) - 1))
         positions[last:] = positions[last]

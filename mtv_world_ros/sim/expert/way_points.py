@@ -17,6 +17,8 @@ _PLACE = ('carry', 'lower', 'open', 'retreat')
 _LOWEST_M = 0.004
 #: how far a first grasp is raised before it lets go again [m]
 _TRY_LIFT_M = 0.04
+#: way points of a move at most
+_MOST_STOPS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,7 @@ class WayPointFaults:
         self._variant = variant
         self._move, self._angle = float(rng.uniform()), float(rng.uniform(0, 2 * np.pi))
         self._sign = float(rng.choice((-1.0, 1.0)))
+        self._draws = rng.normal(size=(_MOST_STOPS, 3))
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -77,7 +80,7 @@ class WayPointFaults:
         for kind, size in self._variant.sizes:
             edit = _EDITS.get(kind)
             if edit is not None:
-                stops = edit(stops, size, _Side(yaw, self._sign, self._angle))
+                stops = edit(stops, size, _Side(yaw, self._sign, self._angle, self._draws))
         return stops
 
 
@@ -88,6 +91,7 @@ class _Side:
     yaw: float
     sign: float
     angle: float
+    draws: FloatArray
 
     @property
     def along(self) -> FloatArray:
@@ -240,6 +244,16 @@ def _regrasp(stops: Stops, size: float, side: _Side) -> Stops:
     return [*(replace(stop, phase='above') for stop in begin), *stops]
 
 
+def _wander(stops: Stops, size: float, side: _Side) -> Stops:
+    floor = min(stop.position[2] for stop in stops)
+
+    def moved(stop: WayPoint, way: FloatArray) -> WayPoint:
+        x, y, z = stop.position + size * way
+        return replace(stop, position=np.array([x, y, max(z, floor)]))
+
+    return [*(moved(s, w) for s, w in zip(stops[:-1], side.draws, strict=False)), stops[-1]]
+
+
 _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'high': _high,
     'drop_high': _drop_high,
@@ -258,4 +272,5 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'elsewhere': _elsewhere,
     'retry': _retry,
     'regrasp': _regrasp,
+    'wander': _wander,
 }
