@@ -1,4 +1,4 @@
-"""Simulates one episode with the expert or a faulty variant of it, and writes it as a bag."""
+"""Simulates one episode with the expert or a faulty variant of it; writes and reads its bag."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ import time
 
 import numpy as np
 
+from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.errors import EpisodeError, SimulatorError
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import ScriptedPolicy
-from mtv_world_ros.sim.tasks.tasks import Task
-from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
+from mtv_world_ros.sim.tasks.tasks import Task, task_named
+from mtv_world_ros.sim.world.randomize import draw_scene
+from mtv_world_ros.sim.world.simulator import (
+    CONTROL_PERIOD_S,
+    scene_generator,
+    SimEpisode,
+    SimObservation,
+)
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final
 
 #: stamp of every episode's first frame [ns]; ROS takes zero for "not set"
@@ -227,6 +236,38 @@ def write_take(
             if k % chunk_every == 0 and k < last:
                 commands = chunk(take.commands, k * CONTROL_PERIOD_S, config)
                 writer.write_trajectory(stamp, commands)
+
+
+def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
+    """Returns where the objects of a simulated episode were, at every frame.
+
+    Sizes and goals are not recorded; they are those of the scene that the seed draws.
+
+    Raises:
+        EpisodeError: it holds no poses, or its seed draws a scene of other objects.
+    """
+    info = episode.info
+    if episode.object_poses is None or info.seed is None:
+        raise EpisodeError(
+            f"'{info.path}' has no object poses with a seed; only simulated ones do"
+        )
+    task = task_named(info.task)
+    scene = draw_scene(task, scene_generator(info.seed))
+    names = tuple(item.name for item in scene.objects)
+    if names != info.objects:
+        raise EpisodeError(
+            f"'{info.path}' shows {list(info.objects)}, but its seed draws {list(names)}"
+        )
+    stamps, poses = episode.object_poses
+    rows = np.searchsorted(episode.joint_states.stamps_ns, stamps)
+    roles = [item.role for item in scene.objects]
+    return TruePoses(
+        positions={role: poses[:, i, :3, 3] for i, role in enumerate(roles)},
+        rotations={role: poses[:, i, :3, :3] for i, role in enumerate(roles)},
+        sizes={item.role: item.size for item in scene.objects},
+        openings=robot.gripper_openings(episode.joint_states.positions[rows]),
+        goals=task.goals(scene.goals),
+    )
 
 
 def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:

@@ -19,9 +19,11 @@ from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.sim.collect.collect import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.jobs import episode_seed, jobs_of, misses
+from mtv_world_ros.sim.collect.record import true_poses
 from mtv_world_ros.sim.collect.workers import locked
-from mtv_world_ros.sim.tasks.tasks import tasks_named
+from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
+from mtv_world_ros.success.task import ever_and_final
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))
 #: one of a single move and one of two, whose episodes are longer
@@ -291,3 +293,27 @@ def test_so_many_of_ten_episodes_of_a_task_are_to_miss(tmp_path, num):
 def test_more_than_ten_of_ten_cannot_miss(tmp_path):
     with pytest.raises(SimulatorError, match='--failures-of-ten'):
         jobs_of(tasks_named('shake_bottle'), 1, 0, tmp_path, 11)
+
+
+def test_relations_on_recorded_poses_say_what_was_recorded(data_set, robot):
+    outcomes = set()
+    for name in _names(data_set):
+        episode = read_episode(data_set / name)
+        ever, final = ever_and_final(
+            task_named(episode.info.task).succeeds(true_poses(episode, robot))
+        )
+        assert episode.info.metadata['ever'] == str(ever).lower()
+        assert episode.info.metadata['final'] == str(final).lower()
+        outcomes.add(episode.info.outcome == 'success')
+        assert (ever and final) == (episode.info.outcome == 'success')
+    assert True in outcomes
+
+
+def test_poses_of_an_episode_whose_seed_draws_another_scene_are_refused(data_set, robot):
+    episode = read_episode(data_set / _names(data_set)[0])
+    assert episode.info.seed is not None
+    other = replace(episode, info=replace(episode.info, seed=episode.info.seed + 1))
+    with pytest.raises(EpisodeError, match='but its seed draws'):
+        true_poses(other, robot)
+    with pytest.raises(EpisodeError, match='no object poses'):
+        true_poses(replace(episode, object_poses=None), robot)
