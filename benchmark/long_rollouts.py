@@ -31,12 +31,11 @@ import torch
 
 from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.data_types import ByteArray, History
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 from mtv_world_ros.evaluation.report.summary import Summary
 from mtv_world_ros.files import write_json
-from mtv_world_ros.history import History
 from mtv_world_ros.model.history_tokens import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline

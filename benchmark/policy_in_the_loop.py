@@ -30,8 +30,7 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.model import world_model as model_module
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.ranking.living import live
-from mtv_world_ros.ranking.worlds import SimulatedWorld
+from mtv_world_ros.ranking.worlds import run_policy, SimulatedWorld
 from mtv_world_ros.sim.expert.expert import home_positions
 from mtv_world_ros.sim.world.simulator import SimEpisode
 
@@ -259,10 +258,7 @@ def _simulated_s(pipeline: Pipeline, episodes: Any, options: Any) -> float:
         begun = time.perf_counter()
         world = SimulatedWorld(sim, spec.fps, int(info.seed or 0), info.task)
         chunk_s = spec.num_frames / spec.fps
-        live(
-            policy, world, world.start, world.instruction,
-            chunk_s=chunk_s, max_chunks=options.chunks,
-        )  # fmt: skip
+        run_policy(policy, world, world.instruction, chunk_s=chunk_s, max_chunks=options.chunks)
         spent.append(time.perf_counter() - begun)
     sim.close()
     return float(np.median(spent))

@@ -78,7 +78,7 @@ def chained_errors(checkpoint: str | Path, options: argparse.Namespace) -> np.nd
         )  # fmt: skip
         first = 1
         for chunk in chunks[:_CHUNKS]:
-            frames = chunk.rollout.video.frames
+            frames = chunk.video.frames
             recorded = stretch.frames[:, first : first + frames.shape[1]].astype(np.float32)
             changed = np.abs(recorded - stretch.frames[:, :1]).max(-1) > _CHANGE
             if changed.any():

@@ -172,6 +172,55 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class History:
+    """What of a rollout comes before the frame that its next chunk starts from.
+
+    Attributes:
+        anchor: (V, H, W, 3) uint8 RGB, the first frame of the rollout: the observed one.
+        frames: (V, N, H, W, 3) uint8 RGB, the last frames before the chunk's start frame, oldest
+            first, on the model's clock; none of them at the first chunk.
+    """
+
+    anchor: ByteArray
+    frames: ByteArray
+
+    def __post_init__(self) -> None:
+        views, *image = self.anchor.shape
+        if self.frames.ndim != 5 or (views, *image) != (len(self.frames), *self.frames.shape[2:]):
+            raise ObservationError(
+                f'a history has an anchor of shape {self.anchor.shape} and frames of shape '
+                f'{self.frames.shape}; expected (V, H, W, 3) and (V, N, H, W, 3)'
+            )
+
+    @staticmethod
+    def begin(start_frame: ByteArray) -> History:
+        """Returns that of a rollout which begins at a frame (V, H, W, 3)."""
+        return History(anchor=start_frame, frames=start_frame[:, None][:, :0])
+
+    def after(self, start_frame: ByteArray, predicted: ByteArray, num_kept: int) -> History:
+        """Returns that of the next chunk, which starts from the last predicted frame.
+
+        Args:
+            start_frame: (V, H, W, 3) where the chunk started.
+            predicted: (V, T, H, W, 3) its frames.
+            num_kept: most frames to keep.
+        """
+        frames = np.concatenate([self.frames, start_frame[:, None], predicted[:, :-1]], axis=1)
+        return History(anchor=self.anchor, frames=frames[:, max(frames.shape[1] - num_kept, 0) :])
+
+    def filled(self, num_frames: int) -> ByteArray:
+        """Returns (V, num_frames, H, W, 3) frames; where there are fewer, the oldest is repeated.
+
+        Between its first chunk and the N-th predicted frame a rollout has less than N of them, and
+        a causal autoencoder takes no less. Zeros where there is none at all.
+        """
+        count = self.frames.shape[1]
+        if not count:
+            return np.zeros_like(self.anchor[:, None]).repeat(num_frames, axis=1)
+        return self.frames[:, [max(count - num_frames + k, 0) for k in range(num_frames)]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MultiViewVideo:
     """Observed, trajectory or predicted frames of all views on one clock.
 
@@ -189,28 +238,6 @@ class MultiViewVideo:
         object.__setattr__(self, 'views', tuple(self.views))
         _freeze(self, 'times', (None,), np.float64)
         _freeze(self, 'frames', (len(self.views), len(self.times), None, None, 3), np.uint8)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rollout:
-    """Frames a world model predicted; frame k shows the state after command k.
-
-    Attributes:
-        video: the T predicted frames; `video.times` > 0 counts from the observation.
-        seed: seed of the noise.
-        start_frame: (V, H, W, 3) uint8 RGB, the observed frame it starts from, at model size.
-        positions: (T, J) commanded positions at the predicted times [rad or m].
-    """
-
-    video: MultiViewVideo
-    seed: int
-    start_frame: ByteArray
-    positions: FloatArray
-
-    def __post_init__(self) -> None:
-        num_views, num_frames, height, width, _ = self.video.frames.shape
-        _freeze(self, 'start_frame', (num_views, height, width, 3), np.uint8)
-        _freeze(self, 'positions', (num_frames, None), np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

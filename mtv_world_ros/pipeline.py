@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import ceil
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,30 +14,33 @@ from mtv_world_ros.data_types import (
     ByteArray,
     CameraModel,
     FloatArray,
+    History,
     JointTrajectory,
     MultiViewVideo,
     ObjectMasks,
     Observation,
-    Rollout,
+    SuccessEstimate,
     WorldModelSpec,
 )
-from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.errors import ObservationError, RolloutPreempted
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot import check_positions, RobotModel
-from mtv_world_ros.history import fit_history, History
-from mtv_world_ros.prediction import Prediction, StageClock
+from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
-from mtv_world_ros.success.estimator import SuccessEstimator
+from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.footage import footage_of
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.trusted_horizon import HorizonCurve
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+#: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
+SEED_STEP = 1_000_003
 
 
 class WorldModel(Protocol):
@@ -70,7 +73,7 @@ class WorldModel(Protocol):
             seed: seed of the noise.
             num_inference_steps: denoising steps.
             should_stop: asked between steps.
-            history: what of the rollout comes before the start frame; None = it begins there.
+            history: the frames before the start frame; None = the episode begins there.
 
         Raises:
             RolloutPreempted: `should_stop` said so.
@@ -85,7 +88,7 @@ def _never() -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """Everything between a message and a prediction; holds no state between rollouts.
+    """What imagines and judges; holds no state: `begin` returns the object that does.
 
     Attributes:
         robot: joints, limits and tools.
@@ -96,7 +99,6 @@ class Pipeline:
         object_mask: whether trajectory videos carry the object masks.
         objects: names of the objects; empty = the ones the instruction names.
         horizon: how J falls with the horizon, where it was measured.
-        limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
     robot: RobotModel
@@ -107,139 +109,43 @@ class Pipeline:
     object_mask: bool = True
     objects: tuple[str, ...] = ()
     horizon: HorizonCurve | None = None
-    limit_tolerance: float = 1e-3
 
     @property
     def spec(self) -> WorldModelSpec:
         """Of the world model."""
         return self.world_model.spec
 
-    def accept(self, trajectory: JointTrajectory, current: FloatArray | None) -> JointTrajectory:
-        """Returns the trajectory in the robot's joint order, or says why it is rejected.
-
-        Raises:
-            TrajectoryError: joints missing, positions outside the limits.
-        """
-        matched = match_joints(trajectory, self.robot, current)
-        check_positions(self.robot, matched.positions, tolerance=self.limit_tolerance)
-        return matched
-
-    def imagine(
+    def begin(
         self,
         observation: Observation,
-        trajectory: JointTrajectory,
         *,
         instruction: str = '',
+        objects: tuple[str, ...] = (),
         seed: int = 0,
+        num_seeds: int = 1,
         num_inference_steps: int = 0,
+        limit_tolerance: float = LIMIT_TOLERANCE,
         should_stop: Callable[[], bool] = _never,
-        memory: RolloutMemory | None = None,
-        history: History | None = None,
-    ) -> Iterator[Prediction]:
-        """Yields the predicted chunks, each as soon as it is ready.
+    ) -> ImaginedEpisode:
+        """Returns an episode that begins at an observation (V views, any image size).
 
-        Args:
-            observation: V views in the model's order, any size.
-            trajectory: times count from the observation's stamp.
-            instruction: what the robot was told; names the objects unless they are given.
-            seed: of the noise; chunk k uses `seed + k`.
-            num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
-            should_stop: asked between denoising steps.
-            memory: of the prediction that the observation is the end of, where it is one: the
-                estimate is about the whole, from its first observation on.
-            history: `end_history` of the prediction that the observation is the end of; None = a
-                rollout begins.
+        The other arguments are the attributes of `ImaginedEpisode`.
 
         Raises:
-            TrajectoryError: the trajectory does not fit the robot.
-            ObservationError: the views are not the model's, or the history is of another size.
-            RolloutPreempted: `should_stop` said so.
-            ModelMemoryError: the device ran out of memory.
+            ObservationError: the views are not the model's.
         """
-        spec = self.spec
-        trajectory = self.accept(trajectory, observation.positions)
-        total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
-        num_chunks = ceil(total / spec.num_frames)
-        start = fit_observation(observation, spec)
-        past = (memory, fit_history(history, start))
-        names = self.objects or objects_from_instruction(instruction)
-        times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
-        positions = resample(trajectory, observation.positions, times)
-        num_steps = num_inference_steps or spec.num_inference_steps
-        request = _Request(names, instruction, num_steps, should_stop)
-        for chunk in range(num_chunks):
-            first = chunk * spec.num_frames
-            window = slice(first, first + spec.num_frames + 1)
-            num_kept = min(spec.num_frames, total - first)
-            parts = self._imagine_chunk(
-                start, times[window], positions[window], num_kept, request, seed + chunk, past
-            )
-            prediction = Prediction(
-                **parts,
-                cameras=start.cameras,
-                stamp_ns=observation.stamp_ns,
-                chunk=chunk,
-                num_chunks=num_chunks,
-                horizon=self.horizon,
-                segmenter=self.segmenter.name,
-                num_inference_steps=num_steps,
-            )
-            yield prediction
-            start = prediction.end_observation
-            past = (prediction.memory, prediction.end_history)
-
-    def _imagine_chunk(
-        self,
-        start: Observation,
-        times: FloatArray,
-        positions: FloatArray,
-        num_kept: int,
-        request: _Request,
-        seed: int,
-        past: tuple[RolloutMemory | None, History],
-    ) -> dict[str, Any]:
-        """What is made of one chunk: fields of `Prediction`."""
-        clock, (memory, history) = StageClock(), past
-        start_masks = self.segmenter.segment(start.frames[:, None], request.names)
-        clock.lap('start masks')
-        control = self.draw(start.cameras, positions, times, start_masks)
-        clock.lap('trajectory video')
-        frames = self.world_model.predict(
-            start.frames,
-            control.frames,
-            positions=positions,
+        start = fit_observation(observation, self.spec)
+        return ImaginedEpisode(
+            pipeline=self,
+            instruction=instruction,
+            objects=objects,
             seed=seed,
-            num_inference_steps=request.num_inference_steps,
-            should_stop=request.should_stop,
-            history=history,
-        )[:, :num_kept]
-        clock.lap('model')
-        first = start_masks.masks[:, :, 0]
-        masks = self.segmenter.segment(
-            frames, request.names, first_masks=first, first_frames=start.frames
+            num_seeds=num_seeds,
+            num_inference_steps=num_inference_steps,
+            limit_tolerance=limit_tolerance,
+            should_stop=should_stop,
+            _rollouts=(_RolloutState(observation=start, history=History.begin(start.frames)),),
         )
-        clock.lap('masks')
-        rollout = Rollout(
-            video=MultiViewVideo(views=start.views, times=times[1 : num_kept + 1], frames=frames),
-            seed=seed,
-            start_frame=start.frames,
-            positions=positions[1 : num_kept + 1],
-        )
-        footage = footage_of(
-            self.robot, start.cameras, positions[: num_kept + 1], start_masks, masks
-        )
-        success, memory = self.estimator.estimate(footage, request.instruction, memory)
-        clock.lap('success')
-        return {
-            'rollout': rollout,
-            'trajectory_video': control,
-            'start_masks': start_masks,
-            'masks': masks,
-            'success': success,
-            'memory': memory,
-            'end_history': history.after(start.frames, frames, self.spec.num_history),
-            'seconds': MappingProxyType(clock.seconds),
-        }
 
     def draw(
         self,
@@ -259,13 +165,255 @@ class Pipeline:
         )
 
 
-class _Request(NamedTuple):
-    """What all chunks of a rollout share; see `Pipeline.imagine`."""
+@dataclass(slots=True, kw_only=True)
+class ImaginedEpisode:
+    """An episode in the world model: owns everything that goes from chunk to chunk.
 
-    names: tuple[str, ...]
+    It has `num_seeds` rollouts of the same plans that differ in their noise; the first one is
+    what `observation` and the predictions show, the estimate is the mean of all. The attributes
+    may be changed between two calls of `extend`; they hold from then on.
+
+    Attributes:
+        pipeline: imagines and judges.
+        instruction: what the robot was told; names the objects unless they are given.
+        objects: names of the objects; empty = the pipeline's, else those of the instruction.
+        seed: of the noise; chunk k of rollout r uses `seed + k + r * SEED_STEP`.
+        num_seeds: rollouts; each takes as long as one.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
+        limit_tolerance: joints may exceed their limits by this [rad or m].
+        should_stop: asked between denoising steps and between chunks.
+        num_chunks: imagined so far.
+    """
+
+    pipeline: Pipeline
     instruction: str
+    objects: tuple[str, ...]
+    seed: int
+    num_seeds: int
     num_inference_steps: int
+    limit_tolerance: float
     should_stop: Callable[[], bool]
+    num_chunks: int = field(default=0, init=False)
+    _rollouts: tuple[_RolloutState, ...]
+
+    @property
+    def observation(self) -> Observation:
+        """Where the episode stands now, at the model's size: its last frame, or its first one."""
+        return self._rollouts[0].observation
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return self.objects or self.pipeline.objects or objects_from_instruction(self.instruction)
+
+    def extend(self, trajectory: JointTrajectory) -> Iterator[Prediction]:
+        """Imagines a trajectory from where the episode stands; yields each chunk once it is ready.
+
+        An error leaves the episode at the end of the last chunk that was completed.
+
+        Args:
+            trajectory: times count from the stamp of `observation`.
+
+        Raises:
+            TrajectoryError: the trajectory does not fit the robot.
+            RolloutPreempted: `should_stop` said so.
+            ModelMemoryError: the device ran out of memory.
+        """
+        for plan in self._plan_chunks(trajectory):
+            if plan.chunk and self.should_stop():
+                raise RolloutPreempted('stopped between two chunks')
+            # rollouts of further seeds branch off from the first one
+            states = (self._rollouts + self._rollouts[:1] * self.num_seeds)[: self.num_seeds]
+            seeds = (self.seed + self.num_chunks + SEED_STEP * r for r in range(self.num_seeds))
+            made = [
+                self._imagine_chunk(state, plan, seed)
+                for state, seed in zip(states, seeds, strict=True)
+            ]
+            self._rollouts = tuple(state for _, state in made)
+            self.num_chunks += 1
+            yield mean_of_seeds([prediction for prediction, _ in made])
+
+    def observe(self, frames: ByteArray, positions: FloatArray) -> ObservedChunk:
+        """Takes real frames instead of imagining some; the episode then stands at the last one.
+
+        Args:
+            frames: (V, T, H', W', 3) uint8 RGB after `observation`, at the model's frame rate and
+                any size.
+            positions: (1 + T, J) commanded [rad or m]; row 0 where the robot stood before.
+        """
+        spec, state = self.pipeline.spec, self._rollouts[0]
+        frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
+        start_masks = self._find_start_masks(state)
+        masks = self._follow_masks(state, start_masks, frames)
+        success, memory = self._judge(state, positions, start_masks, masks)
+        end = replace(
+            state.observation,
+            frames=frames[:, -1],
+            positions=positions[-1],
+            stamp_ns=state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9),
+        )
+        state = state.after(frames, end, memory, spec.num_history)
+        self._rollouts = (replace(state, num_imagined=0),)
+        return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
+
+    def _plan_chunks(self, trajectory: JointTrajectory) -> list[_ChunkPlan]:
+        """The trajectory on the model's clock, cut into chunks."""
+        robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
+        trajectory = match_joints(trajectory, robot, start.positions)
+        check_positions(robot, trajectory.positions, tolerance=self.limit_tolerance)
+        total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
+        num_chunks = ceil(total / spec.num_frames)
+        times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
+        positions = resample(trajectory, start.positions, times)
+        return [
+            _ChunkPlan(
+                times=times[first : first + spec.num_frames + 1],
+                positions=positions[first : first + spec.num_frames + 1],
+                num_frames=min(spec.num_frames, total - first),
+                stamp_ns=start.stamp_ns,
+                chunk=chunk,
+                num_chunks=num_chunks,
+            )
+            for chunk, first in enumerate(range(0, total, spec.num_frames))
+        ]
+
+    def _imagine_chunk(
+        self, state: _RolloutState, plan: _ChunkPlan, seed: int
+    ) -> tuple[Prediction, _RolloutState]:
+        """One chunk of one rollout, stage by stage, and where the rollout stands then."""
+        pipeline, start, clock = self.pipeline, state.observation, StageClock()
+        num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
+        start_masks = self._find_start_masks(state)
+        clock.lap('start masks')
+        control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks)
+        clock.lap('trajectory video')
+        frames = pipeline.world_model.predict(
+            start.frames,
+            control.frames,
+            positions=plan.positions,
+            seed=seed,
+            num_inference_steps=num_steps,
+            should_stop=self.should_stop,
+            history=state.history,
+        )[:, : plan.num_frames]
+        clock.lap('model')
+        masks = self._follow_masks(state, start_masks, frames)
+        clock.lap('masks')
+        positions = plan.positions[: plan.num_frames + 1]
+        success, memory = self._judge(state, positions, start_masks, masks)
+        clock.lap('success')
+        times = plan.times[1 : plan.num_frames + 1]
+        end = replace(
+            start,
+            frames=frames[:, -1],
+            positions=positions[-1],
+            stamp_ns=plan.stamp_ns + round(float(times[-1]) * 1e9),
+        )
+        state = state.after(frames, end, memory, pipeline.spec.num_history)
+        prediction = Prediction(
+            start=start,
+            video=MultiViewVideo(views=start.views, times=times, frames=frames),
+            seed=seed,
+            positions=positions[1:],
+            trajectory_video=control,
+            start_masks=start_masks,
+            masks=masks,
+            success=success,
+            stamp_ns=plan.stamp_ns,
+            chunk=plan.chunk,
+            num_chunks=plan.num_chunks,
+            imagined_seconds=state.num_imagined / pipeline.spec.fps,
+            horizon=pipeline.horizon,
+            segmenter=pipeline.segmenter.name,
+            num_inference_steps=num_steps,
+            seconds=MappingProxyType(clock.seconds),
+        )
+        return prediction, state
+
+    def _find_start_masks(self, state: _RolloutState) -> ObjectMasks:
+        """Masks of the frame that a chunk starts from (T = 1)."""
+        return self.pipeline.segmenter.segment(state.observation.frames[:, None], self.names)
+
+    def _follow_masks(
+        self, state: _RolloutState, start_masks: ObjectMasks, frames: ByteArray
+    ) -> ObjectMasks:
+        """Masks of the frames (V, T, H, W, 3) after the start frame."""
+        return self.pipeline.segmenter.segment(
+            frames,
+            self.names,
+            first_masks=start_masks.masks[:, :, 0],
+            first_frames=state.observation.frames,
+        )
+
+    def _judge(
+        self,
+        state: _RolloutState,
+        positions: FloatArray,
+        start_masks: ObjectMasks,
+        masks: ObjectMasks,
+    ) -> Judged:
+        """The estimate after a chunk with joints at (1 + T, J), and what it remembers."""
+        footage = footage_of(
+            self.pipeline.robot, state.observation.cameras, positions, start_masks, masks
+        )
+        return self.pipeline.estimator.estimate(footage, self.instruction, state.memory)
+
+
+class ObservedChunk(NamedTuple):
+    """What was found in real frames: masks of the frame before them (T = 1) and of all of them."""
+
+    start_masks: ObjectMasks
+    masks: ObjectMasks
+    success: SuccessEstimate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _RolloutState:
+    """Where the rollout of one seed stands: what its next chunk goes on from.
+
+    Attributes:
+        observation: its last frame, at the model's size.
+        history: the frames before that one.
+        memory: what the estimate remembers; None before the first chunk.
+        num_imagined: frames since the last real one.
+    """
+
+    observation: Observation
+    history: History
+    memory: RolloutMemory | None = None
+    num_imagined: int = 0
+
+    def after(
+        self, frames: ByteArray, end: Observation, memory: RolloutMemory, num_history: int
+    ) -> _RolloutState:
+        """Returns the state at the last of the frames (V, T, H, W, 3), which is also in `end`."""
+        return _RolloutState(
+            observation=end,
+            history=self.history.after(self.observation.frames, frames, num_history),
+            memory=memory,
+            num_imagined=self.num_imagined + frames.shape[1],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ChunkPlan:
+    """The part of a trajectory that one chunk shows.
+
+    Attributes:
+        times: (1 + T,) of a whole chunk, from the stamp on [s]; row 0 its start.
+        positions: (1 + T, J) then [rad or m].
+        num_frames: frames to keep: the last chunk ends with the trajectory.
+        stamp_ns: of the observation that the trajectory started from [ns].
+        chunk: its index in the trajectory.
+        num_chunks: of the trajectory.
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    num_frames: int
+    stamp_ns: int
+    chunk: int
+    num_chunks: int
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:
@@ -281,9 +429,8 @@ def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observati
         )
     if observation.frames.shape[1:3] == (spec.height, spec.width):
         return observation
-    return Observation(
+    return replace(
+        observation,
         cameras=tuple(scaled(c, spec.width, spec.height) for c in observation.cameras),
         frames=resize_frames(observation.frames, spec.width, spec.height),
-        positions=observation.positions,
-        stamp_ns=observation.stamp_ns,
     )

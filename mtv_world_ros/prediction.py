@@ -1,24 +1,27 @@
-"""One imagined chunk and what was made on the way."""
+"""One imagined chunk and what was made on the way; the mean over several seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import nan
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import isfinite, nan, sqrt
 import time
 from types import MappingProxyType
 
+import numpy as np
+
 from mtv_world_ros.data_types import (
-    CameraModel,
+    FloatArray,
     MultiViewVideo,
     ObjectMasks,
     Observation,
-    Rollout,
     SuccessEstimate,
 )
-from mtv_world_ros.history import History
-from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.trusted_horizon import HorizonCurve
+
+#: 97.5 % quantiles of Student's t for 1 ... 9 degrees of freedom; 2 bounds it from there on
+_T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 class StageClock:
@@ -40,44 +43,40 @@ class Prediction:
     """One imagined chunk and what was made on the way.
 
     Attributes:
-        rollout: the predicted frames; `video.times` [s] counts from the rollout's observation.
+        start: what the chunk starts from, at the model's size.
+        video: the T predicted frames, frame k after command k; its times count from `stamp_ns`.
+        seed: of the noise.
+        positions: (T, J) commanded at these times [rad or m].
         trajectory_video: 1 + T control frames, frame 0 at the chunk's start.
         start_masks: object masks of the chunk's start frame (T = 1).
         masks: object masks of the predicted frames.
         success: the estimate at the end of this chunk.
-        cameras: the V cameras at the model's size.
         stamp_ns: stamp of the rollout's observation [ns].
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
-        memory: what the estimate remembers of the rollout, for what is chained onto this chunk.
-        end_history: what comes before `end_observation`, for chaining the next chunk onto it.
+        imagined_seconds: how far the last frame is from the last real one [s].
         horizon: how J falls with the horizon, where that was measured.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
         seconds: time spent by stage [s].
     """
 
-    rollout: Rollout
+    start: Observation
+    video: MultiViewVideo
+    seed: int
+    positions: FloatArray
     trajectory_video: MultiViewVideo
     start_masks: ObjectMasks
     masks: ObjectMasks
     success: SuccessEstimate
-    cameras: tuple[CameraModel, ...]
     stamp_ns: int
     chunk: int
     num_chunks: int
-    memory: RolloutMemory
-    end_history: History
+    imagined_seconds: float
     horizon: HorizonCurve | None = None
     segmenter: str = ''
     num_inference_steps: int = 0
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def imagined_seconds(self) -> float:
-        """How far the last frame is from the last real one [s], over all that was chained."""
-        times = self.trajectory_video.times
-        return self.memory.num_frames * float(times[1] - times[0])
 
     def trusted_seconds(self, level: float) -> float:
         """Returns up to which time after the last real frame J is expected to be `level` [s].
@@ -88,13 +87,59 @@ class Prediction:
             return nan
         return self.horizon.trusted_seconds(level)
 
-    @property
-    def end_observation(self) -> Observation:
-        """The last predicted frame as an observation, for chaining the next chunk onto it."""
-        video = self.rollout.video
-        return Observation(
-            cameras=self.cameras,
-            frames=video.frames[:, -1],
-            positions=self.rollout.positions[-1],
-            stamp_ns=self.stamp_ns + round(float(video.times[-1]) * 1e9),
+
+def mean_of_seeds(predictions: Sequence[Prediction]) -> Prediction:
+    """Returns the first of a chunk's predictions with the mean estimate and the time of all."""
+    if len(predictions) == 1:
+        return predictions[0]
+    seconds: Counter[str] = Counter()
+    for prediction in predictions:
+        seconds.update(prediction.seconds)
+    return replace(
+        predictions[0],
+        success=mean_estimate([prediction.success for prediction in predictions]),
+        seconds=MappingProxyType(dict(seconds)),
+    )
+
+
+def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
+    """Returns the mean over rollouts that differ in their seeds alone.
+
+    `spread` is their standard deviation; the interval is Student's of the mean: where more
+    rollouts of this world model would put it, not where reality lies. Abstains where most of them
+    do. J and features are those of the first.
+    """
+    first = estimates[0]
+    known = [e.probability for e in estimates if isfinite(e.probability)]
+    num = len(estimates)
+    if num == 1:
+        return first
+    if 2 * len(known) <= num:
+        reasons = next(e.reasons for e in estimates if not isfinite(e.probability))
+        text = f'abstains: {num - len(known)} of {num} seeds do; {reasons[0]}'
+        return replace(
+            first,
+            probability=nan,
+            interval=(nan, nan),
+            reasons=(text, *reasons[1:]),
+            num_seeds=num,
+            spread=nan,
         )
+    mean = float(np.mean(known))
+    spread = float(np.std(known, ddof=1)) if len(known) > 1 else nan
+    degrees = len(known) - 1
+    quantile = _T[degrees - 1] if 0 < degrees <= len(_T) else 2.262
+    half = quantile * spread / sqrt(len(known)) if degrees else 1.0
+    text = (
+        f'mean of {len(known)} of {num} seeds, spread {spread:.2f}; '
+        'the interval is of the mean, given the world model'
+    )
+    interval = (max(mean - half, 0.0), min(mean + half, 1.0))
+    return replace(
+        first,
+        probability=mean,
+        interval=interval,
+        reasons=(text, *first.reasons),
+        num_seeds=num,
+        spread=spread,
+    )

@@ -9,12 +9,16 @@ import pytest
 
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.errors import CheckpointError, ObservationError, TrajectoryError
+from mtv_world_ros.data_types import History, JointTrajectory, Observation, WorldModelSpec
+from mtv_world_ros.errors import (
+    CheckpointError,
+    ObservationError,
+    RolloutPreempted,
+    TrajectoryError,
+)
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.history import History
 from mtv_world_ros.pipeline import Pipeline
 
 SPEC = WorldModelSpec(
@@ -77,14 +81,8 @@ def commands(recording: Recording, seconds: float) -> JointTrajectory:
 
 
 def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
-    return list(
-        pipeline.imagine(
-            observe(recording),
-            commands(recording, seconds),
-            instruction=recording.instruction,
-            **options,
-        )
-    )
+    episode = pipeline.begin(observe(recording), instruction=recording.instruction, **options)
+    return list(episode.extend(commands(recording, seconds)))
 
 
 @pytest.mark.parametrize(
@@ -94,19 +92,25 @@ def test_predicts_just_as_far_as_the_trajectory_goes(
     pipeline: Pipeline, recording: Recording, seconds: float, lengths: list[int]
 ) -> None:
     chunks = imagine(pipeline, recording, seconds)
-    assert [len(chunk.rollout.video.times) for chunk in chunks] == lengths
-    times = np.concatenate([chunk.rollout.video.times for chunk in chunks])
+    assert [len(chunk.video.times) for chunk in chunks] == lengths
+    times = np.concatenate([chunk.video.times for chunk in chunks])
     np.testing.assert_allclose(times, np.arange(1, sum(lengths) + 1) / SPEC.fps)
 
 
 def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(
     pipeline: Pipeline, recording: Recording
 ) -> None:
-    first, second = imagine(pipeline, recording, 3.2)
-    assert np.array_equal(second.rollout.start_frame, first.rollout.video.frames[:, -1])
-    assert np.array_equal(first.end_observation.frames, second.rollout.start_frame)
-    end_ns = recording.stamp_ns + 1_600_000_000
-    assert first.end_observation.stamp_ns == end_ns
+    episode = pipeline.begin(observe(recording))
+    stands_at = []
+    for prediction in episode.extend(commands(recording, 3.2)):
+        assert np.array_equal(episode.observation.frames, prediction.video.frames[:, -1])
+        assert np.array_equal(episode.observation.positions, prediction.positions[-1])
+        stands_at.append((prediction.start, episode.observation))
+    (first, after_first), (second, _) = stands_at
+    assert second is after_first
+    assert np.array_equal(first.frames, recording.frames[:, 0])
+    assert after_first.stamp_ns == recording.stamp_ns + 1_600_000_000
+    assert episode.num_chunks == 2
 
 
 @pytest.mark.parametrize(('asked', 'made_for', 'expected'), [(0, 2, 2), (7, 2, 7), (0, 4, 4)])
@@ -134,7 +138,7 @@ def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anch
     model = CountingWorldModel(replace(SPEC, num_history=num_history))
     chunks = imagine(assemble(CARD, model), recording, 4.8)
     first = recording.frames[:, 0]
-    shown = np.concatenate([first[:, None], *(c.rollout.video.frames for c in chunks)], axis=1)
+    shown = np.concatenate([first[:, None], *(c.video.frames for c in chunks)], axis=1)
     assert len(model.histories) == 3
     for chunk, history in enumerate(model.histories):
         start = 8 * chunk  # the frame that the chunk starts from is no part of its history
@@ -142,38 +146,134 @@ def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anch
         assert np.array_equal(history.anchor, first)
 
 
-def test_a_rollout_that_goes_on_is_the_one_that_never_stopped(recording: Recording) -> None:
-    """Chunks asked for one by one: the clock, the history and the anchor are those of one."""
+def part_of(asked: JointTrajectory, begin_s: float, end_s: float) -> JointTrajectory:
+    mine = (asked.times > begin_s + 1e-6) & (asked.times <= end_s + 1e-6)
+    return JointTrajectory(
+        joint_names=asked.joint_names,
+        times=asked.times[mine] - begin_s,
+        positions=asked.positions[mine],
+    )
+
+
+@pytest.mark.parametrize('num_seeds', [1, 2])
+def test_chained_extends_are_one_long_extend(recording: Recording, num_seeds: int) -> None:
+    """The clock, seeds, history, anchor and memory are those of an episode without stops."""
     model = CountingWorldModel(replace(SPEC, num_history=5))
     pipeline = assemble(CARD, model)
-    whole = imagine(pipeline, recording, 4.8)
-    seen, history, parts = observe(recording), None, []
+    whole = imagine(pipeline, recording, 4.8, seed=3, num_seeds=num_seeds)
     asked = commands(recording, 4.8)
-    for chunk in range(3):
-        mine = (asked.times > 1.6 * chunk + 1e-6) & (asked.times <= 1.6 * (chunk + 1) + 1e-6)
-        trajectory = JointTrajectory(
-            joint_names=asked.joint_names,
-            times=asked.times[mine] - 1.6 * chunk,
-            positions=asked.positions[mine],
-        )
-        (part,) = pipeline.imagine(
-            seen, trajectory, instruction=recording.instruction, history=history
-        )
-        seen, history = part.end_observation, part.end_history
-        parts.append(part)
-    for one, other in zip(parts, whole, strict=True):
-        assert np.array_equal(one.rollout.video.frames, other.rollout.video.frames)
-        assert one.end_observation.stamp_ns == other.end_observation.stamp_ns
-        np.testing.assert_allclose(one.rollout.positions, other.rollout.positions, atol=1e-9)
-    for one, other in zip(model.histories[3:], model.histories[:3], strict=True):
+    episode = pipeline.begin(
+        observe(recording), instruction=recording.instruction, seed=3, num_seeds=num_seeds
+    )
+    for chunk, other in enumerate(whole):
+        (one,) = episode.extend(part_of(asked, 1.6 * chunk, 1.6 * (chunk + 1)))
+        assert np.array_equal(one.video.frames, other.video.frames)
+        assert one.seed == other.seed
+        assert one.start.stamp_ns == other.start.stamp_ns
+        np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
+        assert one.imagined_seconds == other.imagined_seconds
+        assert one.success.probability == pytest.approx(other.success.probability, abs=1e-6)
+        assert one.success.features == pytest.approx(other.success.features, abs=1e-6, nan_ok=True)
+    half = 3 * num_seeds
+    assert model.seeds[half:] == model.seeds[:half]
+    for one, other in zip(model.histories[half:], model.histories[:half], strict=True):
         assert np.array_equal(one.frames, other.frames)
         assert np.array_equal(one.anchor, other.anchor)
 
 
-def test_a_history_of_another_size_is_refused(pipeline: Pipeline, recording: Recording) -> None:
-    other = History.begin(np.zeros((2, 24, 32, 3), np.uint8))
-    with pytest.raises(ObservationError, match=r'\(2, 24, 32, 3\).*\(2, 48, 64, 3\)'):
-        list(pipeline.imagine(observe(recording), commands(recording, 1.6), history=other))
+def test_what_has_changed_holds_from_the_next_extend_on(
+    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
+) -> None:
+    episode = pipeline.begin(observe(recording), instruction='pick the red block')
+    list(episode.extend(commands(recording, 1.6)))
+    episode.instruction, episode.seed = recording.instruction, 40
+    (chunk,) = episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2))
+    assert chunk.masks.names == recording.objects[:2]
+    assert world_model.seeds == [0, 41]
+
+
+class StoppingWorldModel(CountingWorldModel):
+    """Is stopped in its third chunk."""
+
+    def predict(self, *frames, **options):
+        if len(self.seeds) == 2:
+            raise RolloutPreempted('stopped')
+        return super().predict(*frames, **options)
+
+
+@pytest.mark.parametrize('num_seeds', [1, 2])
+def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(
+    recording: Recording, num_seeds: int
+) -> None:
+    model = StoppingWorldModel(SPEC)
+    episode = assemble(CARD, model).begin(observe(recording), num_seeds=num_seeds)
+    done = []
+    with pytest.raises(RolloutPreempted):
+        for prediction in episode.extend(commands(recording, 4.8)):
+            done.append((prediction, episode.observation))
+    last, stands_at = done[-1]
+    assert episode.num_chunks == len(done) == 2 // num_seeds
+    assert episode.observation is stands_at
+    model.seeds.clear()
+    (after,) = episode.extend(commands(recording, 1.6))
+    assert np.array_equal(after.start.frames, last.video.frames[:, -1])
+    assert after.seed == last.seed + 1
+
+
+def test_a_stop_between_chunks_keeps_those_that_are_done(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    done: list[int] = []
+    episode = pipeline.begin(observe(recording), should_stop=lambda: len(done) == 2)
+    with pytest.raises(RolloutPreempted):
+        for prediction in episode.extend(commands(recording, 4.8)):
+            done.append(prediction.chunk)
+    assert done == [0, 1] and episode.num_chunks == 2
+
+
+class NoisyWorldModel(CountingWorldModel):
+    """Draws its frames from the seed alone."""
+
+    def predict(self, start_frame, trajectory_frames, *, seed, **options):
+        held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
+        return np.random.default_rng(seed).integers(0, 256, held.shape, np.uint8)
+
+
+def test_the_same_seed_twice_gives_the_same_frames(recording: Recording) -> None:
+    pipeline = assemble(CARD, NoisyWorldModel(SPEC))
+    first, again, other = (
+        np.concatenate([c.video.frames for c in imagine(pipeline, recording, 3.2, seed=seed)], 1)
+        for seed in (5, 5, 6)
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_real_frames_are_judged_as_imagined_ones_are(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    """Observing what was imagined: masks and estimate are the same, chunk after chunk."""
+    imagined = imagine(pipeline, recording, 3.2)
+    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    for chunk in imagined:
+        positions = np.concatenate([chunk.start.positions[None], chunk.positions])
+        found = episode.observe(chunk.video.frames, positions)
+        assert np.array_equal(found.masks.masks, chunk.masks.masks)
+        assert found.success.reasons == chunk.success.reasons
+        np.testing.assert_equal(dict(found.success.features), dict(chunk.success.features))
+    assert episode.observation.stamp_ns == recording.stamp_ns + 3_200_000_000
+    assert np.array_equal(episode.observation.frames, imagined[-1].video.frames[:, -1])
+
+
+def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
+    model = CountingWorldModel(replace(SPEC, num_history=5))
+    episode = assemble(CARD, model).begin(observe(recording), instruction=recording.instruction)
+    real = recording.frames[:, :9]
+    episode.observe(real[:, 1:], recording.positions[:9])
+    (chunk,) = episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2))
+    assert np.array_equal(chunk.start.frames, real[:, 8])
+    assert np.array_equal(model.histories[0].frames, real[:, 3:8])
+    assert chunk.imagined_seconds == pytest.approx(1.6)  # since the last real frame
 
 
 def test_control_frame_zero_shows_the_observed_state(
@@ -183,7 +283,7 @@ def test_control_frame_zero_shows_the_observed_state(
     (chunk,) = imagine(pipeline, recording, 1.6)
     drawn = pipeline.draw(
         recording.cameras,
-        np.stack([recording.positions[0], chunk.rollout.positions[0]]),
+        np.stack([recording.positions[0], chunk.positions[0]]),
         np.array([0.0, 0.2]),
         chunk.start_masks,
     )
@@ -214,11 +314,9 @@ def test_a_larger_observation_is_brought_to_the_models_size(
     large = load_recording(
         share_path('resource', 'demo_episode'), replace(SPEC, width=384, height=288), robot
     )
-    chunks = list(
-        pipeline.imagine(observe(large), commands(large, 1.6), instruction=large.instruction)
-    )
-    np.testing.assert_allclose(chunks[0].cameras[0].K, recording.cameras[0].K)
-    difference = np.abs(chunks[0].rollout.start_frame.astype(int) - recording.frames[:, 0])
+    (chunk,) = imagine(pipeline, large, 1.6)
+    np.testing.assert_allclose(chunk.start.cameras[0].K, recording.cameras[0].K)
+    difference = np.abs(chunk.start.frames.astype(int) - recording.frames[:, 0])
     assert difference.max() <= 1
 
 
@@ -231,7 +329,7 @@ def test_views_in_another_order_are_refused(pipeline: Pipeline, recording: Recor
         stamp_ns=seen.stamp_ns,
     )
     with pytest.raises(ObservationError, match=r"\['high', 'low'\].*\['low', 'high'\]"):
-        list(pipeline.imagine(turned, commands(recording, 1.6)))
+        pipeline.begin(turned)
 
 
 def test_positions_outside_the_limits_are_refused(
@@ -242,7 +340,7 @@ def test_positions_outside_the_limits_are_refused(
     positions[3, 1] = 9.0
     bad = replace(good, positions=positions)
     with pytest.raises(TrajectoryError, match='left_joint2.* is 9 '):
-        list(pipeline.imagine(observe(recording), bad))
+        list(pipeline.begin(observe(recording)).extend(bad))
 
 
 def test_a_checkpoint_of_another_robot_is_refused(world_model: CountingWorldModel) -> None:

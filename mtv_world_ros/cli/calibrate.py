@@ -97,8 +97,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
-    from mtv_world_ros.ensemble import SEED_STEP
     from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+    from mtv_world_ros.pipeline import SEED_STEP
 
     load = partial(
         load_pipeline,

@@ -19,7 +19,7 @@ from mtv_world_ros.cli.options import (
 from mtv_world_ros.cli.provenance import provenance
 
 if TYPE_CHECKING:
-    from mtv_world_ros.ranking.job import Job
+    from mtv_world_ros.ranking.jobs import Job
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -72,9 +72,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.ranking.page import write_ranking
     from mtv_world_ros.ranking.rank import run_jobs
-    from mtv_world_ros.ranking.report import console
+    from mtv_world_ros.ranking.report import console, write_ranking
     from mtv_world_ros.ranking.runner import RolloutConfig
     from mtv_world_ros.ranking.summary import Summary
 
@@ -112,7 +111,7 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     from mtv_world_ros.assembly import checkpoint_path, robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.card import read_card
-    from mtv_world_ros.ranking.job import (
+    from mtv_world_ros.ranking.jobs import (
         DEFAULT_POLICIES,
         DEFAULT_TASKS,
         make_jobs,

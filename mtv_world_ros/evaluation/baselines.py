@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mtv_world_ros.data_types import ByteArray, FloatArray, WorldModelSpec
-from mtv_world_ros.history import History
+from mtv_world_ros.data_types import ByteArray, FloatArray, History, WorldModelSpec
 
 
 class PersistenceWorldModel:

@@ -14,7 +14,6 @@ from mtv_world_ros.data_types import (
     Observation,
     WorldModelSpec,
 )
-from mtv_world_ros.ensemble import imagine_seeds
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
@@ -130,19 +129,16 @@ def imagine_stretch(
         positions=recording.positions[stretch.start],
         stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
     )
-    return list(
-        imagine_seeds(
-            pipeline,
-            observation,
-            trajectory,
-            num_seeds=num_seeds,
-            instruction=recording.instruction,
-            seed=seed,
-            num_inference_steps=num_inference_steps,
-        )
+    episode = pipeline.begin(
+        observation,
+        instruction=recording.instruction,
+        seed=seed,
+        num_seeds=num_seeds,
+        num_inference_steps=num_inference_steps,
     )
+    return list(episode.extend(trajectory))
 
 
 def predicted_frames(chunks: list[Prediction]) -> ByteArray:
     """Returns the (V, T, H, W, 3) frames of a rollout's chunks in a row."""
-    return np.concatenate([chunk.rollout.video.frames for chunk in chunks], axis=1)
+    return np.concatenate([chunk.video.frames for chunk in chunks], axis=1)

@@ -58,7 +58,7 @@ class Comparison:
 
 def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:
     """Returns a rollout's chunks beside (V, T, H, W, 3) recorded frames at the same times."""
-    videos = [chunk.rollout.video for chunk in chunks]
+    videos = [chunk.video for chunk in chunks]
     return Comparison(
         views=videos[0].views,
         times=np.concatenate([video.times for video in videos]),

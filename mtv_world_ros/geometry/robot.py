@@ -12,6 +12,9 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import nearest, RobotError, TrajectoryError
 from mtv_world_ros.geometry.transforms import inverse, is_rigid
 
+#: how far outside the limits a position is still accepted: recorded states overshoot [rad or m]
+LIMIT_TOLERANCE = 1e-3
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tool:
@@ -265,13 +268,15 @@ def _link_frames(model: pin.Model) -> dict[str, int]:
     return {frame.name: i for i, frame in enumerate(model.frames) if frame.type == kind}
 
 
-def check_positions(robot: RobotModel, positions: FloatArray, *, tolerance: float = 1e-3) -> None:
+def check_positions(
+    robot: RobotModel, positions: FloatArray, *, tolerance: float = LIMIT_TOLERANCE
+) -> None:
     """Checks positions (T, J) against the joint limits.
 
     Args:
         robot: the robot.
         positions: (T, J) in its joint order [rad or m].
-        tolerance: how far outside is still accepted, since recorded states overshoot [rad or m].
+        tolerance: how far outside is still accepted [rad or m].
 
     Raises:
         TrajectoryError: names the first joint outside or not finite, its value and the limits.

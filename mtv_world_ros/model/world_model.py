@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from mtv_world_ros.data_types import ByteArray, FloatArray
+from mtv_world_ros.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
-from mtv_world_ros.history import History
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import check_same_model, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint

@@ -1,16 +1,60 @@
-"""What one policy reached in one episode: really, and as imagined."""
+"""The jobs of a ranking: one policy on one episode each, and what it reached there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite, nan
 from typing import Any
 
 from mtv_world_ros.data_types import SuccessEstimate
+from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
+from mtv_world_ros.sim.collect.jobs import episode_seed
+from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.expert.faults import EXPERT, parse_variant
+from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.tasks.tasks import tasks_named
 
+#: from the expert to one that never finishes; in between, faults of several kinds and sizes
+DEFAULT_POLICIES = (
+    'expert',
+    'expert-noise-0.03',
+    'expert-noise-0.06',
+    'expert-shift-0.01',
+    'expert-shift-0.03',
+    'expert-place-0.04',
+    'expert-late-0.6',
+    'expert-miss-0.5',
+    'expert-wrong-0.5',
+    'expert-stop-0.5',
+)
+DEFAULT_TASKS = ('place_block_a2b_left', 'place_bread_plate', 'stack_blocks_two')
+#: scenes drawn until the expert reaches everything in one
+_MAX_ATTEMPTS = 25
 #: probability from which an estimate counts as a success
 THRESHOLD = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One policy on one episode, in the simulator and in imagination.
+
+    Attributes:
+        policy: its name.
+        task: name of the task.
+        index: of the episode within the task.
+        seed: of the scene, of the policy and of the imagination's noise.
+    """
+
+    policy: str
+    task: str
+    index: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its result."""
+        return f'{self.task}_{self.index:05d}_{self.policy}'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,3 +149,60 @@ class Result:
         """Reads what `as_json` returned, NaN as null."""
         judged = {key: Judged.from_json(values[key]) for key in ('imagined', 'seen')}
         return cls(**{**values, **judged})
+
+
+def policies_named(text: str) -> tuple[str, ...]:
+    """Returns the policies of a comma-separated list, as they are called.
+
+    Raises:
+        ConfigError: none, or one twice.
+        PolicyError: no such policy.
+    """
+    names = [parse_variant(name).name for name in text.split(',') if name.strip()]
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled or not names:
+        what = f"'{doubled[0]}' is listed twice" if doubled else 'no policy is listed'
+        raise ConfigError(f'{what} in --policies; give each once, e.g. {DEFAULT_POLICIES[:2]}')
+    return tuple(names)
+
+
+def make_jobs(
+    policies: Sequence[str], tasks: Sequence[str], num_episodes: int, seed: int, expert: Expert
+) -> list[Job]:
+    """Returns the jobs; all policies meet the same episodes.
+
+    Episodes take turns, so that what is done so far is always balanced.
+
+    Raises:
+        ConfigError: less than one episode, no task, or a task twice.
+        SimulatorError: unknown task, or none of its scenes is in the expert's reach.
+    """
+    if num_episodes < 1:
+        raise ConfigError(f'--episodes is {num_episodes}; it must be at least 1')
+    names = [task.name for task in tasks_named(','.join(tasks))]
+    if len(set(names)) != len(names) or not names:
+        raise ConfigError(f"--tasks is '{','.join(tasks)}'; give at least one task, each once")
+    return [
+        Job(policy=policy, task=task, index=index, seed=episode)
+        for index in range(num_episodes)
+        for task in names
+        for episode in [_seed(task, index, seed, expert)]
+        for policy in policies
+    ]
+
+
+def _seed(task: str, index: int, seed: int, expert: Expert) -> int:
+    """The first seed whose scene exists and is in the expert's reach."""
+    reason = ''
+    for attempt in range(_MAX_ATTEMPTS):
+        found = episode_seed(seed, task, index, attempt)
+        try:
+            scripted_policy(EXPERT, task, found, expert).reset(seed=found)
+        except (SimulatorError, PolicyError) as error:
+            reason = str(error)
+        else:
+            return found
+    raise SimulatorError(
+        f"task '{task}', episode {index}: no scene in the expert's reach in {_MAX_ATTEMPTS} "
+        f'draws ({reason}); choose another --seed'
+    )

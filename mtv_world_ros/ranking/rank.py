@@ -15,8 +15,7 @@ from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.ranking.job import Job
-from mtv_world_ros.ranking.jobs import Result
+from mtv_world_ros.ranking.jobs import Job, Result
 from mtv_world_ros.ranking.runner import make_runner, RolloutConfig
 
 FOLDER = 'rollouts'
@@ -42,7 +41,7 @@ def run_jobs(
         jobs: what to run.
         make_pipeline: called once in every process; has to be picklable for more than one.
         out: results go into its folder `rollouts`.
-        config: how episodes are lived.
+        config: how episodes are run.
         settings: what the results depend on besides, e.g. which checkpoint.
         workers: processes; with Ray, at most so many at once.
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.

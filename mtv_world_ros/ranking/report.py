@@ -1,16 +1,23 @@
-"""A ranking in tables and sentences, for Markdown and HTML alike."""
+"""The report of a ranking: tables and remarks, as Markdown, as HTML and on the console."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
+from pathlib import Path
 from typing import NamedTuple
 
+from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
+from mtv_world_ros.evaluation.report.html import document
+from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
 from mtv_world_ros.evaluation.report.tables import grid
+from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.ranking.jobs import THRESHOLD
 from mtv_world_ros.ranking.summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
 
 TITLE = 'Policy ranking'
+#: hues of the report's style sheet
+_NUM_HUES = 6
 _MEANING = (
     'Success in the simulator is its predicate on object poses, held at the end. Success in '
     'imagination is an estimate of at least {threshold} at the end of the imagined episode, '
@@ -233,3 +240,73 @@ def markdown(summary: Summary) -> str:
         parts += [f'## {found.caption}', grid(found.head, found.rows)]
     lines = [f'- {heading}: `{value}`' for heading, value in summary.provenance.items()]
     return '\n\n'.join([*parts, '## How this was made', '\n'.join(lines)]) + '\n'
+
+
+def write_ranking(summary: Summary, out: Path) -> Path:
+    """Writes `ranking.json`, `ranking.md` and `ranking.html`; returns the last one's path."""
+    write_json(out / 'ranking.json', summary.as_json())
+    write_whole(out / 'ranking.md', markdown(summary))
+    path = out / 'ranking.html'
+    write_whole(path, document(TITLE, join([element('h1', TITLE), *_sections(summary)])))
+    return path
+
+
+def _sections(summary: Summary) -> list[Markup]:
+    charts = [
+        _figure(summary, judge, task)
+        for task in (None, *summary.tasks)
+        for judge in JUDGES
+        if any(summary.judged_rate(p, task, judge).count for p in summary.policies)
+    ]
+    made = [[heading, value] for heading, value in summary.provenance.items()]
+    return [
+        element('section', *(element('p', remark) for remark in remarks(summary))),
+        element(
+            'section',
+            element('h2', 'Imagined against true success'),
+            _key(summary),
+            element('div', *charts, class_='panels'),
+        ),
+        *(
+            element('section', element('h2', found.caption), table(found.head, found.rows))
+            for found in grids(summary)
+        ),
+        element(
+            'section',
+            element('h2', 'How this was made'),
+            table(['', ''], made, num_labels=2) if made else None,
+        ),
+    ]
+
+
+def _figure(summary: Summary, judge: str, task: str | None) -> Markup:
+    points = []
+    for number, policy in enumerate(summary.policies, 1):
+        true = summary.true_rate(policy, task)
+        judged = summary.judged_rate(policy, task, judge)
+        points.append(
+            Point(
+                label=str(number),
+                title=policy,
+                x=true.value,
+                y=judged.value,
+                x_interval=true.interval,
+                y_interval=judged.interval,
+                style=f'c{(number - 1) % _NUM_HUES}',
+            )
+        )
+    title = f'{task or ALL_TASKS}: {JUDGES[judge]}'
+    chart = scatter_chart(title, points, 'success rate in the simulator', 'judged success rate')
+    return element('figure', element('h3', title), chart)
+
+
+def _key(summary: Summary) -> Markup:
+    items = [
+        element(
+            'li',
+            element('span', str(number), class_=f'badge c{(number - 1) % _NUM_HUES}'),
+            policy,
+        )
+        for number, policy in enumerate(summary.policies, 1)
+    ]
+    return element('ul', *items, class_='key')

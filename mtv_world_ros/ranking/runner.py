@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import time
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
-from mtv_world_ros.ranking.imagined import ImaginedWorld, judge
-from mtv_world_ros.ranking.job import Job
-from mtv_world_ros.ranking.jobs import Judged, Result
-from mtv_world_ros.ranking.living import Life, live, World
-from mtv_world_ros.ranking.worlds import SimulatedWorld
+from mtv_world_ros.ranking.jobs import Job, Judged, Result
+from mtv_world_ros.ranking.worlds import (
+    ImaginedWorld,
+    judge,
+    PolicyRun,
+    run_policy,
+    SimulatedWorld,
+    World,
+)
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.world.simulator import SimEpisode
@@ -24,7 +28,7 @@ MakePolicy = Callable[[str, str, int, Expert], Policy]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutConfig:
-    """How episodes are lived.
+    """How episodes are run.
 
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
@@ -47,7 +51,7 @@ class RolloutRunner:
 
     Args:
         pipeline: imagines and judges; its robot is the simulator's.
-        config: how episodes are lived.
+        config: how episodes are run.
         make_policy: makes a policy for an episode.
     """
 
@@ -67,12 +71,15 @@ class RolloutRunner:
         """
         policy = self._make_policy(job.policy, job.task, job.seed, self._expert)
         world = SimulatedWorld(self._sim, self.pipeline.spec.fps, job.seed, job.task)
-        real = self._live(policy, world, world, job)
+        real = self._run(policy, world, world.instruction, job)
         ever, final = world.outcome()
         begun = time.perf_counter()
-        seen = judge(self.pipeline, world.chunks, world.instruction)
+        seen = judge(self._begin(world, job), world.chunks)
         judging_s = time.perf_counter() - begun
-        imagined, life, imagining_s = self._imagine(policy, world, job)
+        begun = time.perf_counter()
+        imagined = ImaginedWorld(self._begin(world, job))
+        run = self._run(policy, imagined, world.instruction, job)
+        imagining_s = time.perf_counter() - begun
         return Result(
             policy=job.policy,
             task=job.task,
@@ -80,11 +87,11 @@ class RolloutRunner:
             seed=job.seed,
             ever=ever,
             final=final,
-            imagined=imagined,
+            imagined=Judged.of(imagined.success),
             seen=Judged.of(seen),
             num_chunks=real.num_chunks,
-            num_imagined=life.num_chunks,
-            is_over=real.is_over and life.is_over,
+            num_imagined=run.num_chunks,
+            is_over=real.is_over and run.is_over,
             seconds={
                 'policy': real.policy_s,
                 'physics': world.physics_s,
@@ -94,28 +101,21 @@ class RolloutRunner:
             },
         )
 
-    def _imagine(
-        self, policy: Policy, simulated: SimulatedWorld, job: Job
-    ) -> tuple[Judged, Life, float]:
-        """From the simulator's first observation on; the estimate, and the time it took [s]."""
-        world = ImaginedWorld(
-            self.pipeline,
-            simulated.instruction,
+    def _begin(self, simulated: SimulatedWorld, job: Job) -> ImaginedEpisode:
+        """An episode that begins with the simulator's first observation."""
+        return self.pipeline.begin(
+            simulated.start,
+            instruction=simulated.instruction,
             seed=job.seed,
             num_inference_steps=self.config.num_inference_steps,
         )
-        begun = time.perf_counter()
-        life = self._live(policy, world, simulated, job)
-        seconds = time.perf_counter() - begun
-        return Judged.of(world.success), life, seconds
 
-    def _live(self, policy: Policy, world: World, simulated: SimulatedWorld, job: Job) -> Life:
+    def _run(self, policy: Policy, world: World, instruction: str, job: Job) -> PolicyRun:
         policy.reset(seed=job.seed)
-        return live(
+        return run_policy(
             policy,
             world,
-            simulated.start,
-            simulated.instruction,
+            instruction,
             chunk_s=self.pipeline.spec.chunk_seconds,
             max_chunks=self.config.max_chunks,
         )

@@ -1,15 +1,26 @@
-"""The simulator as a world that policies live in: physics, rendered frames, true success."""
+"""Two worlds in which a policy's commands are executed: the simulator, and imagination."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 import time
+from typing import Protocol
 
 import numpy as np
 
-from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
+from mtv_world_ros.data_types import (
+    ByteArray,
+    FloatArray,
+    JointTrajectory,
+    Observation,
+    SuccessEstimate,
+)
 from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.pipeline import ImaginedEpisode
+from mtv_world_ros.policies.execution import first_part
+from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.sim.collect.record import START_NS
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final
@@ -18,17 +29,103 @@ from mtv_world_ros.success.task import ever_and_final
 _LOOK_S = 0.1
 
 
+class World(Protocol):
+    """Where a policy's commands are executed."""
+
+    @property
+    def observation(self) -> Observation:
+        """What is seen now."""
+        ...
+
+    def execute(self, answer: JointTrajectory) -> None:
+        """Executes an answer to the present observation, no longer than a chunk."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicyRun:
+    """How an episode went.
+
+    Attributes:
+        num_chunks: answers that were executed.
+        is_over: the policy ended it, not the limit.
+        policy_s: time that the policy took [s].
+    """
+
+    num_chunks: int
+    is_over: bool
+    policy_s: float
+
+
+def run_policy(
+    policy: Policy, world: World, instruction: str, *, chunk_s: float, max_chunks: int
+) -> PolicyRun:
+    """Runs a policy that was reset until it ends the episode, or up to a limit of answers.
+
+    Args:
+        policy: decides.
+        world: where its answers are executed.
+        instruction: what the robot is told.
+        chunk_s: the policy is asked again after this time, or where its answer ends [s].
+        max_chunks: answers at most.
+
+    Raises:
+        PolicyError: the policy cannot answer.
+        TrajectoryError: its answer does not fit the robot.
+    """
+    policy_s = 0.0
+    for number in range(max_chunks):
+        begun = time.perf_counter()
+        answer = policy.act(world.observation, instruction)
+        policy_s += time.perf_counter() - begun
+        if answer is None:
+            return PolicyRun(num_chunks=number, is_over=True, policy_s=policy_s)
+        world.execute(first_part(answer, world.observation.positions, chunk_s))
+    return PolicyRun(num_chunks=max_chunks, is_over=False, policy_s=policy_s)
+
+
+class ImaginedWorld:
+    """Predicted frames, commanded joints, estimates.
+
+    Attributes:
+        success: the estimate at the end; None before the first answer.
+
+    Args:
+        episode: that answers are imagined in.
+    """
+
+    def __init__(self, episode: ImaginedEpisode) -> None:
+        self._episode = episode
+        self.success: SuccessEstimate | None = None
+
+    @property
+    def observation(self) -> Observation:
+        """The last predicted frame."""
+        return self._episode.observation
+
+    def execute(self, answer: JointTrajectory) -> None:
+        """Imagines an answer."""
+        for prediction in self._episode.extend(answer):
+            self.success = prediction.success
+
+
+def judge(episode: ImaginedEpisode, chunks: Sequence[SeenChunk]) -> SuccessEstimate | None:
+    """Returns the estimate of an episode that is seen, not imagined; None without a chunk."""
+    success = None
+    for chunk in chunks:
+        success = episode.observe(chunk.frames, chunk.positions).success
+    return success
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenChunk:
     """What was seen while an answer was executed.
 
     Attributes:
-        start: before it.
         frames: (V, T, H, W, 3) uint8 RGB at the model's rate.
         positions: (1 + T, J) commanded, row 0 where the robot stood [rad or m].
     """
 
-    start: Observation
     frames: ByteArray
     positions: FloatArray
 
@@ -38,6 +135,7 @@ class SimulatedWorld:
 
     Attributes:
         start: first observation.
+        observation: what is seen now.
         chunks: what was seen, one an answer.
         physics_s: time that the physics took [s].
         rendering_s: time that pictures took, and building the scene [s].
@@ -52,7 +150,7 @@ class SimulatedWorld:
     def __init__(self, sim: SimEpisode, fps: float, seed: int, task: str) -> None:
         begun = time.perf_counter()
         self._sim, self._fps = sim, fps
-        self.start = self._observation(sim.reset(seed, task))
+        self.start = self.observation = self._observation(sim.reset(seed, task))
         self.rendering_s, self.physics_s = time.perf_counter() - begun, 0.0
         self.chunks: list[SeenChunk] = []
         self._target = np.array(sim.home)
@@ -62,9 +160,10 @@ class SimulatedWorld:
         """What the robot is told."""
         return self._sim.instruction
 
-    def execute(self, observation: Observation, answer: JointTrajectory) -> Observation:
-        """Returns what is seen once the answer is executed; the arms hold up to a whole frame."""
-        matched = match_joints(answer, self._sim.robot, observation.positions)
+    def execute(self, answer: JointTrajectory) -> None:
+        """Executes an answer; the arms hold up to a whole frame."""
+        before = self.observation
+        matched = match_joints(answer, self._sim.robot, before.positions)
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
         times = np.linspace(CONTROL_PERIOD_S, num * CONTROL_PERIOD_S, num)
@@ -75,13 +174,12 @@ class SimulatedWorld:
         shown = [self._observation(found) for found in seen if found is not None]
         self.chunks.append(
             SeenChunk(
-                start=observation,
                 frames=np.stack([found.frames for found in shown], axis=1),
-                positions=np.concatenate([observation.positions[None], commands[rows]]),
+                positions=np.concatenate([before.positions[None], commands[rows]]),
             )
         )
         self._target = commands[-1]
-        return shown[-1]
+        self.observation = shown[-1]
 
     def outcome(self) -> tuple[bool, bool]:
         """Returns whether the task's predicate ever held, and held at the end."""

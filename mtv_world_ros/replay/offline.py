@@ -127,14 +127,13 @@ def replay_offline(
             try:
                 observation = observe(episode, pipeline, stamp, limits or ReplayLimits())
                 shifted = _shifted(trajectory, stamp, observation.stamp_ns)
-                chunks = pipeline.imagine(
+                imagined = pipeline.begin(
                     observation,
-                    shifted,
                     instruction=instruction_at(episode, stamp),
                     seed=seed + 1000 * index,
                     num_inference_steps=num_inference_steps,
                 )
-                _write_rollout(writer, chunks, summary, until, spec.fps)
+                _write_rollout(writer, imagined.extend(shifted), summary, until, spec.fps)
             except MtvWorldError as error:
                 summary.rejected.append((stamp, str(error)))
                 writer.write_report(stamp, ERROR, f'rejected: {error}', {})
@@ -162,7 +161,7 @@ def _write_rollout(
         summary.num_frames += count
         summary.video_s += count / fps
         last = chunk
-        end_ns = chunk.stamp_ns + round(float(chunk.rollout.video.times[-1]) * 1e9)
+        end_ns = chunk.stamp_ns + round(float(chunk.video.times[-1]) * 1e9)
         writer.write_report(end_ns, OK, 'imagined', _chunk_values(chunk))
         if until is not None and end_ns >= until:
             break
@@ -175,7 +174,7 @@ def _chunk_values(chunk: Prediction) -> dict[str, object]:
     return {
         'chunk': chunk.chunk,
         'num_chunks': chunk.num_chunks,
-        'chunk_seed': chunk.rollout.seed,
+        'chunk_seed': chunk.seed,
         'observation_stamp_ns': chunk.stamp_ns,
         'success': chunk.success.probability,
         'success_low': chunk.success.interval[0],

@@ -49,7 +49,7 @@ class PredictionWriter(BagWriter):
 
         The estimate is recorded at the chunk's last frame, if that is among them.
         """
-        times = prediction.rollout.video.times
+        times = prediction.video.times
         stamps = [prediction.stamp_ns + round(float(time) * 1e9) for time in times]
         kept = [
             index for index, stamp in enumerate(stamps) if until_ns is None or stamp <= until_ns
@@ -81,15 +81,14 @@ class PredictionWriter(BagWriter):
         self._write(f'{NODE}/report', DIAGNOSTICS, stamp_ns, report)
 
     def _write_frame(self, prediction: Prediction, index: int, stamp_ns: int) -> None:
-        rollout = prediction.rollout
-        for number, camera in enumerate(prediction.cameras):
+        for number, camera in enumerate(prediction.start.cameras):
             base = f'{NODE}/{camera.view}'
-            frame = rollout.video.frames[number, index]
+            frame = prediction.video.frames[number, index]
             control = prediction.trajectory_video.frames[number, index + 1]
             self._write_jpeg(f'{base}/predicted', camera, stamp_ns, frame)
             self._write_jpeg(f'{base}/trajectory', camera, stamp_ns, control)
             self._write_labels(f'{base}/mask', camera, stamp_ns, prediction.masks, number, index)
-        state = messages.make_joint_state(stamp_ns, self._joint_names, rollout.positions[index])
+        state = messages.make_joint_state(stamp_ns, self._joint_names, prediction.positions[index])
         self._write(f'{NODE}/predicted/joint_states', messages.JOINT_STATE, stamp_ns, state)
 
     def _write_jpeg(self, base: str, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
@@ -134,7 +133,7 @@ class PredictionWriter(BagWriter):
         value = messages.make(FLOAT64, data=float(success.probability))
         self._write(f'{NODE}/success', FLOAT64, stamp_ns, value)
         labels = (
-            f'view: {", ".join(prediction.rollout.video.views)}',
+            f'view: {", ".join(prediction.video.views)}',
             f'object: {", ".join(prediction.masks.names)}',
         )
         self._write(f'{NODE}/jaccard', ARRAY, stamp_ns, _array(success.jaccard, labels))

@@ -57,7 +57,6 @@ class RolloutMemory:
         seen_masks: (V, O, H, W) last masks in which an object was not hidden.
         seen_points: (O, 3) where it was then [m].
         largest: (V, O) largest area of each mask so far [px].
-        num_frames: imagined since the first frame of all, whatever the objects were.
         grasps: in order.
         levels: (A,) opening since which a gripper's closing or opening counts.
         closed: (A,) whether a gripper has closed since it last opened.
@@ -70,7 +69,6 @@ class RolloutMemory:
     seen_masks: BoolArray
     seen_points: FloatArray
     largest: FloatArray
-    num_frames: int = 0
     grasps: tuple[Grasp, ...] = ()
     levels: FloatArray | None = None
     closed: BoolArray | None = None
@@ -93,8 +91,7 @@ def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
         footage: the chunk.
     """
     if memory is None or memory.names != footage.masks.names:
-        before = 0 if memory is None else memory.num_frames
-        memory = replace(_begin(footage), num_frames=before)
+        memory = _begin(footage)
     for frame in range(1, footage.num_frames + 1):
         memory = _followed(memory, footage, frame)
     return memory
@@ -138,7 +135,6 @@ def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMem
         trail, leans = np.delete(trail, 1, axis=1), np.delete(leans, 1, axis=2)
     return replace(
         memory,
-        num_frames=memory.num_frames + 1,
         points=trail,
         leans=leans,
         largest=largest,

@@ -21,8 +21,7 @@ import numpy as np
 import torch
 
 from mtv_world_ros.data.recording import chunk_of
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.history import History
+from mtv_world_ros.data_types import ByteArray, History
 from mtv_world_ros.model.actions import collate
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import Scheduler

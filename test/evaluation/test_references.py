@@ -17,7 +17,7 @@ def executed(recordings, make_pipeline):
         chunks = imagine_stretch(
             pipeline, recording, stretch, actions=actions, seed=0, num_inference_steps=1
         )
-        return chunks[0].rollout.positions
+        return chunks[0].positions
 
     return imagine, recording.positions[stretch.start], pipeline.robot
 

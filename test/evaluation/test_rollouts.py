@@ -40,7 +40,7 @@ def test_rollout_has_as_many_frames_as_the_stretch(recordings, make_pipeline, or
     assert len(chunks) == 3
     frames = predicted_frames(chunks)
     assert (frames == stretch.frames[:, 1:]).all()
-    assert [chunk.rollout.seed for chunk in chunks] == [3, 4, 5]
+    assert [chunk.seed for chunk in chunks] == [3, 4, 5]
     assert chunks[0].stamp_ns == recording.stamp_ns
 
 
@@ -53,5 +53,5 @@ def test_actions_of_another_episode_are_executed_from_the_same_start(recordings,
         )[0]
         for source in (recordings[0], recordings[2])
     )
-    assert not np.allclose(own.rollout.positions, other.rollout.positions)
-    assert (own.rollout.start_frame == other.rollout.start_frame).all()
+    assert not np.allclose(own.positions, other.positions)
+    assert (own.start.frames == other.start.frames).all()

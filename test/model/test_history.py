@@ -12,8 +12,8 @@ from small_transformer import build, inputs, PATCH, SMALL
 import torch
 from torch import Tensor
 
+from mtv_world_ros.data_types import History
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.history import History
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.history_tokens import history_settings

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.ranking.job import make_jobs
+from mtv_world_ros.ranking.jobs import make_jobs
 from mtv_world_ros.ranking.rank import run_jobs
 from mtv_world_ros.ranking.runner import RolloutConfig
 

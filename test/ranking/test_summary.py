@@ -6,8 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from mtv_world_ros.ranking.jobs import Result
-from mtv_world_ros.ranking.page import write_ranking
-from mtv_world_ros.ranking.report import markdown, remarks
+from mtv_world_ros.ranking.report import markdown, remarks, write_ranking
 from mtv_world_ros.ranking.summary import Summary
 
 #: (policy, true outcomes, imagined probabilities) of four episodes

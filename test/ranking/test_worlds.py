@@ -4,7 +4,7 @@ import pytest
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.policies.execution import first_part
-from mtv_world_ros.ranking.living import live
+from mtv_world_ros.ranking.worlds import run_policy
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -37,28 +37,29 @@ class _Policy:
 class _World:
     def __init__(self):
         self.executed = []
+        self.observation = _observation()
 
-    def execute(self, observation, answer):
+    def execute(self, answer):
         self.executed.append(float(answer.times[-1]))
-        return _observation(observation.stamp_ns + round(answer.times[-1] * 1e9))
+        self.observation = _observation(self.observation.stamp_ns + round(answer.times[-1] * 1e9))
 
 
-def _live(policy, world, max_chunks):
-    return live(policy, world, _observation(), 'go', chunk_s=1.2, max_chunks=max_chunks)
+def _run(policy, world, max_chunks):
+    return run_policy(policy, world, 'go', chunk_s=1.2, max_chunks=max_chunks)
 
 
 def test_the_policy_sees_what_its_answer_led_to_and_ends_the_episode():
     policy, world = _Policy(2), _World()
-    life = _live(policy, world, 5)
+    run = _run(policy, world, 5)
     assert policy.stamps == pytest.approx([0.0, 1.2, 2.4])
     assert world.executed == pytest.approx([1.2, 1.2])
-    assert (life.num_chunks, life.is_over) == (2, True)
+    assert (run.num_chunks, run.is_over) == (2, True)
 
 
 def test_an_endless_policy_is_cut_off_at_the_limit():
     policy, world = _Policy(100), _World()
-    life = _live(policy, world, 3)
-    assert (life.num_chunks, life.is_over, len(world.executed)) == (3, False, 3)
+    run = _run(policy, world, 3)
+    assert (run.num_chunks, run.is_over, len(world.executed)) == (3, False, 3)
 
 
 def test_an_answer_is_cut_with_a_point_at_the_cut():

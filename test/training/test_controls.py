@@ -90,7 +90,7 @@ def test_the_pipeline_hands_the_model_what_training_saw(
     trajectory = JointTrajectory(
         joint_names=robot.joint_names, times=clip.times[1:], positions=clip.positions[1:]
     )
-    list(pipeline.imagine(observation, trajectory, num_inference_steps=1))
+    list(pipeline.begin(observation, num_inference_steps=1).extend(trajectory))
     np.testing.assert_allclose(given[0], encoding.encode(robot, clip.positions), atol=1e-6)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+import heapq
 from pathlib import Path
 import sys
 import time
@@ -21,19 +23,47 @@ from rosgraph_msgs.msg import Clock
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp, with_stamp
-from mtv_world_ros.ros.bags.timeline import in_order, Timeline
 from mtv_world_ros.ros.messages.conversions import values_of
 from mtv_world_ros.ros.messages.stamps import NANO, to_stamp
 from mtv_world_ros.ros.peers import Peers
 from mtv_world_ros.ros.run_node import run
 
 TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
+#: recorders write messages this much out of order at most
+_WINDOW_NS = 2 * NANO
 #: topics whose last message late subscribers get
 _LATCHED = ('instruction', 'tf_static', 'robot_description')
 _CLOCK_PERIOD_NS = 10_000_000
 #: connections that do not change for this long are complete [s]
 _SETTLED_S = 0.5
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
+
+
+@dataclass(slots=True)
+class Timeline:
+    """Maps bag time to the clock on the wall.
+
+    Attributes:
+        bag_ns: bag time at which playing started [ns].
+        wall_ns: wall time at that moment, moved on by every pause [ns].
+        rate: seconds of the bag a second.
+    """
+
+    bag_ns: int
+    wall_ns: int
+    rate: float
+
+    def due(self, bag_ns: int) -> int:
+        """Wall time at which a bag time is due [ns]."""
+        return self.wall_ns + round((bag_ns - self.bag_ns) / self.rate)
+
+    def bag_time(self, wall_ns: int) -> int:
+        """Bag time of a wall time [ns]."""
+        return self.bag_ns + round((wall_ns - self.wall_ns) * self.rate)
+
+    def pause(self, duration_ns: int) -> None:
+        """Moves all that is still to come by a pause."""
+        self.wall_ns += duration_ns
 
 
 class Player(Node):
@@ -211,6 +241,21 @@ class Player(Node):
         if state != 'done':
             text = '' if answer is None else answer.get('text', '')
             self.get_logger().warning(f'trajectory at {stamp_ns} ns: {state} {text}')
+
+
+def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
+    """Yields messages by time, holding two seconds of them; trajectories last among equals.
+
+    A trajectory is planned from the messages that have its time.
+    """
+    heap: list[tuple[int, bool, int, BagMessage]] = []
+    for number, message in enumerate(messages):
+        key = (message.stamp_ns, message.msgtype == TRAJECTORY, number)
+        heapq.heappush(heap, (*key, message))
+        while heap and heap[0][0] < message.stamp_ns - _WINDOW_NS:
+            yield heapq.heappop(heap)[-1]
+    while heap:
+        yield heapq.heappop(heap)[-1]
 
 
 def _chosen(types: dict[str, str], options: argparse.Namespace) -> list[str]:

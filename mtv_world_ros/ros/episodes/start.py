@@ -19,8 +19,7 @@ from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.ros.messages.conversions import to_joint_state, to_positions
 from mtv_world_ros.ros.messages.images import to_image
 from mtv_world_ros.ros.messages.stamps import make_header, NANO, to_stamp
-from mtv_world_ros.ros.sensing.matched_subscription import MatchedSubscription
-from mtv_world_ros.ros.sensing.subscriptions import Handler
+from mtv_world_ros.ros.sensing.subscriptions import Handler, MatchedSubscription
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

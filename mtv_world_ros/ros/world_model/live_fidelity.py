@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Condition, Thread
+from typing import NamedTuple
 
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
-from mtv_world_ros.data_types import ByteArray, ObjectMasks
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.data_types import ByteArray, FloatArray
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.ros.messages import images as image_messages
 from mtv_world_ros.ros.messages.conversions import to_multi_array
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 from mtv_world_ros.ros.status_publisher import create_publisher
-from mtv_world_ros.ros.world_model.fidelity import compare_masks, Fidelity
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
+from mtv_world_ros.vision.jaccard import mean_of_known, object_scores, persistence_scores
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
 MAX_CHUNKS = 8
@@ -45,8 +46,30 @@ class Expected:
     def __post_init__(self) -> None:
         prediction = self.chunk.prediction
         self.stamps = [
-            prediction.stamp_ns + round(float(t) * NANO) for t in prediction.rollout.video.times
+            prediction.stamp_ns + round(float(t) * NANO) for t in prediction.video.times
         ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fidelity:
+    """How a chunk compares with what really came: V views, O objects.
+
+    Attributes:
+        names: O names.
+        jaccard: (V, O) mean J over the compared frames, NaN = not scored.
+        copy: the same of the chunk's first masks held.
+        num_frames: that were compared.
+    """
+
+    names: tuple[str, ...]
+    jaccard: FloatArray
+    copy: FloatArray
+    num_frames: int
+
+    @property
+    def mean(self) -> float:
+        """Mean J over views and objects, NaN where none is scored."""
+        return float(mean_of_known(self.jaccard))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +80,14 @@ class Scored:
     fidelity: Fidelity
 
 
+class _SeenRollout(NamedTuple):
+    """A rollout whose real frames were observed up to a chunk."""
+
+    rollout: int
+    num_chunks: int
+    episode: ImaginedEpisode
+
+
 class LiveFidelity:
     """Compares in a thread of its own; publishes `~/fidelity` from the executor.
 
@@ -64,7 +95,7 @@ class LiveFidelity:
 
     Args:
         node: owner of the publisher.
-        pipeline: its segmenter finds the objects in real frames, too.
+        pipeline: observes the real frames as it does imagined ones.
         on_scored: called from the executor with every chunk that was compared.
         on_error: called from the executor with what went wrong.
     """
@@ -76,14 +107,14 @@ class LiveFidelity:
         on_scored: Callable[[Scored], None],
         on_error: Callable[[Exception], None],
     ) -> None:
-        self._spec, self._segmenter = pipeline.spec, pipeline.segmenter
+        self._pipeline, self._spec = pipeline, pipeline.spec
         self._on_scored, self._on_error = on_scored, on_error
         self._tolerance_ns = round(MAX_OFFSET / self._spec.fps * NANO)
         self._changed = Condition()
         self._images: deque[tuple[str, Image | CompressedImage]] = deque(maxlen=MAX_WAITING)
         self._expected: deque[Expected] = deque(maxlen=MAX_CHUNKS)
         self._frames = {view: deque(maxlen=MAX_FRAMES) for view in self._spec.views}
-        self._last: tuple[int, int, ByteArray, ObjectMasks] | None = None
+        self._seen: _SeenRollout | None = None
         self._results: deque[Scored | Exception] = deque(maxlen=MAX_CHUNKS)
         self._kept: deque[float] = deque(maxlen=MAX_KEPT)
         self._num_missed, self._closing = 0, False
@@ -203,24 +234,32 @@ class LiveFidelity:
         if not indices or not prediction.masks.names:
             self._num_missed += 1
             return
-        rollout, chunk = expected.chunk.request.rollout, prediction.chunk
-        first_frames, first_masks = prediction.rollout.start_frame, prediction.start_masks
-        if self._last is not None and self._last[:2] == (rollout, chunk):
-            first_frames, first_masks = self._last[2:]
-        found = compare_masks(
-            self._segmenter,
-            prediction.masks,
-            indices,
-            frames,
-            first_frames=first_frames,
-            first_masks=first_masks,
+        episode = self._real_episode(expected.chunk)
+        start = episode.observation.positions[None]
+        found = episode.observe(frames, np.concatenate([start, prediction.positions[indices]]))
+        imagined = replace(prediction.masks, masks=prediction.masks.masks[:, :, indices])
+        fidelity = Fidelity(
+            names=imagined.names,
+            jaccard=object_scores(imagined, found.masks).objects,
+            copy=persistence_scores(found.start_masks.masks[:, :, 0], found.masks).objects,
+            num_frames=len(indices),
         )
-        ends = ObjectMasks(
-            names=found.names, masks=found.masks.masks[:, :, -1:], status=found.masks.status
-        )
-        self._last = (rollout, chunk + 1, frames[:, -1], ends)
-        self._results.append(Scored(chunk=expected.chunk, fidelity=found))
+        self._results.append(Scored(chunk=expected.chunk, fidelity=fidelity))
         self._done.trigger()
+
+    def _real_episode(self, chunk: Chunk) -> ImaginedEpisode:
+        """The real frames of the chunk's rollout so far; a new episode where some are missing."""
+        prediction, rollout = chunk.prediction, chunk.request.rollout
+        seen = self._seen
+        if seen is None or (seen.rollout, seen.num_chunks) != (rollout, prediction.chunk):
+            episode = self._pipeline.begin(
+                prediction.start,
+                instruction=chunk.request.instruction,
+                objects=prediction.masks.names,
+            )
+            seen = _SeenRollout(rollout, prediction.chunk, episode)
+        self._seen = seen._replace(num_chunks=prediction.chunk + 1)
+        return seen.episode
 
     def _matched(self, stamps: Sequence[int]) -> tuple[list[int], ByteArray]:
         """Imagined frames that every view has a real one for, and those (V, N, H, W, 3)."""

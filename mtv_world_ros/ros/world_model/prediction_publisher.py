@@ -138,7 +138,7 @@ class PredictionPublisher:
         if self._sent.num_frames == 0 and time.monotonic() < self._not_before_s:
             return
         self._publish_frame(chunk)
-        if self._sent.num_frames == len(chunk.prediction.rollout.video.times):
+        if self._sent.num_frames == len(chunk.prediction.video.times):
             self._queue.popleft()
             self._publish_estimate(chunk)
             self._finish(chunk)
@@ -164,7 +164,7 @@ class PredictionPublisher:
         stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
         for view, publisher in enumerate(self._views):
             self._publish_view(chunk, view, publisher, index, stamp_ns)
-        positions = chunk.prediction.rollout.positions[index]
+        positions = chunk.prediction.positions[index]
         header = make_header(stamp_ns)
         self._joints.publish(to_joint_state(self._joint_names, positions, header))
         self._sent.num_frames += 1
@@ -176,7 +176,7 @@ class PredictionPublisher:
     ) -> None:
         prediction, info = chunk.prediction, chunk.scene.camera_infos[view]
         frames: dict[str, Callable[[], ByteArray]] = {
-            'predicted': lambda: prediction.rollout.video.frames[view, index],
+            'predicted': lambda: prediction.video.frames[view, index],
             'trajectory': lambda: prediction.trajectory_video.frames[view, index + 1],
             'mask': lambda: label_image(prediction.masks, view, index),
         }
@@ -190,7 +190,7 @@ class PredictionPublisher:
         prediction = chunk.prediction
         self._success.publish(Float64(data=float(prediction.success.probability)))
         labels = (
-            f'view: {", ".join(prediction.rollout.video.views)}',
+            f'view: {", ".join(prediction.video.views)}',
             f'object: {", ".join(prediction.masks.names)}',
         )
         self._jaccard.publish(to_multi_array(prediction.success.jaccard, labels))
@@ -200,7 +200,7 @@ def stamp_of(chunk: Chunk, index: int, stamp_mode: str) -> int:
     """Stamp of a chunk's frame [ns]: its predicted time, or that of the real frames behind it."""
     if stamp_mode == 'source':
         return chunk.scene.source_stamp_ns
-    return chunk.prediction.stamp_ns + round(chunk.prediction.rollout.video.times[index] * NANO)
+    return chunk.prediction.stamp_ns + round(chunk.prediction.video.times[index] * NANO)
 
 
 def label_image(masks: ObjectMasks, view: int, index: int) -> ByteArray:

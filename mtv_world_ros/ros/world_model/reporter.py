@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from math import isnan
 import time
 import traceback
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
@@ -16,16 +19,23 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import create_publisher
-from mtv_world_ros.ros.world_model import report
-from mtv_world_ros.ros.world_model.diagnostics import Tally
 from mtv_world_ros.ros.world_model.live_fidelity import Scored
-from mtv_world_ros.ros.world_model.prediction_publisher import Sent
-from mtv_world_ros.ros.world_model.worker import Chunk, Ended
+from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
+from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
 
 _LEVELS = {
     'rejected': DiagnosticStatus.WARN,
     'failed': DiagnosticStatus.ERROR,
 }
+
+#: chunks that latencies are taken over
+_WINDOW = 50
+#: a rejection shows as a warning for this long [s]
+_WARN_S = 5.0
+#: rollouts ended in a row without a chunk that are worth a warning
+_STARVED = 5
+#: reasons that mean something is broken here and not in what was sent
+_ERRORS = (Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR)
 
 
 class Reporter:
@@ -65,7 +75,7 @@ class Reporter:
     def reject_trajectory(self, error: Rejection, trajectory_stamp_ns: int) -> None:
         """Counts and reports a refused trajectory; `/diagnostics` says why at once."""
         self.reject(error)
-        values = report.rejection_values(error, trajectory_stamp_ns)
+        values = _rejection_values(error, trajectory_stamp_ns)
         self._publish_report('rejected', values)
         self.publish_diagnostics()
 
@@ -92,11 +102,11 @@ class Reporter:
 
     def sent(self, chunk: Chunk, sent: Sent) -> None:
         """Counts and reports a chunk that is out, or whose rest was dropped."""
-        values = report.chunk_values(chunk, sent, self._settings())
+        values = _chunk_values(chunk, sent, self._settings())
         counts = self._tally.counts
         counts['chunks'] += 1
         counts['frames_published'] += sent.num_frames
-        counts['frames_dropped'] += len(chunk.prediction.rollout.video.times) - sent.num_frames
+        counts['frames_dropped'] += len(chunk.prediction.video.times) - sent.num_frames
         self._tally.add_seconds(
             {
                 name: value
@@ -110,7 +120,7 @@ class Reporter:
 
     def scored(self, scored: Scored) -> None:
         """Reports how a chunk compares with the real frames that came for it."""
-        self._publish_report('fidelity', report.fidelity_values(scored))
+        self._publish_report('fidelity', _fidelity_values(scored))
 
     def ended(self, ended: Ended) -> None:
         """Counts and reports the end of a rollout."""
@@ -119,7 +129,7 @@ class Reporter:
             self._node.get_logger().error(ended.trace)
         if ended.reason is not None:
             self.reject(Rejection(ended.reason, ended.text))
-        self._publish_report(ended.state, report.ended_values(ended))
+        self._publish_report(ended.state, _ended_values(ended))
         if ended.reason is not None:
             self.publish_diagnostics()
 
@@ -147,3 +157,189 @@ class Reporter:
         status = to_status(name, self._hardware_id, level, message, values)
         header = make_header(self._node.get_clock().now().nanoseconds)
         publisher.publish(to_diagnostics(header, status))
+
+
+class Tally:
+    """Counts what happens to messages and rollouts; times are of `time.monotonic`."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
+        self._last: tuple[float, Reason, str] | None = None
+        self._seconds: dict[str, deque[float]] = {}
+        self._fruitless = 0
+
+    def reject(self, error: Rejection, now_s: float) -> None:
+        """Counts a refused message or rollout."""
+        self._rejected[error.reason] += 1
+        self._last = (now_s, error.reason, str(error))
+
+    def end(self, state: str, num_chunks: int) -> None:
+        """Counts the end of a rollout."""
+        self.counts[f'rollouts_{state}'] += 1
+        starved = state == 'preempted' and num_chunks == 0
+        self._fruitless = self._fruitless + 1 if starved else 0
+
+    def add_seconds(self, seconds: Mapping[str, float]) -> None:
+        """Takes the durations of a chunk [s], by name."""
+        for name, value in seconds.items():
+            self._seconds.setdefault(name, deque(maxlen=_WINDOW)).append(value)
+
+    def level(self, now_s: float, num_policies: int = 1) -> tuple[bytes, str]:
+        """How bad it is, and everything that is wrong.
+
+        Args:
+            now_s: now [s].
+            num_policies: publishers of trajectories.
+        """
+        level, texts = DiagnosticStatus.WARN, []
+        if self._last is not None and now_s - self._last[0] < _WARN_S:
+            _, reason, text = self._last
+            level = DiagnosticStatus.ERROR if reason in _ERRORS else level
+            texts.append(f'{reason}: {text}')
+        if num_policies > 1:
+            texts.append(
+                f'{num_policies} publishers of joint trajectories: each pre-empts the rollouts of '
+                'the others; stop all but one'
+            )
+        if self._fruitless >= _STARVED:
+            texts.append(
+                f'the last {self._fruitless} rollouts were pre-empted before their first chunk: '
+                'trajectories arrive faster than the model predicts'
+            )
+        return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, 'ready')
+
+    def values(self, now_s: float) -> dict[str, object]:
+        """Keys and values: counts, `rejected.<reason>`, the last rejection, latencies."""
+        values: dict[str, object] = dict(self.counts)
+        values['rejected'] = sum(self._rejected.values())
+        values |= {f'rejected.{reason}': n for reason, n in sorted(self._rejected.items())}
+        if self._last is not None:
+            when, reason, text = self._last
+            values['last_rejection'] = f'{reason}: {text}'
+            values['last_rejection_age_s'] = now_s - when
+        for name, window in self._seconds.items():
+            values[f'{name}.last'] = window[-1]
+            values[f'{name}.median'] = float(np.median(window))
+            values[f'{name}.max'] = max(window)
+        return values
+
+
+def _chunk_values(chunk: Chunk, sent: Sent, settings: Settings) -> dict[str, object]:
+    """Keys and values of a published chunk; stamps in ns, durations in s."""
+    prediction, request = chunk.prediction, chunk.request
+    num_frames = len(prediction.video.times)
+    model_s = sum(prediction.seconds.values())
+    values = {
+        **_request_values(request),
+        'chunk': prediction.chunk,
+        'num_chunks': prediction.num_chunks,
+        'chunk_seed': prediction.seed,
+        'observation_stamp_ns': prediction.stamp_ns,
+        'source_stamp_ns': chunk.scene.source_stamp_ns,
+        'first_stamp_ns': stamp_of(chunk, 0, 'target'),
+        'last_stamp_ns': stamp_of(chunk, -1, 'target'),
+        'stamp_mode': settings.stamp_mode,
+        'frames': num_frames,
+        'frames_published': sent.num_frames,
+        'frames_dropped': num_frames - sent.num_frames,
+        'latency_s': chunk.ready_s - request.received_s,
+        'first_frame_s': sent.first_s - request.received_s if sent.num_frames else float('nan'),
+        'last_frame_s': sent.last_s - request.received_s if sent.num_frames else float('nan'),
+        'real_time_factor': num_frames * _frame_s(chunk) / model_s,
+    }
+    values |= {f'stage_s.{_key(stage)}': s for stage, s in prediction.seconds.items()}
+    values['stage_s.publish'] = sent.publish_s
+    # the request may leave it to the checkpoint
+    values['num_inference_steps'] = prediction.num_inference_steps
+    return values | _estimate_values(chunk) | _trust_values(chunk, settings.trusted_jaccard)
+
+
+def _frame_s(chunk: Chunk) -> float:
+    """Time between two predicted frames [s]."""
+    times = chunk.prediction.video.times
+    before = chunk.prediction.trajectory_video.times[0]
+    return float(times[0] - before)
+
+
+def _ended_values(ended: Ended) -> dict[str, object]:
+    """Keys and values of a rollout's end."""
+    values = {**_request_values(ended.request), 'num_chunks': ended.num_chunks}
+    if ended.reason is not None:
+        values |= {'reason': ended.reason.value, 'text': ended.text}
+    return values
+
+
+def _request_values(request: Request) -> dict[str, object]:
+    """What identifies a plan and how it is imagined."""
+    return {
+        'rollout': request.rollout,
+        'trajectory_stamp_ns': request.stamp_ns,
+        'mode': 'imagine' if request.imagine else 'observe',
+        'seed': request.seed,
+        'num_inference_steps': request.num_inference_steps,
+        'instruction': request.instruction,
+    }
+
+
+def _rejection_values(error: Rejection, trajectory_stamp_ns: int) -> dict[str, object]:
+    """Keys and values of a trajectory that never became a rollout."""
+    return {
+        'trajectory_stamp_ns': trajectory_stamp_ns,
+        'reason': error.reason.value,
+        'text': str(error),
+    }
+
+
+def _estimate_values(chunk: Chunk) -> dict[str, object]:
+    prediction = chunk.prediction
+    success, masks = prediction.success, prediction.masks
+    values: dict[str, object] = {
+        'success': success.probability,
+        'success_low': success.interval[0],
+        'success_high': success.interval[1],
+        'success_spread': success.spread,
+        'success_num_seeds': success.num_seeds,
+        'success_calibrated': success.is_calibrated,
+        'success_reasons': '; '.join(success.reasons),
+        'objects': masks.names,
+        'segmenter': prediction.segmenter,
+    }
+    for row, view in enumerate(prediction.video.views):
+        for column, name in enumerate(masks.names):
+            values[f'jaccard.{view}.{_key(name)}'] = float(success.jaccard[row, column])
+            values[f'mask_status.{view}.{_key(name)}'] = masks.status[row][column]
+    return values
+
+
+def _fidelity_values(scored: Scored) -> dict[str, object]:
+    """Keys and values of a chunk whose real frames came."""
+    prediction, found = scored.chunk.prediction, scored.fidelity
+    values: dict[str, object] = {
+        **_request_values(scored.chunk.request),
+        'chunk': prediction.chunk,
+        'frames_compared': found.num_frames,
+        'fidelity_jaccard': found.mean,
+    }
+    for row, view in enumerate(prediction.video.views):
+        for column, name in enumerate(found.names):
+            values[f'fidelity.{view}.{_key(name)}'] = float(found.jaccard[row, column])
+            values[f'fidelity_copy.{view}.{_key(name)}'] = float(found.copy[row, column])
+    return values
+
+
+def _trust_values(chunk: Chunk, level: float) -> dict[str, object]:
+    """How far the chunk's end is from the last real frame, and how far J is to be trusted [s]."""
+    trusted_s = chunk.prediction.trusted_seconds(level)
+    end_s = chunk.prediction.imagined_seconds
+    known = 'yes' if end_s <= trusted_s + 1e-6 else 'no'
+    return {
+        'imagined_s': end_s,
+        'trusted_s': trusted_s,
+        'trusted_jaccard': level,
+        'trusted': 'not measured' if isnan(trusted_s) else known,
+    }
+
+
+def _key(name: str) -> str:
+    return name.replace(' ', '_')

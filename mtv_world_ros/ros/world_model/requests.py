@@ -13,8 +13,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
-from mtv_world_ros.ros.world_model.timing import from_observation, TimeLimits
-from mtv_world_ros.ros.world_model.worker import Request
+from mtv_world_ros.ros.world_model.worker import from_observation, Request, TimeLimits
 
 
 class RequestMaker:

@@ -10,14 +10,20 @@ import time
 import traceback
 
 from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.ensemble import imagine_seeds
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import NANO
 from mtv_world_ros.ros.sensing.observations import Scene
-from mtv_world_ros.ros.world_model.timing import from_observation, TimeLimits
-from mtv_world_ros.success.rollout_memory import RolloutMemory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeLimits:
+    """Limits [s] beyond which a trajectory is refused."""
+
+    trajectory_age: float
+    horizon: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,9 +105,8 @@ class RolloutWorker:
         self._between: Callable[[], None] | None = None
         self._abandoned = False
         self._closing = False
+        self._episode: ImaginedEpisode | None = None
         self._last: Scene | None = None
-        self._num_imagined = 0
-        self._memory: RolloutMemory | None = None
         self._results: deque[Result] = deque()
         self._thread = Thread(target=self._run, name='rollouts')
 
@@ -145,7 +150,7 @@ class RolloutWorker:
                     self._put(Ended(request=request, state='reset', num_chunks=0))
             self._abandoned = self._running is not None
             self._pending = None
-            self._last, self._memory, self._num_imagined = None, None, 0
+            self._episode, self._last = None, None
 
     def take(self) -> list[Result]:
         """Returns the results since the last call, in order."""
@@ -195,7 +200,7 @@ class RolloutWorker:
             )
 
         try:
-            for _ in self._chunks(request):
+            for _ in self._imagine(request):
                 num_chunks += 1
         except RolloutPreempted:
             return ended('preempted')
@@ -212,58 +217,72 @@ class RolloutWorker:
             )
         return ended('done')
 
-    def _chunks(self, request: Request) -> Iterator[None]:
-        scene, memory, num_before = self._start(request)
+    def _imagine(self, request: Request) -> Iterator[Prediction]:
+        """Yields the chunks of a request, each once it is handed on."""
+        scene, episode = self._begin(request)
+        episode.instruction, episode.objects = request.instruction, request.objects
+        episode.seed, episode.num_seeds = request.seed, request.num_seeds
+        episode.num_inference_steps = request.num_inference_steps
+        episode.limit_tolerance = request.limit_tolerance
         trajectory = from_observation(
-            request.trajectory, request.stamp_ns, scene.observation.stamp_ns, request.limits
+            request.trajectory, request.stamp_ns, episode.observation.stamp_ns, request.limits
         )
-        pipeline = replace(
-            self._pipeline,
-            objects=request.objects or self._pipeline.objects,
-            limit_tolerance=request.limit_tolerance,
-        )
-        predictions = imagine_seeds(
-            pipeline,
-            scene.observation,
-            trajectory,
-            instruction=request.instruction,
-            num_seeds=request.num_seeds,
-            seed=request.seed + num_before,
-            num_inference_steps=request.num_inference_steps,
-            should_stop=self._should_stop,
-            memory=memory,
-            history=scene.history,
-        )
-        for prediction in predictions:
-            self._finish_chunk(request, scene, prediction)
-            yield
-            if self._should_stop() and prediction.chunk + 1 < prediction.num_chunks:
-                raise RolloutPreempted('a newer trajectory arrived')
+        for prediction in episode.extend(trajectory):
+            ready_s = time.monotonic()
+            chunk = Chunk(request=request, scene=scene, prediction=prediction, ready_s=ready_s)
+            with self._changed:
+                if self._abandoned or self._closing:
+                    raise RolloutPreempted('the rollout was given up')
+                if request.imagine:
+                    self._episode = episode
+                    self._last = replace(scene, observation=episode.observation)
+                self._put(chunk)
+            yield prediction
 
-    def _start(self, request: Request) -> tuple[Scene, RolloutMemory | None, int]:
-        """The scene to start from, how it came about, and the chunks imagined before it."""
+    def _begin(self, request: Request) -> tuple[Scene, ImaginedEpisode]:
+        """The scene to start from and its episode: the one that goes on, or a new one."""
         with self._changed:
-            if request.imagine and self._last is not None:
-                return self._last, self._memory, self._num_imagined
-            return request.scene, None, 0
-
-    def _finish_chunk(self, request: Request, scene: Scene, prediction: Prediction) -> None:
-        chunk = Chunk(
-            request=request, scene=scene, prediction=prediction, ready_s=time.monotonic()
-        )
-        with self._changed:
-            if self._abandoned or self._closing:
-                raise RolloutPreempted('the rollout was given up')
-            if request.imagine:
-                self._last = replace(
-                    scene,
-                    observation=prediction.end_observation,
-                    history=prediction.end_history,
-                )
-                self._memory = prediction.memory
-                self._num_imagined += 1
-            self._put(chunk)
+            if request.imagine and self._episode is not None and self._last is not None:
+                return self._last, self._episode
+        scene = request.scene
+        return scene, self._pipeline.begin(scene.observation, should_stop=self._should_stop)
 
     def _put(self, result: Result) -> None:
         self._results.append(result)
         self._notify()
+
+
+def from_observation(
+    trajectory: JointTrajectory, stamp_ns: int, observation_ns: int, limits: TimeLimits
+) -> JointTrajectory:
+    """Returns the trajectory with times from the observation's stamp.
+
+    Args:
+        trajectory: its times count from `stamp_ns`.
+        stamp_ns: when it starts [ns]; 0 = at the observation.
+        observation_ns: stamp of the observation [ns].
+        limits: what is too old and what too long.
+
+    Raises:
+        Rejection: it starts too long ago, has ended already, or ends too late.
+    """
+    offset = (stamp_ns - observation_ns) / NANO if stamp_ns else 0.0
+    end = offset + float(trajectory.times[-1])
+    if -offset > limits.trajectory_age:
+        raise Rejection(
+            Reason.TRAJECTORY_STALE,
+            f'the trajectory is stamped {-offset:.3f} s before the observation it would start '
+            f"from; 'max_trajectory_age_s' allows {limits.trajectory_age:g} s",
+        )
+    if end < 0:
+        raise Rejection(
+            Reason.TRAJECTORY_STALE,
+            f'the trajectory ended {-end:.3f} s before the observation it would start from',
+        )
+    if end > limits.horizon:
+        raise Rejection(
+            Reason.TRAJECTORY_TOO_LONG,
+            f"the trajectory ends {end:.3f} s after its observation; 'max_horizon_s' allows "
+            f'{limits.horizon:g} s (do its stamp and the images come from the same clock?)',
+        )
+    return replace(trajectory, times=trajectory.times + offset) if offset else trajectory

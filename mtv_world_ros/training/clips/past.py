@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mtv_world_ros.data.recording import Clip, cut_clip, frame_indices, Recording
-from mtv_world_ros.data_types import ByteArray, WorldModelSpec
-from mtv_world_ros.history import History
+from mtv_world_ros.data_types import ByteArray, History, WorldModelSpec
 from mtv_world_ros.training.config import HistoryConfig, SelfRolloutConfig
 
 

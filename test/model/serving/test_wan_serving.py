@@ -16,8 +16,8 @@ from wan_encoder_reference import clip_tokens, umt5_encode
 from wan_files import CARD, clip_weights, umt5_weights, vae_model
 from wan_predictions import frames, imported, predict, T, VIEWS
 
+from mtv_world_ros.data_types import History
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.history import History
 from mtv_world_ros.model.autoencoders import WanAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk

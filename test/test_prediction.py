@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import SuccessEstimate
-from mtv_world_ros.success.seeds import combine
+from mtv_world_ros.prediction import mean_estimate
 
 
 def estimate(probability, *reasons):
@@ -21,12 +21,12 @@ def estimate(probability, *reasons):
 
 def test_one_seed_stays_as_it_is():
     alone = estimate(0.3)
-    assert combine([alone]) is alone
+    assert mean_estimate([alone]) is alone
 
 
 def test_interval_is_students_of_the_mean():
     # mean .5, s = .1, n = 3: t(.975, 2) = 4.303 (tables), half width .2484
-    found = combine([estimate(0.4), estimate(0.5), estimate(0.6)])
+    found = mean_estimate([estimate(0.4), estimate(0.5), estimate(0.6)])
     assert found.probability == pytest.approx(0.5)
     assert found.spread == pytest.approx(0.1)
     assert found.interval == pytest.approx((0.2516, 0.7484), abs=1e-4)
@@ -36,16 +36,19 @@ def test_interval_is_students_of_the_mean():
 
 
 def test_interval_stays_within_what_a_probability_can_be():
-    assert combine([estimate(0.9), estimate(1.0)]).interval == (pytest.approx(0.3147, abs=1e-3), 1)
+    assert mean_estimate([estimate(0.9), estimate(1.0)]).interval == (
+        pytest.approx(0.3147, abs=1e-3),
+        1,
+    )
 
 
 def test_one_of_two_that_know_is_not_most_of_them():
-    found = combine([estimate(0.9), estimate(nan, 'abstains: lost')])
+    found = mean_estimate([estimate(0.9), estimate(nan, 'abstains: lost')])
     assert np.isnan(found.probability) and np.isnan(found.interval).all()
     assert found.reasons[0] == 'abstains: 1 of 2 seeds do; abstains: lost'
 
 
 def test_two_of_three_that_know_are():
-    found = combine([estimate(0.9), estimate(nan, 'abstains: lost'), estimate(0.7)])
+    found = mean_estimate([estimate(0.9), estimate(nan, 'abstains: lost'), estimate(0.7)])
     assert found.probability == pytest.approx(0.8)
     assert found.reasons[0].startswith('mean of 2 of 3 seeds')

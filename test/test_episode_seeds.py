@@ -8,10 +8,10 @@ import pytest
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.ensemble import imagine_seeds, SEED_STEP
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.pipeline import SEED_STEP
 from mtv_world_ros.success.trusted_horizon import HorizonCurve
 
 SPEC = WorldModelSpec(
@@ -52,15 +52,10 @@ def imagine(recording, num_seeds, horizon=None):
     trajectory = JointTrajectory(
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
-    chunks = imagine_seeds(
-        assemble(CARD, model, horizon=horizon),
-        observation,
-        trajectory,
-        num_seeds=num_seeds,
-        seed=3,
-        instruction=recording.instruction,
+    episode = assemble(CARD, model, horizon=horizon).begin(
+        observation, instruction=recording.instruction, seed=3, num_seeds=num_seeds
     )
-    return model, list(chunks)
+    return model, list(episode.extend(trajectory))
 
 
 def test_every_seed_chains_its_own_chunks_and_the_first_is_shown(recording):
@@ -70,7 +65,7 @@ def test_every_seed_chains_its_own_chunks_and_the_first_is_shown(recording):
     assert model.asked[:3] == [(seed, pixel) for seed in seeds]
     # their second chunks start from what each of them imagined itself
     assert model.asked[3:] == [(s + 1, pixel + (s >= SEED_STEP)) for s in seeds]
-    assert [chunk.rollout.seed for chunk in chunks] == [3, 4]
+    assert [chunk.seed for chunk in chunks] == [3, 4]
     assert all(chunk.success.num_seeds == 3 for chunk in chunks)
 
 

@@ -1,0 +1,32 @@
+"""The order of what is played, and when."""
+
+from mtv_world_ros.data.bag.reader import BagMessage
+from mtv_world_ros.ros.bags.player import in_order, Timeline
+from mtv_world_ros.ros.messages.stamps import NANO
+
+
+def message(topic, stamp_s, msgtype='sensor_msgs/msg/Image'):
+    return BagMessage(topic, msgtype, round(stamp_s * NANO), b'')
+
+
+def test_messages_play_by_time_with_the_plan_after_what_it_is_made_from():
+    plan = message('/plan', 1.0, 'trajectory_msgs/msg/JointTrajectory')
+    recorded = [plan, message('/low', 1.0), message('/late', 0.9), message('/high', 1.0)]
+    recorded += [message('/low', 5.0), message('/high', 4.5), message('/low', 9.0)]
+    assert [(m.topic, m.stamp_ns / NANO) for m in in_order(recorded)] == [
+        ('/late', 0.9),
+        ('/low', 1.0),
+        ('/high', 1.0),
+        ('/plan', 1.0),
+        ('/high', 4.5),
+        ('/low', 5.0),
+        ('/low', 9.0),
+    ]
+
+
+def test_timeline_follows_rate_and_pauses():
+    timeline = Timeline(bag_ns=100 * NANO, wall_ns=1000 * NANO, rate=4.0)
+    assert timeline.due(108 * NANO) == 1002 * NANO
+    assert timeline.bag_time(1001 * NANO) == 104 * NANO
+    timeline.pause(3 * NANO)
+    assert timeline.due(108 * NANO) == 1005 * NANO
