@@ -34,11 +34,10 @@ observation = Observation(
     stamp_ns=recording.stamp_ns,
 )
 
+episode = pipeline.begin(observation, instruction=recording.instruction, seed=0)
 chunks = []
-for prediction in pipeline.imagine(
-    observation, commands_from(recording, 0), instruction=recording.instruction, seed=0
-):
-    video, success = prediction.rollout.video, prediction.success
+for prediction in episode.extend(commands_from(recording, 0)):
+    video, success = prediction.video, prediction.success
     chunks.append(video.frames)
     print(f'up to {video.times[-1]:.1f} s: success {success.probability:.2f}')
     print(*success.reasons, sep='\n', end='\n\n')

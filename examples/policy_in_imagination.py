@@ -61,21 +61,12 @@ observation = Observation(
 policy = SwingingPolicy(pipeline.robot.joint_names)
 policy.reset(seed=0)
 
-memory, history = None, None
-for number in range(NUM_CHUNKS):
-    answer = policy.act(observation, recording.instruction)
+episode = pipeline.begin(observation, instruction=recording.instruction, seed=0)
+for _ in range(NUM_CHUNKS):
+    answer = policy.act(episode.observation, recording.instruction)
     if answer is None:
         break
-    for prediction in pipeline.imagine(
-        observation,
-        answer,
-        instruction=recording.instruction,
-        seed=number,
-        memory=memory,
-        history=history,
-    ):
-        observation = prediction.end_observation
-        memory, history = prediction.memory, prediction.end_history
+    for prediction in episode.extend(answer):
         success = prediction.success
         print(
             f'{prediction.imagined_seconds:.1f} s imagined: '

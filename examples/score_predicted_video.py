@@ -33,16 +33,11 @@ observation = Observation(
     positions=recording.positions[0],
     stamp_ns=recording.stamp_ns,
 )
-prediction = next(
-    iter(
-        pipeline.imagine(
-            observation, commands_from(recording, 0), instruction=recording.instruction
-        )
-    )
-)
+episode = pipeline.begin(observation, instruction=recording.instruction)
+prediction = next(episode.extend(commands_from(recording, 0)))
 
 # the recorded frames at the predicted times, segmented as the prediction was
-nearest = np.abs(recording.times[:, None] - prediction.rollout.video.times).argmin(axis=0)
+nearest = np.abs(recording.times[:, None] - prediction.video.times).argmin(axis=0)
 start = prediction.start_masks.masks[:, :, 0]  # (V, O, H, W)
 names = prediction.masks.names
 real = pipeline.segmenter.segment(

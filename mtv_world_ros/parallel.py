@@ -1,4 +1,4 @@
-"""Jobs scored one after the other, by several processes at once, or by Ray actors."""
+"""Runs jobs one after the other, in several processes, or in Ray actors."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 import importlib
-from multiprocessing import get_context
+import multiprocessing
 import os
 import signal
+import threading
 from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
@@ -17,6 +19,8 @@ from mtv_world_ros.files import plain
 
 #: scores as plain values, or why there are none
 Outcome = dict[str, Any] | str
+#: runs one job
+Run = Callable[[Any], Any]
 #: libraries that start threads read these when they are loaded
 _THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
@@ -40,65 +44,52 @@ class Scorer(Protocol):
 
 
 #: of this process, if it is a worker
-_scorer: Scorer | MtvWorldError | None = None
+_run: Run | None = None
 
 
-def score_all(
-    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
-) -> Iterator[tuple[Job, Outcome]]:
-    """Yields jobs with their outcome, as they are done.
+def run_all(
+    jobs: Sequence[Job], make_run: Callable[[], Run], workers: int, threads: int = 1
+) -> Iterator[tuple[Job, Any]]:
+    """Yields jobs with their result, in the order in which they are done.
+
+    Workers are spawned, not forked, since the threads of torch and OpenCV do not survive a fork.
+    They end with this process, however that ends.
 
     Args:
-        jobs: what to score.
-        make_scorer: called once in every process; has to be picklable for more than one.
+        jobs: what to run.
+        make_run: makes what runs a job, once in every process; has to be picklable for more than
+            one.
         workers: processes; 1 = this one.
         threads: of each process, where there are several.
 
     Raises:
         ConfigError: less than one worker.
-        MtvWorldError: a worker died.
+        MtvWorldError: a worker died, or what a job raised.
     """
     if workers < 1:
         raise ConfigError(f'workers is {workers}; it must be at least 1')
-    if workers == 1 or len(jobs) < 2:
-        yield from _score_here(jobs, make_scorer)
-    else:
-        yield from _score_in_processes(jobs, make_scorer, min(workers, len(jobs)), threads)
+    if workers > 1 and len(jobs) > 1:
+        yield from _in_processes(jobs, make_run, min(workers, len(jobs)), threads)
+    elif jobs:
+        run = make_run()
+        for job in jobs:
+            yield job, run(job)
 
 
-def _score_here(
-    jobs: Sequence[Job], make_scorer: Callable[[], Scorer]
-) -> Iterator[tuple[Job, Outcome]]:
-    scorer = make_scorer() if jobs else None
-    for job in jobs:
-        assert scorer is not None
-        yield job, outcome_of(scorer, job)
-
-
-def outcome_of(scorer: Scorer, job: Any) -> Outcome:
-    """Returns a job's scores as plain values, or why there are none."""
-    try:
-        return plain(scorer.score(job).as_json())
-    except MtvWorldError as error:
-        return str(error)
-
-
-def _score_in_processes(
-    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
-) -> Iterator[tuple[Job, Outcome]]:
-    # spawned, not forked: torch's and OpenCV's threads do not survive a fork
-    pool = ProcessPoolExecutor(
-        workers, get_context('spawn'), initializer=_start, initargs=(make_scorer, threads)
-    )
+def _in_processes(
+    jobs: Sequence[Job], make_run: Callable[[], Run], workers: int, threads: int
+) -> Iterator[tuple[Job, Any]]:
+    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (make_run, threads))
     try:
         with _environment(dict.fromkeys(_THREAD_VARIABLES, str(threads))):
-            futures = {pool.submit(_score, job): job for job in jobs}
+            futures = {pool.submit(_run_job, job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
     except BrokenProcessPool as error:
         raise MtvWorldError(
-            f'one of {workers} workers died, most likely of lack of memory; what was scored is '
-            'kept: run the command again, with fewer --workers'
+            f'one of {workers} workers died, most likely of lack of memory; what is done is kept: '
+            'run the command again, with fewer --workers'
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -119,46 +110,93 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start(make_scorer: Callable[[], Scorer], threads: int) -> None:
-    """Prepares a worker; what goes wrong is told by its first job."""
-    global _scorer
+def _start_worker(make_run: Callable[[], Run], threads: int) -> None:
+    """Prepares a worker; an error is raised by every job."""
+    global _run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     import cv2
 
     cv2.setNumThreads(threads)
     try:
-        _scorer = make_scorer()
+        _run = make_run()
     except MtvWorldError as error:
-        _scorer = error
+        _run = _raising(error)
 
 
-def _score(job: Any) -> Outcome:
-    if isinstance(_scorer, MtvWorldError):
-        return str(_scorer)
-    assert _scorer is not None
-    return outcome_of(_scorer, job)
+def _end_with_parent() -> None:
+    """A killed command must not go on writing: the same command may have been started again."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
-class _Worker:
-    """Lives in an actor; what goes wrong while it starts is told by every job."""
+def _raising(error: MtvWorldError) -> Run:
+    def run(job: Any) -> Any:
+        raise error
+
+    return run
+
+
+def _run_job(job: Any) -> Any:
+    assert _run is not None
+    return _run(job)
+
+
+class _Scoring:
+    """Runs a scorer, and says why where a job has no scores."""
 
     def __init__(self, make_scorer: Callable[[], Scorer]) -> None:
-        self._scorer: Scorer | str
-        try:
-            self._scorer = make_scorer()
-        except MtvWorldError as error:
-            self._scorer = str(error)
+        self._score: Callable[[Any], Scores] = make_scorer().score
 
-    def score(self, number: int, job: Any) -> tuple[int, Outcome]:
-        if isinstance(self._scorer, str):
-            return number, self._scorer
-        return number, outcome_of(self._scorer, job)
+    def __call__(self, job: Any) -> Outcome:
+        try:
+            return plain(self._score(job).as_json())
+        except MtvWorldError as error:
+            return str(error)
+
+
+class _LateScoring(_Scoring):
+    """A scorer of another process; what goes wrong while it is made is told by every job."""
+
+    def __init__(self, make_scorer: Callable[[], Scorer]) -> None:
+        try:
+            super().__init__(make_scorer)
+        except MtvWorldError as error:
+            self._score = _raising(error)
+
+
+def score_all(
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
+) -> Iterator[tuple[Job, Outcome]]:
+    """Yields jobs with their scores, or why there are none; see `run_all`.
+
+    Args:
+        jobs: what to score.
+        make_scorer: called once in every process; has to be picklable for more than one.
+        workers: processes; 1 = this one.
+        threads: of each process, where there are several.
+    """
+    several = workers > 1 and len(jobs) > 1
+    make_run = partial(_LateScoring if several else _Scoring, make_scorer)
+    yield from run_all(jobs, make_run, workers, threads)
+
+
+class _RayWorker:
+    """Lives in an actor."""
+
+    def __init__(self, make_scorer: Callable[[], Scorer]) -> None:
+        self._scoring = _LateScoring(make_scorer)
+
+    def run(self, number: int, job: Any) -> tuple[int, Outcome]:
+        return number, self._scoring(job)
 
 
 def score_with_ray(
     jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, address: str = ''
 ) -> Iterator[tuple[Job, Outcome]]:
-    """Yields jobs with their outcome, as they are done.
+    """Yields jobs with their scores, or why there are none, from actors of a Ray cluster.
 
     Every machine of the cluster needs this package, and checkpoints under the same path.
 
@@ -180,14 +218,14 @@ def score_with_ray(
     except (ConnectionError, ValueError) as error:
         raise ConfigError(f"Ray cannot be reached at '{address}': {error}; set --ray") from error
     try:
-        actor = ray.remote(num_cpus=1)(_Worker)
+        actor = ray.remote(num_cpus=1)(_RayWorker)
         pool = ray.util.ActorPool([actor.remote(make_scorer) for _ in range(workers)])
         numbered = list(enumerate(jobs))
-        for number, outcome in pool.map_unordered(lambda a, one: a.score.remote(*one), numbered):
+        for number, outcome in pool.map_unordered(lambda a, one: a.run.remote(*one), numbered):
             yield jobs[number], outcome
     except ray.exceptions.RayError as error:
         raise MtvWorldError(
-            f'a Ray worker died ({error}); what was scored is kept: run the command again'
+            f'a Ray worker died ({error}); what is done is kept: run the command again'
         ) from error
     finally:
         ray.shutdown()

@@ -127,7 +127,7 @@ def reliability_page(found: Calibrated) -> str:
         'head',
         element('meta', charset='utf-8'),
         element('title', 'Reliability of the success estimate'),
-        element('style', Markup(share_path('resource', 'report.css').read_text('utf-8'))),
+        element('style', Markup(share_path('resource', 'report', 'style.css').read_text('utf-8'))),
     )
     body = element('main', element('h1', 'Reliability of the success estimate'), *figures)
     return f'<!DOCTYPE html>\n{element("html", head, element("body", body), lang="en")}\n'

@@ -83,7 +83,7 @@ def page(evaluations: Sequence[Evaluated]) -> str:
 
 def document(title: str, content: Markup) -> str:
     """Returns a whole page in the report's style, from which no request leaves."""
-    style = share_path('resource', 'report.css').read_text(encoding='utf-8')
+    style = share_path('resource', 'report', 'style.css').read_text(encoding='utf-8')
     head = element(
         'head',
         element('meta', charset='utf-8'),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
+import fcntl
+from functools import partial
 import json
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.parallel import run_all
 from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, SHEET_FILE, write_sheet
 from mtv_world_ros.sim.collect.dataset_card import (
     card_of,
@@ -25,15 +28,15 @@ from mtv_world_ros.sim.collect.dataset_card import (
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.sim.collect.dataset_readme import write_readme
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
 from mtv_world_ros.sim.collect.jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
-from mtv_world_ros.sim.collect.workers import locked, made
 from mtv_world_ros.sim.tasks.tasks import tasks_named
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.zero_shot import kinds_named
 
 #: episodes between two writings of the card
 CARD_EVERY = 20
+LOCK_FILE = '.lock'
 SHEETS_FOLDER = 'sheets'
 
 
@@ -106,6 +109,36 @@ def collect(
     return [data_set.entries[job.path.name] for job in jobs]
 
 
+def _maker(config: CollectConfig) -> Callable[[Job], Spent]:
+    return EpisodeMaker(config).make
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Holds the data set's lock, which ends with the process however that ends.
+
+    Raises:
+        SimulatorError: another process collects into the folder, or it cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        stream = (out / LOCK_FILE).open('a')
+    except OSError as error:
+        raise SimulatorError(
+            f"cannot write into '{out}': {error}; choose another --out"
+        ) from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SimulatorError(
+                f"another `collect` is writing into '{out}'; wait for it, or choose another --out"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+
+
 class _DataSet:
     """What is in the folder of a data set, and its card."""
 
@@ -126,10 +159,8 @@ class _DataSet:
         missing = [job for job in jobs if job.path.name not in self.entries]
         done = len(jobs) - len(missing)
         try:
-            with (
-                tqdm(total=len(jobs), initial=done, unit='ep', disable=not progress) as bar,
-                made(missing, min(workers, max(1, len(missing))), config) as finished,
-            ):
+            finished = run_all(missing, partial(_maker, config), workers)
+            with tqdm(total=len(jobs), initial=done, unit='ep', disable=not progress) as bar:
                 self._show(bar, jobs)
                 for number, (job, _) in enumerate(finished, 1):
                     self.entries[job.path.name] = read_entry(job.path)

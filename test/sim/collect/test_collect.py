@@ -16,11 +16,10 @@ from rosbags.typesys import get_typestore, Stores
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import iter_messages, read_episode, read_info
 from mtv_world_ros.errors import EpisodeError, SimulatorError
-from mtv_world_ros.sim.collect.collect import collect
+from mtv_world_ros.sim.collect.collect import collect, locked
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.sim.collect.record import true_poses
-from mtv_world_ros.sim.collect.workers import locked
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
 from mtv_world_ros.success.task import ever_and_final
