@@ -9,12 +9,32 @@ import re
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
+import yaml
 
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.policies.config import load_policy_config
 from mtv_world_ros.sim.expert.faults import FAULTS
+from mtv_world_ros.success.relations import KINDS
+from mtv_world_ros.success.task import load_task
 
 ROOT = Path(__file__).resolve().parents[2]
 MOST_WORDS = 1200
+#: of the robot that docs/robots.md describes
+URDF = """
+<robot name="my_robot">
+  <link name="base"/><link name="link_1"/><link name="link_2"/><link name="finger"/>
+  <joint name="joint1" type="revolute"><parent link="base"/><child link="link_1"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="joint2" type="revolute"><parent link="link_1"/><child link="link_2"/>
+    <axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="gripper" type="prismatic"><parent link="link_2"/><child link="finger"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="1" velocity="1"/></joint>
+</robot>
+"""
 
 
 def test_the_readme_is_short():
@@ -51,6 +71,41 @@ def test_the_fault_catalogue_has_a_row_for_every_kind():
     page = (ROOT / 'docs' / 'ranking.md').read_text()
     rows = re.findall(r'^\| `(\w+)` \| (\w+) \| (\w+) \|', page, re.M)
     assert rows == [(name, kind.family, kind.split) for name, kind in FAULTS.items()]
+
+
+def test_the_page_of_tasks_has_every_relation():
+    page = (ROOT / 'docs' / 'tasks.md').read_text()
+    assert not [kind for kind in KINDS if f'`{kind}`' not in page and f'kind: {kind}' not in page]
+
+
+YAML_BLOCK = re.compile(r'^```yaml\n(.*?)^```', re.M | re.S)
+YAML_BLOCKS = [
+    pytest.param(block, id=f'{page.name}-{number}')
+    for page in sorted((ROOT / 'docs').glob('*.md'))
+    for number, block in enumerate(
+        re.findall(r'^```yaml\n(.*?)^```', page.read_text(), re.M | re.S)
+    )
+]
+
+
+@pytest.mark.parametrize('block', YAML_BLOCKS)
+def test_yaml_in_the_pages_can_be_used(block, tmp_path):
+    file = tmp_path / 'block.yaml'
+    file.write_text(block)
+    values = yaml.safe_load(block)
+    if 'relations' in values:
+        for name in re.findall(r'\w+\.png', block):
+            cv2.imwrite(str(tmp_path / name), np.full((72, 96, 3), 255, np.uint8))
+        load_task(file)
+    elif 'dh' in values or 'urdf' in values:
+        (tmp_path / 'my_robot.urdf').write_text(URDF)
+        load_robot(file)
+    elif 'kind' in values:
+        load_policy_config(file)
+    elif 'views' in values:
+        load_calibration(file)
+    else:
+        assert 'qos_overrides' in values
 
 
 @pytest.mark.skipif(

@@ -93,7 +93,7 @@ class Block:
 def pages() -> list[Path]:
     """The README, the pages in the order of the site, and what else shows commands."""
     text = (ROOT / 'mkdocs.yml').read_text()
-    names = re.findall(r'- (\w+\.md)$', text, re.M)
+    names = re.findall(r'- (?:.+: )?(\w+\.md)$', text, re.M)
     return [
         ROOT / 'README.md',
         *(ROOT / 'docs' / name for name in names),
