@@ -52,6 +52,7 @@ setup(
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pin>=4.1,<5',
+        'pydantic>=2.10',
         'rosbags>=0.11',
         'safetensors>=0.8',
         'tokenizers>=0.22',

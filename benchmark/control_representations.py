@@ -99,7 +99,7 @@ def train_row(name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Trains a row, or goes on; returns what is known of it."""
     config, folder = config_of(ROWS[name], options), options.work / name
     file = folder / 'row.json'
-    settings = plain({'config': config.as_dict(), 'seed': options.seed})
+    settings = plain({'config': config.model_dump(), 'seed': options.seed})
     if file.is_file():
         known = json.loads(file.read_text())
         if known['settings'] != settings:

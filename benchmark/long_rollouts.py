@@ -36,7 +36,7 @@ from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 from mtv_world_ros.evaluation.report.summary import Summary
 from mtv_world_ros.files import write_json
-from mtv_world_ros.model.history_tokens import HistorySettings
+from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.training.run import spread

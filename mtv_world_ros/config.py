@@ -1,15 +1,196 @@
-"""Values of YAML files, checked: every error says the file, the key and what would be valid."""
+"""What users write: typed models, and errors that say the file, the key and what would be valid.
+
+A model is a `Schema`: frozen, strict (no text where a number belongs) and without unknown keys.
+Defaults, ranges and descriptions stand in its fields and nowhere else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+import re
+from typing import Annotated, Any, ClassVar, Self, TYPE_CHECKING, TypeVar
 
 import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    model_validator,
+    Strict,
+    ValidationError,
+    WrapValidator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
 import yaml
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
+
+Item = TypeVar('Item')
+Model = TypeVar('Model', bound='Schema')
+
+
+def expected(what: str) -> WrapValidator:
+    """Returns an annotation: errors of its field say that `what` is valid, e.g. `in [0, 1]`."""
+
+    def checked(value: Any, validate: Any) -> Any:
+        try:
+            return validate(value)
+        except ValidationError:
+            raise PydanticCustomError('expected', '{what}', {'what': what}) from None
+
+    return WrapValidator(checked)
+
+
+#: a YAML list
+ListOf = Annotated[tuple[Item, ...], Strict(False)]
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+Pair = Annotated[tuple[float, float], Strict(False), expected('a list of 2 numbers')]
+Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]
+
+
+class Schema(BaseModel):
+    """Base of everything that users write.
+
+    Attributes:
+        section: how errors name a value: None = by its quoted key; a text = by its dotted path,
+            which begins with this text if the model is made by itself.
+    """
+
+    model_config = ConfigDict(frozen=True, extra='forbid', strict=True, allow_inf_nan=False)
+    section: ClassVar[str | None] = None
+
+    if not TYPE_CHECKING:
+
+        def __init__(self, **values: Any) -> None:
+            try:
+                super().__init__(**values)
+            except ValidationError as failed:
+                raise ConfigError(_explain(failed, type(self))) from failed
+
+        # so that nested models are validated by the outer one, whose error has the whole path
+        __init__.__pydantic_base_init__ = True
+
+    @model_validator(mode='before')
+    @classmethod
+    def _has_known_keys(cls, values: Any) -> Any:
+        if isinstance(values, cls):
+            return values
+        if not isinstance(values, Mapping):
+            raise ValueError(f'expected keys and values, got {values!r}')
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in values:
+            if key not in known:
+                raise ValueError(
+                    f"unknown key '{key}'{nearest(str(key), known)}; known are {', '.join(known)}"
+                )
+        return values
+
+    def replace(self, **changes: Any) -> Self:
+        """Returns a copy with changed values.
+
+        Raises:
+            ConfigError: a changed value is wrong.
+        """
+        return type(self)(**{**dict(self), **changes})
+
+
+def validated(
+    kind: type[Model],
+    values: Any,
+    where: str,
+    *,
+    context: Mapping[str, Any] | None = None,
+    error: type[MtvWorldError] = ConfigError,
+) -> Model:
+    """Returns the model that plain values describe.
+
+    Args:
+        kind: the model.
+        values: e.g. of a YAML file.
+        where: what the error begins with, e.g. the file.
+        context: what validators need to know, e.g. the robot.
+        error: raised instead of `ConfigError`.
+
+    Raises:
+        ConfigError: an unknown or missing key, or a wrong value.
+    """
+    try:
+        return kind.model_validate(values, context=context or {})
+    except ValidationError as failed:
+        raise error(f'{where}: {_explain(failed, kind)}') from failed
+
+
+#: what is valid, by pydantic's type of error
+_VALID = {
+    'greater_than_equal': 'at least {ge:g}',
+    'less_than': 'below {lt:g}',
+    'less_than_equal': 'at most {le:g}',
+    'finite_number': 'a finite number',
+    'float_type': 'a finite number',
+    'int_type': 'a whole number',
+    'bool_type': 'true or false',
+    'string_type': 'a text',
+    'tuple_type': 'a list',
+    'dict_type': 'keys and values',
+    'mapping_type': 'keys and values',
+    'expected': '{what}',
+}
+
+
+def _explain(failed: ValidationError, kind: type[Schema]) -> str:
+    """The first error: key, value and what would be valid."""
+    error = failed.errors(include_url=False)[0]
+    if error['type'] == 'value_error':  # a validator's own text
+        where = _path(error['loc']) or kind.section
+        return ': '.join(filter(None, (where, str(error.get('ctx', {})['error']))))
+    if error['type'] == 'missing':
+        return _inside(error, f"key '{error['loc'][-1]}' is missing")
+    if kind.section is None:
+        return _inside(error, _quoted(error))
+    return _dotted(error, kind.section)
+
+
+def _quoted(error: ErrorDetails) -> str:
+    """E.g. `'gripper_open' is 'wide', must be a finite number`."""
+    name, value = f"'{error['loc'][-1]}'", error['input']
+    if error['type'] == 'tuple_type':
+        return f'{name} is {value!r}; {name} must be a list'
+    if error['type'] == 'literal_error':
+        known = _choices(error)
+        return f'{name} is {value!r}{nearest(str(value), known)}; valid are {", ".join(known)}'
+    return f'{name} is {value!r}, must be {_valid(error)}'
+
+
+def _dotted(error: ErrorDetails, section: str) -> str:
+    """E.g. `optimizer.steps is 0; it must be at least 1`."""
+    name, value = '.'.join(filter(None, (section, _path(error['loc'])))), error['input']
+    if error['type'] == 'literal_error':
+        known = _choices(error)
+        return f'{name} {value!r} is not one of {", ".join(known)}{nearest(str(value), known)}'
+    return f'{name} is {value!r}; it must be {_valid(error)}'
+
+
+def _inside(error: ErrorDetails, text: str) -> str:
+    return ': '.join(filter(None, (_path(error['loc'][:-1]), text)))
+
+
+def _path(loc: Sequence[int | str]) -> str:
+    """E.g. `tools[0].link`."""
+    parts = (f'[{part}]' if isinstance(part, int) else f'.{part}' for part in loc)
+    return ''.join(parts).removeprefix('.')
+
+
+def _choices(error: ErrorDetails) -> list[str]:
+    return re.findall(r"'([^']*)'", error.get('ctx', {})['expected'])
+
+
+def _valid(error: ErrorDetails) -> str:
+    context = error.get('ctx', {})
+    if error['type'] == 'greater_than':
+        return f'above {context["gt"]:g}' if context['gt'] else 'positive'
+    return _VALID.get(error['type'], error['msg']).format(**context)
 
 
 def read_yaml(

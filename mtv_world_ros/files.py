@@ -11,7 +11,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
 
@@ -44,6 +44,25 @@ def share_path(*parts: str) -> Path:
     searched = ', '.join(str(root) for root in roots)
     wanted = '/'.join(parts)
     raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")
+
+
+def bundled(kind: str, name: str | Path, setting: str) -> Path:
+    """Returns the YAML file of `config/<kind>` with this name, or `name` if it is a YAML path.
+
+    Raises:
+        ConfigError: there is no such file; names the nearest known one and `setting`.
+    """
+    path = Path(name)
+    if path.suffix in ('.yaml', '.yml'):
+        return path
+    folder = share_path('config', kind)
+    known = sorted(file.stem for file in folder.glob('*.yaml'))
+    if str(name) not in known:
+        raise ConfigError(
+            f"'{name}' is not in config/{kind}{nearest(str(name), known)}; set '{setting}' to a "
+            f'YAML file or to one of {", ".join(known)}'
+        )
+    return folder / f'{name}.yaml'
 
 
 def content_digest(folder: Path, without: Collection[str] = ()) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,7 +44,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
     # public weights never saw a history: they take one once they are trained with it
-    config = replace(load_training_config(arguments.preset), history=HistoryConfig())
+    config = load_training_config(arguments.preset).replace(history=HistoryConfig())
     text = {
         'prompt': arguments.prompt,
         'negative_prompt': arguments.negative_prompt,

@@ -35,13 +35,14 @@ _LEAST_HALF_RANGE = 1e-3
 _VERTICAL = 1e-9
 
 
-def check_control(name: str) -> None:
-    """Raises ConfigError if it is none of `CONTROLS`."""
+def check_control(name: str) -> str:
+    """Returns the name; raises ConfigError if it is none of `CONTROLS`."""
     if name not in CONTROLS:
         raise ConfigError(
             f"control '{name}' is not one of {', '.join(CONTROLS)}{nearest(str(name), CONTROLS)}; "
             'set video.control or --control'
         )
+    return name
 
 
 def action_names(control: str, robot: RobotModel) -> tuple[str, ...]:

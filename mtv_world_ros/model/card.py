@@ -5,43 +5,104 @@ from __future__ import annotations
 from collections.abc import Mapping
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
+from pydantic import AfterValidator, Field
+
+from mtv_world_ros.config import expected, ListOf, Positive, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.action_features import CONTROLS
 
 CARD = 'world_model.json'
-_CARD_KEYS = {
-    'views': list,
-    'fps': (int, float),
-    'num_frames': int,
-    'width': int,
-    'height': int,
-    'robot': str,
-    'control': str,
-    'object_mask': bool,
-    'rendering': dict,
-    'trained_on': dict,
-}
+
+
+class HistorySettings(Schema):
+    """Whether and how a model takes up what a rollout showed before; the default is not at all."""
+
+    section: ClassVar = 'history'
+
+    num_frames: int = Field(
+        default=0,
+        ge=0,
+        description="N, frames before the chunk's start frame; 0 = no history tokens",
+    )
+    noise_level: Annotated[float, expected('at least 0 and below 1')] = Field(
+        default=0.05,
+        ge=0,
+        lt=1,
+        description="share of noise in the history's latents: enough to hide what a model's own "
+        'frames look like, too little to hide what they show',
+    )
+    reference: Literal['chunk_start', 'first_frame'] = Field(
+        default='chunk_start', description='frame that the reference tokens show'
+    )
+
+    @property
+    def on(self) -> bool:
+        """Whether the model takes up anything."""
+        return self.num_frames > 0 or self.anchored
+
+    @property
+    def anchored(self) -> bool:
+        """Whether the reference tokens show the rollout's first frame."""
+        return self.reference == 'first_frame'
+
+    def as_card(self) -> dict[str, Any]:
+        """Returns the checkpoint card's entry; empty where nothing is on."""
+        names = set(HistorySettings.model_fields)
+        return {'history': self.model_dump(include=names)} if self.on else {}
+
+
+def _known_control(name: str) -> str:
+    if name not in CONTROLS:
+        raise ValueError(f"'{name}' is not one of {', '.join(CONTROLS)}")
+    return name
+
+
+def _some_steps(count: int) -> int:
+    if count < 1:
+        raise ValueError(f'num_inference_steps is {count}; it must be at least 1')
+    return count
+
+
+class CheckpointCard(Schema):
+    """Contents of `world_model.json`."""
+
+    views: ListOf[str]
+    fps: Positive
+    num_frames: int
+    width: int
+    height: int
+    robot: str
+    control: Annotated[str, AfterValidator(_known_control)]
+    object_mask: bool
+    rendering: dict[str, Any]
+    trained_on: dict[str, Any]
+    prompt: str = Field(default='', description='instruction of models with text')
+    negative_prompt: str = Field(default='', description='text that guidance leads away from')
+    guidance_scale: float = 1.0
+    num_inference_steps: Annotated[int, AfterValidator(_some_steps)] = Field(
+        default=4, description='denoising steps that the model is made for'
+    )
+    history: HistorySettings = HistorySettings()
+
+
+#: what only some checkpoints have
+OPTIONAL_KEYS = tuple(k for k, f in CheckpointCard.model_fields.items() if not f.is_required())
 #: what an adapter and the checkpoint that it is used on have in common
-SHARED_KEYS = tuple(key for key in _CARD_KEYS if key not in ('rendering', 'trained_on'))
-#: what only models with text need: the instruction, what to keep away from and how strongly; the
-#: denoising steps that a model is made for; and `history.HistorySettings`
-OPTIONAL_KEYS = {
-    'prompt': str,
-    'negative_prompt': str,
-    'guidance_scale': (int, float),
-    'num_inference_steps': int,
-    'history': dict,
-}
+SHARED_KEYS = tuple(
+    key
+    for key in CheckpointCard.model_fields
+    if key not in ('rendering', 'trained_on', *OPTIONAL_KEYS)
+)
 
 
 def read_card(folder: Path) -> dict[str, Any]:
     """Returns the checked contents of `world_model.json`.
 
     Raises:
-        CheckpointError: missing, not JSON, or with missing, unknown or ill-typed keys.
+        CheckpointError: missing, not JSON, or with missing, unknown or wrong values.
     """
     path = Path(folder) / CARD
     if not path.is_file():
@@ -55,6 +116,15 @@ def read_card(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
     check_card(card, path)
     return card
+
+
+def check_card(card: Mapping[str, Any], path: Path) -> None:
+    """Checks the contents of a card; `path` is for the message.
+
+    Raises:
+        CheckpointError: missing, unknown or wrong values.
+    """
+    validated(CheckpointCard, card, f"'{path}'", error=CheckpointError)
 
 
 def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
@@ -93,33 +163,11 @@ def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
     )
 
 
-def check_card(card: Mapping[str, Any], path: Path) -> None:
-    """Checks the keys and types of a card; `path` is for the message.
+def history_settings(card: Mapping[str, Any]) -> HistorySettings:
+    """Returns what a checkpoint's card says of its history.
 
     Raises:
-        CheckpointError: missing, unknown or ill-typed keys.
+        CheckpointError: an unknown key or a wrong value.
     """
-    _check_keys(card, path)
-    num_steps = card.get('num_inference_steps', 1)
-    if num_steps < 1:
-        raise CheckpointError(
-            f"'{path}': num_inference_steps is {num_steps}; it must be at least 1"
-        )
-    if card['control'] not in CONTROLS:
-        raise CheckpointError(
-            f"'{path}': control '{card['control']}' is not one of {', '.join(CONTROLS)}"
-        )
-
-
-def _check_keys(card: Mapping[str, Any], path: Path) -> None:
-    known = {**_CARD_KEYS, **OPTIONAL_KEYS}
-    for key in card:
-        if key not in known:
-            raise CheckpointError(f"'{path}': unknown key '{key}'{nearest(key, known)}")
-    for key, kind in known.items():
-        if key not in card:
-            if key in OPTIONAL_KEYS:
-                continue
-            raise CheckpointError(f"'{path}': key '{key}' is missing")
-        if not isinstance(card[key], kind):
-            raise CheckpointError(f"'{path}': '{key}' is {card[key]!r}, expected {kind}")
+    where = f"{CARD}: 'history' cannot be used"
+    return validated(HistorySettings, card.get('history', {}), where, error=CheckpointError)

@@ -13,7 +13,7 @@ import torch
 from mtv_world_ros.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.model.card import check_same_model, spec_of
+from mtv_world_ros.model.card import check_same_model, history_settings, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
     condition,
@@ -23,7 +23,6 @@ from mtv_world_ros.model.conditioning import (
 )
 from mtv_world_ros.model.history_tokens import (
     check_history,
-    history_settings,
     with_anchor,
     with_history,
     without_history,

@@ -8,10 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import colorsys
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
+from pydantic import Field
 
+from mtv_world_ros.config import expected, Schema, Share
 from mtv_world_ros.data_types import (
     BoolArray,
     ByteArray,
@@ -19,7 +22,7 @@ from mtv_world_ros.data_types import (
     FloatArray,
     MultiViewVideo,
 )
-from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
+from mtv_world_ros.errors import ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.glow import (
@@ -43,56 +46,51 @@ _SHIFT = 4
 #: pieces that end further than this many image sizes away are left out
 _FARTHEST = 4.0
 
+_Length = Annotated[float, Field(gt=0), expected('positive and finite')]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryVideoConfig:
-    """How trajectory videos look; a model is served with what it was trained with.
 
-    Attributes:
-        half_life_s: time after which a point of the trail is half as bright [s].
-        point_radius_m: standard deviation of the glow, at the point's depth [m].
-        min_radius_px: smallest standard deviation of the glow [px].
-        object_fill: brightness of object fills, 0 .. 1.
-        show_gripper: whether the newest point has a core, white as far as the gripper is closed.
-        points_per_frame: least number of trail points from one frame to the next.
-        max_gap_m: largest distance of trail points from each other [m], so that the trails of
-            fast arms have no gaps; None leaves it at `points_per_frame`.
-        link_width_m: width of lines along each arm, from joint to joint, under the trails [m];
-            None = none, as in the paper.
-        finger_width_m: width of a line along each finger, white and magenta, apart as far as the
-            gripper is commanded to open [m]; None = none, as in the paper.
-        object_motion: objects are shown themselves, over the trails, where they are expected to
-            be; else as fills where they were, as in the paper.
-    """
+class TrajectoryVideoConfig(Schema):
+    """How trajectory videos look; a model is served with what it was trained with."""
 
-    half_life_s: float = 0.5
-    point_radius_m: float = 0.012
-    min_radius_px: float = 0.8
-    object_fill: float = 0.35
-    show_gripper: bool = True
-    points_per_frame: int = 3
-    max_gap_m: float | None = None
-    link_width_m: float | None = None
-    finger_width_m: float | None = None
-    object_motion: bool = False
+    section: ClassVar = 'rendering'
 
-    def __post_init__(self) -> None:
-        for name in ('half_life_s', 'point_radius_m', 'min_radius_px'):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(
-                    f'rendering.{name} is {getattr(self, name)}, must be positive and finite'
-                )
-        if not 0 <= self.object_fill <= 1:
-            raise ConfigError(f'rendering.object_fill is {self.object_fill}, must be in 0 .. 1')
-        if self.points_per_frame < 1 or self.points_per_frame != int(self.points_per_frame):
-            raise ConfigError(
-                f'rendering.points_per_frame is {self.points_per_frame}, must be a whole number '
-                'of at least 1'
-            )
-        for name in ('max_gap_m', 'link_width_m', 'finger_width_m'):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ConfigError(f'rendering.{name} is {value}, must be > 0 and finite, or null')
+    half_life_s: _Length = Field(
+        default=0.5, description='time after which a point of the trail is half as bright [s]'
+    )
+    point_radius_m: _Length = Field(
+        default=0.012, description="standard deviation of the glow, at the point's depth [m]"
+    )
+    min_radius_px: _Length = Field(
+        default=0.8, description='smallest standard deviation of the glow [px]'
+    )
+    object_fill: Share = Field(default=0.35, description='brightness of object fills')
+    show_gripper: bool = Field(
+        default=True,
+        description='the newest point has a core, the whiter the more the gripper is closed',
+    )
+    points_per_frame: Annotated[int, expected('a whole number of at least 1')] = Field(
+        default=3, ge=1, description='least number of trail points from one frame to the next'
+    )
+    max_gap_m: _Length | None = Field(
+        default=None,
+        description='largest distance between trail points [m], so that trails of fast arms have '
+        'no gaps; null = as `points_per_frame` says',
+    )
+    link_width_m: _Length | None = Field(
+        default=None,
+        description='width of lines along each arm, from joint to joint, under the trails [m]; '
+        'null = none, as in the paper',
+    )
+    finger_width_m: _Length | None = Field(
+        default=None,
+        description='width of a line along each finger [m], white and magenta, as far apart as '
+        'the gripper is commanded to open; null = none, as in the paper',
+    )
+    object_motion: bool = Field(
+        default=False,
+        description='objects are drawn as they look, over the trails, where they are expected to '
+        'be; else as fills where they were, as in the paper',
+    )
 
 
 #: the core that shows a closed gripper, as a share of the glow's standard deviation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import hashlib
 import json
 from pathlib import Path
@@ -110,7 +110,7 @@ def _check_transformer(
 def _check_card(config: TrainingConfig, card: Mapping[str, Any], folder: Path) -> None:
     """An adapter is served under its base's card, so it has to be trained under it too."""
     mine = config.card({})
-    theirs = {**card, 'rendering': asdict(TrajectoryVideoConfig(**card['rendering']))}
+    theirs = {**card, 'rendering': TrajectoryVideoConfig(**card['rendering']).model_dump()}
     for name in (*SHARED_KEYS, 'rendering', 'history'):
         held, wanted = theirs.get(name), mine.get(name)
         if _plain(held) != _plain(wanted):

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.model.card import spec_of
+from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning
-from mtv_world_ros.model.history_tokens import history_settings
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, flow_of
@@ -225,8 +224,7 @@ def distill(
 def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfig:
     """Returns a configuration with the teacher's architecture, video and rendering."""
     card, spec = teacher.card, spec_of(teacher.card)
-    return replace(
-        config,
+    return config.replace(
         transformer=_arguments(teacher.transformer.config),
         autoencoder=_with_class(getattr(teacher.autoencoder, 'vae', teacher.autoencoder)),
         scheduler=_with_class(teacher.scheduler),
@@ -241,7 +239,7 @@ def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfi
             object_mask=card['object_mask'],
         ),
         rendering=TrajectoryVideoConfig(**card['rendering']),
-        history=replace(config.history, **asdict(history_settings(card))),
+        history=config.history.replace(**dict(history_settings(card))),
         lora=LoraSettings(),  # all of the student is trained
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import time
 from typing import Any
 
@@ -256,6 +256,6 @@ def ideal_seconds(
     model's arithmetic.
     """
     dim = 0 if actions is None else actions.dim
-    optimizer = replace(config.optimizer, gradient_checkpointing=False)
-    config = replace(config, optimizer=optimizer)
+    optimizer = config.optimizer.replace(gradient_checkpointing=False)
+    config = config.replace(optimizer=optimizer)
     return step_cost(config, action_dim=dim, dtype=dtype).step_flop / flops

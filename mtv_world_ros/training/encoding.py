@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
+from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.conditioning import (
     condition,
     condition_on_actions,
@@ -19,7 +20,7 @@ from mtv_world_ros.model.conditioning import (
     encode_chunk,
 )
 from mtv_world_ros.model.encoders import ImageEncoder
-from mtv_world_ros.model.history_tokens import HistorySettings, with_anchor, with_history
+from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.batches import Batch

@@ -15,8 +15,8 @@ from torch import Tensor
 from mtv_world_ros.data_types import History
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
+from mtv_world_ros.model.card import history_settings
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.model.history_tokens import history_settings
 from mtv_world_ros.model.transformer.tokens import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 

@@ -1,7 +1,5 @@
 """The lines along the arms, on gantries whose slides carry the tool from the base's origin."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 
 PLAIN = TrajectoryVideoConfig(show_gripper=False)
-LINKS = replace(PLAIN, link_width_m=0.02)
+LINKS = PLAIN.replace(link_width_m=0.02)
 #: the arm's slides stand in the base, so the camera looks at it from outside
 BACK = np.eye(4) + np.pad(np.array([[0.2], [0.1], [-1.0]]), ((0, 1), (3, 0)))
 
@@ -69,7 +67,7 @@ def test_a_line_is_as_wide_as_its_depth_says(one_arm, make_camera):
         pose[2, 3] = -depth
         camera = make_camera(384, 288, T_mount_camera=pose)
         # along y, from (0.1, 0, 0) to (0.1, 0.3, 0)
-        config = replace(PLAIN, link_width_m=0.04)
+        config = PLAIN.replace(link_width_m=0.04)
         lit = render(one_arm, camera, [[(0.1, 0.3, 0)]], config)[0].max(axis=-1) > 60
         row = lit[144 + int(384 * 0.1 / depth)]
         assert abs(int(row.sum()) - width) <= 3

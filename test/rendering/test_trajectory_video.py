@@ -1,4 +1,4 @@
-from dataclasses import asdict, replace
+from dataclasses import replace
 import json
 
 import cv2
@@ -93,7 +93,7 @@ def test_trails_equal_the_plain_drawing_of_every_point(
     t = np.linspace(0, 1, 7)
     times = np.cumsum([0, 0.1, 0.3, 0.2, 0.05, 0.4, 0.2])
     points = [np.stack([0.6 * t - 0.2, 0.3 * np.sin(5 * t), 1 + 0.5 * t], axis=1)]
-    config = replace(PLAIN, max_gap_m=max_gap_m)
+    config = PLAIN.replace(max_gap_m=max_gap_m)
     frames = render(one_arm, camera, points, times, config=config)[0]
     expected = reference(one_arm, camera, points, times, config)
     np.testing.assert_allclose(frames, expected, atol=2.1 / 255)
@@ -119,7 +119,7 @@ def test_a_glyph_whose_centre_left_the_image_keeps_the_part_inside(one_arm, make
     camera = make_camera()
     bigger = replace(camera, width=136, height=112, K=camera.K + [[0, 0, 20], [0, 0, 20], [0] * 3])
     ray = np.linalg.solve(camera.K, [*centre, 1.0])
-    config = replace(PLAIN, point_radius_m=0.03)
+    config = PLAIN.replace(point_radius_m=0.03)
     inside = render(one_arm, camera, still(0.9 * ray), config=config)
     whole = render(one_arm, bigger, still(0.9 * ray), config=config)
     assert inside.max() > 0.1
@@ -205,7 +205,7 @@ def test_intrinsics_follow_the_image_size(one_arm, make_camera):
 def test_frame_k_shows_the_state_after_command_k_and_frame_0_the_current_one(one_arm, make_camera):
     camera = make_camera()
     points = np.array([[(0.1 * k - 0.3, 0, 1.0) for k in range(7)]])
-    frames = render(one_arm, camera, points, config=replace(PLAIN, half_life_s=1e-3))[0]
+    frames = render(one_arm, camera, points, config=PLAIN.replace(half_life_s=1e-3))[0]
     for k, frame in enumerate(frames):
         x = 96 * points[0, k, 0] + camera.K[0, 2]
         np.testing.assert_allclose(centroid(frame), (x, camera.K[1, 2]), atol=0.05)
@@ -241,7 +241,7 @@ def test_brightness_halves_every_half_life_whatever_the_frame_rate(one_arm, make
         times = np.arange(2 * fps + 1) / fps
         points = np.tile([(0.3, 0.2, 1.0)], (1, len(times), 1))
         points[0, 0] = (-0.3, -0.2, 1.0)
-        config = replace(PLAIN, half_life_s=0.5, points_per_frame=1)
+        config = PLAIN.replace(half_life_s=0.5, points_per_frame=1)
         frames = render(one_arm, make_camera(), points, times, config=config)[0]
         left = frames[:, 16, 19].max(-1) / frames[0, 16, 19].max()
         np.testing.assert_allclose(left, 0.5 ** (times / 0.5), atol=1.5 / 255)
@@ -254,7 +254,7 @@ def test_an_arm_at_rest_does_not_burn_in(one_arm, make_camera):
 
 def test_a_fast_arm_leaves_a_trail_without_gaps(one_arm, make_camera):
     points = [[(-0.08, 0, 1.0), (0.08, 0, 1.0)]]
-    config = replace(PLAIN, max_gap_m=0.012)
+    config = PLAIN.replace(max_gap_m=0.012)
     frame = render(one_arm, make_camera(), points, [0.0, 0.2], config=config)[0, 1]
     assert frame[35, 41:55].max(axis=-1).min() > 0.5
 
@@ -389,4 +389,4 @@ def test_wrong_settings_are_named(key, value):
 
 def test_settings_survive_a_checkpoints_card():
     config = TrajectoryVideoConfig(half_life_s=0.3, show_gripper=False)
-    assert TrajectoryVideoConfig(**json.loads(json.dumps(asdict(config)))) == config
+    assert TrajectoryVideoConfig(**json.loads(json.dumps(config.model_dump()))) == config

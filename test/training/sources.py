@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from mtv_world_ros.data.recording import Recording
@@ -15,7 +14,7 @@ from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 def with_batch_size(config: TrainingConfig, batch_size: int) -> TrainingConfig:
     """The same with another batch size."""
-    return replace(config, optimizer=replace(config.optimizer, batch_size=batch_size))
+    return config.replace(optimizer=config.optimizer.replace(batch_size=batch_size))
 
 
 def make_source(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 import json
 from pathlib import Path
 
@@ -30,7 +29,7 @@ ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']
 
 
 def with_control(config: TrainingConfig, control: str, **video: object) -> TrainingConfig:
-    return replace(config, video=replace(config.video, control=control, **video))
+    return config.replace(video=config.video.replace(control=control, **video))
 
 
 def run(config: TrainingConfig, episode: Path, out: Path, robot: RobotModel, **options) -> Path:
@@ -48,9 +47,9 @@ def test_a_run_cut_in_two_ends_as_the_whole_one(
 ) -> None:
     """Of `fast_tokens`, which has most to carry over: percentiles and a vocabulary."""
     config = with_control(tiny, 'fast_tokens')
-    config = replace(config, optimizer=replace(config.optimizer, decay_share=0.0))
+    config = config.replace(optimizer=config.optimizer.replace(decay_share=0.0))
     whole = run(config, episode, tmp_path / 'whole', robot)
-    half = replace(config, optimizer=replace(config.optimizer, steps=2))
+    half = config.replace(optimizer=config.optimizer.replace(steps=2))
     run(half, episode, tmp_path / 'cut', robot)
     cut = weights(run(config, episode, tmp_path / 'cut', robot))
     for name, value in weights(whole).items():
@@ -111,7 +110,7 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel
 ) -> None:
     def drawn_pixels(object_mask: bool) -> int:
-        drawn = replace(tiny, video=replace(tiny.video, object_mask=object_mask))
+        drawn = tiny.replace(video=tiny.video.replace(object_mask=object_mask))
         source = make_source([recording], drawn, robot)
         batch = source.batch(0)
         source.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 import json
 from pathlib import Path
 
@@ -79,11 +78,11 @@ def test_a_teacher_with_history_has_a_student_with_history(
     tiny: TrainingConfig, recording: Recording, robot: RobotModel, tmp_path: Path
 ) -> None:
     settings = HistoryConfig(num_frames=2, reference='first_frame')
-    teacher = make_teacher(replace(tiny, history=settings), tmp_path)
+    teacher = make_teacher(tiny.replace(history=settings), tmp_path)
     same = make(tmp_path / 'same', teacher, tiny, num_steps=2, teacher_steps=2)
     assert same.config.history == settings
     source = make_source(
-        [recording], with_batch_size(replace(tiny, history=same.config.history), 2), robot
+        [recording], with_batch_size(tiny.replace(history=same.config.history), 2), robot
     )
     assert same.loss(source.batch(0)).mean.item() < 1e-7
     source.close()
@@ -92,7 +91,7 @@ def test_a_teacher_with_history_has_a_student_with_history(
 def test_learns_and_a_killed_run_continues_as_if_nothing_had_happened(
     teacher: Path, tiny: TrainingConfig, source: BatchSource, tmp_path: Path
 ) -> None:
-    config = replace(tiny, optimizer=replace(tiny.optimizer, steps=12, learning_rate=5e-3))
+    config = tiny.replace(optimizer=tiny.optimizer.replace(steps=12, learning_rate=5e-3))
     whole = make(tmp_path / 'whole', teacher, config, num_steps=1)
     losses = run(whole, source)
     assert sum(losses[-3:]) < 0.8 * sum(losses[:3])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -65,4 +63,4 @@ def test_without_dropout_nothing_is_drawn() -> None:
 def test_settings_out_of_range_are_refused(make, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make()
-    assert replace(AugmentConfig(), image_dropout=1.0).image_dropout == 1.0
+    assert AugmentConfig().replace(image_dropout=1.0).image_dropout == 1.0

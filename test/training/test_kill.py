@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
 import json
 import os
 from pathlib import Path
@@ -23,9 +22,9 @@ ROOT = Path(__file__).parents[2]
 def test_kill_9_changes_neither_curve_nor_weights(
     tiny: TrainingConfig, episode: Path, tmp_path: Path
 ) -> None:
-    config = replace(tiny, optimizer=replace(tiny.optimizer, steps=60))
+    config = tiny.replace(optimizer=tiny.optimizer.replace(steps=60))
     preset = tmp_path / 'preset.yaml'
-    preset.write_text(yaml.safe_dump(json.loads(json.dumps(asdict(config)))))
+    preset.write_text(yaml.safe_dump(json.loads(json.dumps(config.model_dump()))))
     started = subprocess.run(
         [sys.executable, str(SCRIPT), str(tmp_path), str(episode.parent), str(preset)],
         env={**os.environ, 'PYTHONPATH': str(ROOT)},

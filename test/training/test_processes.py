@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
 from datetime import timedelta
 import json
 import os
@@ -29,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 def preset(config: TrainingConfig, folder: Path, steps: int = 3) -> Path:
     """Three clips a step, two processes: one gets two of them."""
-    values = json.loads(json.dumps(asdict(config)))
+    values = json.loads(json.dumps(config.model_dump()))
     values['optimizer'] |= {'batch_size': 3, 'steps': steps, 'max_grad_norm': 1e9}
     file = folder / 'preset.yaml'
     file.write_text(yaml.safe_dump(values))
@@ -79,10 +78,10 @@ def test_accumulated_parts_have_the_gradients_of_the_whole(
     source._numbers = range(3)
     batch = source.batch(0)
     whole = gradients(tiny, batch, tmp_path)
-    settings = replace(tiny.optimizer, batch_size=3, accumulation=2)
-    parts = gradients(replace(tiny, optimizer=settings), batch, tmp_path)
+    settings = tiny.optimizer.replace(batch_size=3, accumulation=2)
+    parts = gradients(tiny.replace(optimizer=settings), batch, tmp_path)
     again = gradients(
-        replace(tiny, optimizer=replace(settings, gradient_checkpointing=True)), batch, tmp_path
+        tiny.replace(optimizer=settings.replace(gradient_checkpointing=True)), batch, tmp_path
     )
     for name, expected in whole.items():
         torch.testing.assert_close(parts[name], expected, rtol=1e-4, atol=1e-6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,11 +32,10 @@ from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 @pytest.fixture
 def rolling(tiny: TrainingConfig) -> TrainingConfig:
     """Every clip that has room for it starts from a rollout of one or two chunks."""
-    return replace(
-        tiny,
-        augment=replace(tiny.augment, colour_permutation=0.0, start_noise=0.0),
+    return tiny.replace(
+        augment=tiny.augment.replace(colour_permutation=0.0, start_noise=0.0),
         self_rollout=SelfRolloutConfig(share=1.0, steps=1, max_chunks=2),
-        optimizer=replace(tiny.optimizer, batch_size=3),
+        optimizer=tiny.optimizer.replace(batch_size=3),
     )
 
 
@@ -83,7 +81,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
 
     And so the history that the clip is shown, behind the same anchor.
     """
-    rolling = replace(rolling, history=history)
+    rolling = rolling.replace(history=history)
     trainer = make_trainer(rolling, tmp_path)
     with torch.no_grad():  # an untrained model holds its start frame; this one does not
         for averaged in trainer.weights.ema.shadow_params:
@@ -178,9 +176,9 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
 def test_off_or_before_its_step_it_changes_nothing(
     recording: Recording, rolling: TrainingConfig, robot: RobotModel, source: BatchSource
 ) -> None:
-    later = replace(rolling, self_rollout=replace(rolling.self_rollout, start_step=3))
+    later = rolling.replace(self_rollout=rolling.self_rollout.replace(start_step=3))
     sources = {
-        'off': make_source([recording], replace(rolling, self_rollout=SelfRolloutConfig()), robot),
+        'off': make_source([recording], rolling.replace(self_rollout=SelfRolloutConfig()), robot),
         'later': make_source([recording], later, robot),
     }
     for step in range(3):
@@ -197,7 +195,7 @@ def test_colours_are_exchanged_in_start_and_target_alike(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """A model that holds its start frame gives back the frame before, in the clip's colours."""
-    config = replace(rolling, augment=replace(rolling.augment, colour_permutation=1.0))
+    config = rolling.replace(augment=rolling.augment.replace(colour_permutation=1.0))
     seen = seen_batches(monkeypatch)
     source = make_source([recording], config, robot)
     monkeypatch.setattr(

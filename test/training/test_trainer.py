@@ -57,7 +57,7 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
 def test_a_killed_run_continues_on_a_gpu(
     tiny: TrainingConfig, source: BatchSource, tmp_path: Path
 ) -> None:
-    config = replace(tiny, optimizer=replace(tiny.optimizer, gradient_checkpointing=True))
+    config = tiny.replace(optimizer=tiny.optimizer.replace(gradient_checkpointing=True))
     reports = make(config, tmp_path, device='cuda').run(
         source, save_every=2, on_save=lambda _: None
     )
@@ -85,9 +85,9 @@ def test_a_lack_of_memory_says_what_to_set(
 def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: RobotModel,
                          tmp_path: Path) -> None:  # fmt: skip
     """The loss on the first frames of one episode halves within 60 steps."""
-    config = replace(tiny, optimizer=replace(tiny.optimizer, steps=60))
-    augment = replace(config.augment, start_noise=0.0, colour_permutation=0.0)
-    source = make_source([recording], replace(config, augment=augment), robot)
+    config = tiny.replace(optimizer=tiny.optimizer.replace(steps=60))
+    augment = config.augment.replace(start_noise=0.0, colour_permutation=0.0)
+    source = make_source([recording], config.replace(augment=augment), robot)
     trainer = make(config, tmp_path)
     batch = source.batch(0)
     before = trainer.loss(batch).mean.item()
@@ -221,7 +221,7 @@ def test_weights_of_another_architecture_are_refused(
     first = make(tiny, tmp_path / 'first')
     first.export(tmp_path / 'checkpoint')
     layers = int(tiny.transformer['num_layers']) + 1
-    deeper = replace(tiny, transformer={**tiny.transformer, 'num_layers': layers})
+    deeper = tiny.replace(transformer={**tiny.transformer, 'num_layers': layers})
     with pytest.raises(TrainingError, match=r'--preset|--init'):
         make(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
 
@@ -230,8 +230,8 @@ def test_failed_episodes_are_drawn_as_often_as_asked(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel
 ) -> None:
     failed = replace(recording, outcome='failure', frames=np.zeros_like(recording.frames))
-    augment = replace(tiny.augment, start_noise=0.0, failure_share=0.5)
-    drawn = replace(tiny, augment=augment, video=replace(tiny.video, object_mask=False))
+    augment = tiny.augment.replace(start_noise=0.0, failure_share=0.5)
+    drawn = tiny.replace(augment=augment, video=tiny.video.replace(object_mask=False))
     source = make_source([recording] * 9 + [failed], drawn, robot)
     black = [not source.batch(step).frames.any() for step in range(60)]
     source.close()

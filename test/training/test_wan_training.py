@@ -118,9 +118,9 @@ def test_the_loss_falls_and_the_frozen_weights_stay(
     config: TrainingConfig, base: Path, batches: BatchSource, tmp_path: Path
 ) -> None:
     """On one batch with the same noise; the base's weights are those of its files."""
-    still = replace(config.augment, control_dropout=0, reference_dropout=0, image_dropout=0)
-    steady = replace(config.objective, sigma_weighting='uniform')
-    trainer = make(replace(config, augment=still, objective=steady), tmp_path, base)
+    still = config.augment.replace(control_dropout=0, reference_dropout=0, image_dropout=0)
+    steady = config.objective.replace(sigma_weighting='uniform')
+    trainer = make(config.replace(augment=still, objective=steady), tmp_path, base)
     batch = batches.batch(0)
     before = trainer.loss(batch).mean.item()
     for _ in range(25):
@@ -232,9 +232,9 @@ def test_a_base_of_another_kind_is_refused(
     config: TrainingConfig, base: Path, section: str, changes: dict, message: str
 ) -> None:
     held = getattr(config, section)
-    other = {**held, **changes} if isinstance(held, dict) else replace(held, **changes)
+    other = {**held, **changes} if isinstance(held, dict) else held.replace(**changes)
     with pytest.raises(TrainingError, match=message):
-        load_base(replace(config, **{section: other}), base, CPU, torch.float32, seed=0)
+        load_base(config.replace(**{section: other}), base, CPU, torch.float32, seed=0)
 
 
 def test_without_a_base_the_command_to_make_one_is_named(

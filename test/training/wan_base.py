@@ -24,7 +24,7 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 def tiny_preset(folder: Path) -> Path:
     """Writes `wan-1.3b` with those changes as a preset file."""
-    values = load_training_config('wan-1.3b').as_dict()
+    values = load_training_config('wan-1.3b').model_dump()
     for section, changes in CHANGES.items():
         values[section] |= changes
     plain = yaml.safe_load(yaml.safe_dump(_plain(values)))

@@ -16,8 +16,7 @@ from torch.utils._pytree import tree_leaves
 
 from mtv_world_ros.errors import ModelMemoryError
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
-from mtv_world_ros.model.card import spec_of
-from mtv_world_ros.model.history_tokens import history_settings
+from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS

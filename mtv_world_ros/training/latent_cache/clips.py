@@ -6,7 +6,7 @@ Shape letters: B batch, V views, C latent channels, F latent frames, h w latent 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 import shutil
 import time
@@ -77,20 +77,20 @@ def settings_of(
         segmenter: name of what finds the objects.
         dtype: of the encoders and of what is kept.
     """
-    video = asdict(config.video)
+    video = config.video.model_dump()
     names = ('views', 'fps', 'num_frames', 'width', 'height')
     settings = {
         'version': _VERSION,
         **{f'video.{name}': video[name] for name in names},
         'autoencoder': content_digest(base / 'autoencoder')[:16],
         'dtype': str(dtype),
-        **{f'history.{k}': v for k, v in asdict(config.history).items()},
+        **{f'history.{k}': v for k, v in config.history.model_dump().items()},
         'trajectory_video': config.video.control == TRAJECTORY_VIDEO,
     }
     if (base / 'image_encoder').is_dir():
         settings['image_encoder'] = content_digest(base / 'image_encoder')[:16]
     if settings['trajectory_video']:
-        settings |= {f'rendering.{k}': v for k, v in asdict(config.rendering).items()}
+        settings |= {f'rendering.{k}': v for k, v in config.rendering.model_dump().items()}
         settings |= {'robot': _robot_digest(robot), 'video.object_mask': video['object_mask']}
         settings['segmenter'] = segmenter if video['object_mask'] else None
     return settings
@@ -230,7 +230,7 @@ def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
     """(B, 3, V, F, h, w) uint8: how much of a latent changes, shows an object, or loses one."""
     parts = []
     for name in WEIGHTS:
-        one = replace(_NO_WEIGHTS, **{name: 1.0})
+        one = _NO_WEIGHTS.replace(**{name: 1.0})
         weights = pixel_weights(batch.frames, batch.object_ids, one)
         parts.append(pooled_weights(weights, shape)[:, :, 0] - 1)
     return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)

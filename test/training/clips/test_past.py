@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +60,7 @@ def test_the_recordings_first_frame_has_nothing_before_it(
     recording: Recording, tiny: TrainingConfig
 ) -> None:
     rng = np.random.default_rng(0)
-    history = history_before(recording, 0, tiny.spec, replace(HISTORY, first_share=0.0), rng)
+    history = history_before(recording, 0, tiny.spec, HISTORY.replace(first_share=0.0), rng)
     assert history.frames.shape[1] == 0
     assert np.array_equal(history.anchor, recording.frames[:, 0])
 
@@ -69,7 +68,7 @@ def test_the_recordings_first_frame_has_nothing_before_it(
 def test_noise_levels_are_drawn_up_to_the_largest_and_one_means_nothing(
     recording: Recording, tiny: TrainingConfig
 ) -> None:
-    config = replace(HISTORY, first_share=0.0, dropout=0.25, max_noise=0.2)
+    config = HISTORY.replace(first_share=0.0, dropout=0.25, max_noise=0.2)
     rng = np.random.default_rng(0)
     history = history_before(recording, 40, tiny.spec, config, rng)
     drawn = np.array([draw_past(history, config, rng).sigma for _ in range(400)])
@@ -91,8 +90,8 @@ def test_switched_off_the_clips_are_those_of_before_and_carry_nothing(
 def test_a_batch_shows_colours_of_clip_and_past_alike(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel
 ) -> None:
-    augment = replace(tiny.augment, colour_permutation=1.0, start_noise=0.0)
-    config = replace(tiny, history=replace(HISTORY, first_share=1.0), augment=augment)
+    augment = tiny.augment.replace(colour_permutation=1.0, start_noise=0.0)
+    config = tiny.replace(history=HISTORY.replace(first_share=1.0), augment=augment)
     made = source_of(config, recording, robot)
     batches = [made.batch(step) for step in range(2)]
     made.close()
@@ -105,7 +104,7 @@ def test_a_batch_shows_colours_of_clip_and_past_alike(
 def test_a_model_trained_with_history_serves_with_it(
     recording: Recording, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
 ) -> None:
-    config = replace(tiny, history=HISTORY)
+    config = tiny.replace(history=HISTORY)
     trainer = Trainer(config, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
     made = source_of(config, recording, robot)
     losses = [r.loss for r in trainer.run(made, save_every=9, on_save=lambda _: None)]
@@ -115,7 +114,7 @@ def test_a_model_trained_with_history_serves_with_it(
     served = DiffusionWorldModel(load_checkpoint(tmp_path / 'checkpoint')).history
     assert (served.num_frames, served.noise_level, served.reference) == (4, 0.05, 'first_frame')
     student = student_config(tiny, load_checkpoint(tmp_path / 'checkpoint'))
-    assert replace(student.history, max_noise=HISTORY.max_noise) == HISTORY
+    assert student.history.replace(max_noise=HISTORY.max_noise) == HISTORY
     plain = Trainer(tiny, tmp_path / 'plain', seed=0, device='cpu', dtype=torch.float32,
                     trained_on={})  # fmt: skip
     plain.export(tmp_path / 'off')
@@ -139,6 +138,6 @@ def test_wrong_settings_are_refused_by_name(key: str, value: object, match: str)
 def test_frames_that_do_not_divide_into_tokens_are_refused_before_the_first_step(
     tiny: TrainingConfig, tmp_path: Path
 ) -> None:
-    config = replace(tiny, history=replace(HISTORY, num_frames=3))
+    config = tiny.replace(history=HISTORY.replace(num_frames=3))
     with pytest.raises(CheckpointError, match='num_frames to a multiple of 2'):
         Trainer(config, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})

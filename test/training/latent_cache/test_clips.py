@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 import shutil
 
@@ -30,8 +29,8 @@ CPU = torch.device('cpu')
 @pytest.fixture(scope='module')
 def config(tmp_path_factory: pytest.TempPathFactory) -> TrainingConfig:
     config = load_training_config(tiny_preset(tmp_path_factory.mktemp('preset')))
-    objective = replace(config.objective, change_weight=4.0, moved_weight=10.0)
-    return replace(config, objective=objective)
+    objective = config.objective.replace(change_weight=4.0, moved_weight=10.0)
+    return config.replace(objective=objective)
 
 
 @pytest.fixture(scope='module')
@@ -170,7 +169,7 @@ def test_other_settings_are_noticed(
     copied: Path, root: Path, config: TrainingConfig, base: Base, robot: RobotModel,
     capsys: pytest.CaptureFixture, section: str, changes: dict, said: str,
 ) -> None:  # fmt: skip
-    other = replace(config, **{section: replace(getattr(config, section), **changes)})
+    other = config.replace(**{section: getattr(config, section).replace(**changes)})
     fill(source_of(copied, other, robot), root, other, base)
     assert said in capsys.readouterr().out
 
@@ -212,9 +211,9 @@ def test_what_a_cache_cannot_hold_is_refused(
 ) -> None:  # fmt: skip
     ((dotted, value),) = changes.items()
     section, key = dotted.split('.')
-    held = replace(getattr(config, section), **{key: value})
+    held = getattr(config, section).replace(**{key: value})
     with pytest.raises(ConfigError, match=message):
-        fill(source, tmp_path, replace(config, **{section: held}), base)
+        fill(source, tmp_path, config.replace(**{section: held}), base)
 
 
 def test_the_small_preset_needs_no_cache(source: BatchSource, base: Base, tmp_path: Path) -> None:
