@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
-agree. DIR gets ranking.json, ranking.md, ranking.html and a file for every rollout; running the
-same command again goes on where it was stopped.
+agree. DIR gets ranking.json, ranking.md, ranking.html and two files for every rollout: the result,
+and the last real frames over the last imagined ones. Running the same command again goes on where
+it was stopped.
 """
 _EPILOG = """\
-A policy is `expert`, followed by faults with their sizes: noise (rad), miss (probability), shift
-and place (m), wrong (probability), late (s), stop (share of the plan), e.g. expert-noise-0.03.
-By default one denoising step.
+A policy is `expert`, followed by faults with their sizes, e.g. expert-noise-0.03-late-0.3; the
+catalogue of faults is sim/expert/faults.py. By default one denoising step.
 """
 
 
@@ -41,8 +41,17 @@ def add(commands: argparse._SubParsersAction) -> None:
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )
-    parser.add_argument('--policies', metavar='LIST', help='comma-separated; default: ten')
-    parser.add_argument('--tasks', metavar='LIST', help='comma-separated; default: three')
+    policies = parser.add_mutually_exclusive_group()
+    policies.add_argument('--policies', metavar='LIST', help='comma-separated; default: ten')
+    policies.add_argument(
+        '--faults',
+        choices=('train', 'calibrate', 'test'),
+        help='the optimism benchmark: the expert and each fault kind of this split in small and '
+        'large; kinds of test are in no training and no calibration',
+    )
+    parser.add_argument(
+        '--tasks', metavar='LIST', help='comma-separated; default: three, with --faults six'
+    )
     parser.add_argument('--episodes', type=int, default=10, help='of each task')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
     parser.add_argument('--workers', type=int, default=1, help='processes')
@@ -72,7 +81,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.ranking.rank import run_jobs
+    from mtv_world_ros.ranking.optimism import Optimism
+    from mtv_world_ros.ranking.rank import FOLDER, run_jobs
     from mtv_world_ros.ranking.report import console, write_ranking
     from mtv_world_ros.ranking.runner import RolloutConfig
     from mtv_world_ros.ranking.summary import Summary
@@ -100,7 +110,9 @@ def _rank(arguments: argparse.Namespace) -> int:
         failed=failed,
         num_true=arguments.true_episodes,
         provenance={**provenance(arguments), 'checkpoint': settings['checkpoint']},
-        seed=arguments.seed,
+        optimism={
+            str(arguments.checkpoint): Optimism.of(results, arguments.out / FOLDER, arguments.seed)
+        },
     )
     path = write_ranking(summary, arguments.out)
     print(f'{console(summary)}\n\nreport: {path}')
@@ -117,13 +129,16 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
         make_jobs,
         policies_named,
     )
+    from mtv_world_ros.ranking.policy_sets import BENCHMARK_TASKS, POLICY_SETS
     from mtv_world_ros.sim.expert.expert import Expert
     from mtv_world_ros.sim.tasks.tasks import tasks_named
 
-    policies = policies_named(
-        ','.join(DEFAULT_POLICIES) if arguments.policies is None else arguments.policies
-    )
-    tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(DEFAULT_TASKS))]
+    policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
+    if arguments.policies is not None:
+        policies = policies_named(arguments.policies)
+    elif arguments.faults is not None:
+        policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
+    tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
     robot = arguments.robot or read_card(checkpoint_path(arguments.checkpoint))['robot']
     expert = Expert(load_robot(robot_path(robot)))
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)

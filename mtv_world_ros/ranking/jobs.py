@@ -77,14 +77,19 @@ class Judged:
     def of(cls, estimate: SuccessEstimate | None) -> Judged:
         """Returns an estimate in plain values; None = the policy gave no answer to judge."""
         if estimate is None:
-            reasons = ('abstains: the policy gave no answer',)
-            return cls(probability=nan, interval=(nan, nan), jaccard=(), reasons=reasons)
+            return cls.stated(nan, 'abstains: the policy gave no answer')
         return cls(
             probability=float(estimate.probability),
             interval=estimate.interval,
             jaccard=tuple(tuple(map(float, row)) for row in estimate.jaccard),
             reasons=estimate.reasons,
         )
+
+    @classmethod
+    def stated(cls, probability: float, reason: str) -> Judged:
+        """Returns a verdict without J; NaN = abstains."""
+        interval = (probability, probability)
+        return cls(probability=probability, interval=interval, jaccard=(), reasons=(reason,))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Judged:
@@ -121,10 +126,13 @@ class Result:
         imagined: the estimate at the end of the imagined episode.
         seen: the same estimator on the simulator's own frames: what is wrong with it is not the
             world model's fault.
+        no_picture: the rule that sees the commands and the first frame alone.
         num_chunks: answers executed in the simulator.
         num_imagined: answers executed in imagination.
         is_over: the policy ended the episode before the limit, in both.
         seconds: time by stage [s].
+        last_frames: PNG of the last real and imagined frames in base64, where it is not yet
+            written to its file.
     """
 
     policy: str
@@ -135,10 +143,12 @@ class Result:
     final: bool
     imagined: Judged
     seen: Judged
+    no_picture: Judged
     num_chunks: int
     num_imagined: int
     is_over: bool
     seconds: Mapping[str, float]
+    last_frames: str = ''
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""
@@ -147,7 +157,7 @@ class Result:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Result:
         """Reads what `as_json` returned, NaN as null."""
-        judged = {key: Judged.from_json(values[key]) for key in ('imagined', 'seen')}
+        judged = {key: Judged.from_json(values[key]) for key in ('imagined', 'seen', 'no_picture')}
         return cls(**{**values, **judged})
 
 

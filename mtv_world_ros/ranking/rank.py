@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 import json
@@ -12,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import plain, write_json
+from mtv_world_ros.files import plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.jobs import Job, Result
@@ -34,8 +35,8 @@ def run_jobs(
 ) -> tuple[list[Result], dict[str, str]]:
     """Returns the results in the order of the jobs, and why others have none, by job.
 
-    Each result is written beside its name and renamed; jobs that are there already with the same
-    settings are not run again.
+    Each result is written beside its name and renamed, and its last frames as a PNG, real ones
+    over imagined ones; jobs that are there already with the same settings are not run again.
 
     Args:
         jobs: what to run.
@@ -61,6 +62,9 @@ def run_jobs(
         if isinstance(outcome, str):
             failed[job.name] = outcome
             continue
+        picture = base64.b64decode(outcome.pop('last_frames', ''))
+        if picture:
+            write_whole(_path(out, job).with_suffix('.png'), picture)
         write_json(_path(out, job), {'settings': kept, 'result': outcome})
         found[job] = Result.from_json(outcome)
     if jobs and not found:

@@ -13,6 +13,8 @@ from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
 from mtv_world_ros.evaluation.report.tables import grid
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.ranking.jobs import THRESHOLD
+from mtv_world_ros.ranking.optimism_tables import optimism_tables
+from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
 from mtv_world_ros.ranking.summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
 
 TITLE = 'Policy ranking'
@@ -52,6 +54,7 @@ class Grid(NamedTuple):
 def grids(summary: Summary) -> list[Grid]:
     """Returns the ranking's tables."""
     return [
+        *_optimism(summary),
         _agreement(summary),
         *(_rates(summary, task) for task in (None, *summary.tasks)),
         _powered(summary),
@@ -68,6 +71,7 @@ def remarks(summary: Summary) -> list[str]:
         _agreement_remark(summary),
         _abstention_remark(summary),
         _INTERVALS,
+        OPTIMISM_REMARK if summary.optimism else '',
     ]
     if any('uncalibrated' in ' '.join(result.imagined.reasons) for result in summary.results):
         found.append(
@@ -137,6 +141,10 @@ def _rate(rate: Rate) -> str:
 def _interval(interval: tuple[float, float], digits: int = 2) -> str:
     low, high = interval
     return f'[{low:.{digits}f}, {high:.{digits}f}]' if isfinite(low) else '[not known]'
+
+
+def _optimism(summary: Summary) -> list[Grid]:
+    return [Grid(*found) for found in optimism_tables(summary.optimism)]
 
 
 def _rates(summary: Summary, task: str | None) -> Grid:
@@ -228,7 +236,13 @@ def _speed(summary: Summary) -> Grid:
 
 def console(summary: Summary) -> str:
     """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
-    tables = [_agreement(summary), _rates(summary, None), _powered(summary), _speed(summary)]
+    tables = [
+        *_optimism(summary),
+        _agreement(summary),
+        _rates(summary, None),
+        _powered(summary),
+        _speed(summary),
+    ]
     parts = [f'{found.caption}\n\n{grid(found.head, found.rows)}' for found in tables]
     return '\n\n'.join([*parts, *remarks(summary)[2:]])
 

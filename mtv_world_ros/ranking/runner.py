@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import nan
 import time
+
+import numpy as np
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.jobs import Job, Judged, Result
+from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
+from mtv_world_ros.ranking.optimism import last_frames_png
 from mtv_world_ros.ranking.worlds import (
     ImaginedWorld,
     judge,
@@ -21,6 +27,7 @@ from mtv_world_ros.ranking.worlds import (
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.success.situation import CannotTell
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
 MakePolicy = Callable[[str, str, int, Expert], Policy]
@@ -74,7 +81,8 @@ class RolloutRunner:
         real = self._run(policy, world, world.instruction, job)
         ever, final = world.outcome()
         begun = time.perf_counter()
-        seen = judge(self._begin(world, job), world.chunks)
+        observed = self._begin(world, job)
+        seen = judge(observed, world.chunks)
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
         imagined = ImaginedWorld(self._begin(world, job))
@@ -89,6 +97,7 @@ class RolloutRunner:
             final=final,
             imagined=Judged.of(imagined.success),
             seen=Judged.of(seen),
+            no_picture=_judge_without_pictures(self._begin(world, job), world),
             num_chunks=real.num_chunks,
             num_imagined=run.num_chunks,
             is_over=real.is_over and run.is_over,
@@ -99,6 +108,9 @@ class RolloutRunner:
                 'judging the simulated frames': judging_s,
                 'imagining': imagining_s,
             },
+            last_frames=base64.b64encode(
+                last_frames_png(observed.observation.frames, imagined.observation.frames)
+            ).decode(),
         )
 
     def _begin(self, simulated: SimulatedWorld, job: Job) -> ImaginedEpisode:
@@ -119,6 +131,15 @@ class RolloutRunner:
             chunk_s=self.pipeline.spec.chunk_seconds,
             max_chunks=self.config.max_chunks,
         )
+
+
+def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> Judged:
+    commands = np.concatenate([simulated.start.positions[None], *simulated.commands])
+    try:
+        success = judge_without_pictures(episode, commands)
+    except CannotTell as reason:
+        return Judged.stated(nan, f'abstains: {reason}')
+    return Judged.stated(float(success), 'the no-picture rule')
 
 
 def make_runner(make_pipeline: Callable[[], Pipeline], config: RolloutConfig) -> RolloutRunner:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite, nan
 from typing import Any
@@ -21,6 +21,7 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
 )
 from mtv_world_ros.evaluation.metrics.statistics import Interval, wilson
 from mtv_world_ros.ranking.jobs import Judged, Result
+from mtv_world_ros.ranking.optimism import Optimism
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'
@@ -104,12 +105,14 @@ class Summary:
         failed: rollouts without a result, and why.
         num_true: episodes of each task whose true outcomes the powered estimates may use.
         provenance: what it was made with, by heading.
+        optimism: the benchmark's numbers by checkpoint; empty = not asked for.
     """
 
     results: Sequence[Result]
     failed: Mapping[str, str]
     num_true: int
     provenance: Mapping[str, str]
+    optimism: Mapping[str, Optimism] = field(default_factory=dict)
 
     @cached_property
     def policies(self) -> tuple[str, ...]:
@@ -221,6 +224,7 @@ class Summary:
             'abstained': {judge: self.abstained(judge).as_json() for judge in JUDGES},
             'confusion': {judge: self.confusion(judge) for judge in JUDGES},
             'speed': self.speed(),
+            'optimism': {name: found.as_json() for name, found in self.optimism.items()},
             'num_true_for_powered': self.num_true,
             'num_rollouts': len(self.results),
             'num_cut_off_by_limit': sum(not result.is_over for result in self.results),

@@ -137,6 +137,7 @@ class SimulatedWorld:
         start: first observation.
         observation: what is seen now.
         chunks: what was seen, one an answer.
+        commands: (C, J) that were executed at the control rate, one array an answer.
         physics_s: time that the physics took [s].
         rendering_s: time that pictures took, and building the scene [s].
 
@@ -153,6 +154,7 @@ class SimulatedWorld:
         self.start = self.observation = self._observation(sim.reset(seed, task))
         self.rendering_s, self.physics_s = time.perf_counter() - begun, 0.0
         self.chunks: list[SeenChunk] = []
+        self.commands: list[FloatArray] = []
         self._target = np.array(sim.home)
 
     @property
@@ -178,6 +180,7 @@ class SimulatedWorld:
                 positions=np.concatenate([before.positions[None], commands[rows]]),
             )
         )
+        self.commands.append(commands)
         self._target = commands[-1]
         self.observation = shown[-1]
 

@@ -78,17 +78,22 @@ def runner(robot, expert):
 def make_result():
     """A result with a true outcome and an imagined probability."""
 
-    def make(policy, index, final, probability, task='stack_blocks_two', seen=None, **more):
+    def make(
+        policy, index, final, probability, task='stack_blocks_two', seen=None, rule=None, **more
+    ):
         judged = [
             Judged(
                 probability=value, interval=(value, value), jaccard=((value,),), reasons=('why',)
             )
-            for value in (probability, final if seen is None else seen)
-        ]
+            for value in (
+                probability, final if seen is None else seen, final if rule is None else rule
+            )
+        ]  # fmt: skip
         return Result(
             **{
                 'policy': policy, 'task': task, 'index': index, 'seed': 7, 'ever': final,
-                'final': final, 'imagined': judged[0], 'seen': judged[1], 'num_chunks': 3,
+                'final': final, 'imagined': judged[0], 'seen': judged[1],
+                'no_picture': judged[2], 'num_chunks': 3,
                 'num_imagined': 3, 'is_over': True,
                 'seconds': {'imagining': 2.0, 'physics': 0.1, 'rendering': 0.3},
                 **more,

@@ -1,0 +1,97 @@
+"""The optimism benchmark in tables that fit a console of 100 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+
+from mtv_world_ros.ranking.optimism import JUDGES, MEASURES, Optimism, Score, true_rate
+from mtv_world_ros.sim.expert.faults import FAULTS
+
+REMARK = (
+    'Cells: value [95 % interval] count. False success: real failures called a success, of those '
+    'that were judged. AUROC: of the rollouts that were judged. Flips: a command whose true '
+    "outcome differs from the expert's in the same scene; how often the imagined last frame is "
+    'nearer to what really happened than to what happened under the expert, over the pixels in '
+    'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
+    'frame alone: an object sticks to a gripper that closes near it. AUROC - rule: on the same '
+    'rollouts. Intervals, over scenes: of shares clustered Wilson, of r and MMRV jackknife, of '
+    'AUROC bootstrap; none for few scenes. r, MMRV and AUROC of a kind: over its policies and the '
+    'expert.'
+)
+
+#: characters in the head of a column
+_NAME_LENGTH = 17
+
+Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+
+
+def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
+    """Returns caption, head and rows of the tables: overall, then by fault kind.
+
+    Args:
+        by_model: label of the checkpoint -> its numbers; the first one's stand for the judges
+            that do not depend on imagination.
+    """
+    if not by_model:
+        return []
+    return [_overall(by_model), *(_by_kind(name, found) for name, found in by_model.items())]
+
+
+def _overall(by_model: Mapping[str, Optimism]) -> Table:
+    first = next(iter(by_model.values()))
+    columns = {
+        (_short(name) if len(by_model) > 1 else JUDGES['imagined']): found.scores('imagined')
+        for name, found in by_model.items()
+    }
+    columns |= {JUDGES[judge]: first.scores(judge) for judge in JUDGES if judge != 'imagined'}
+    rows = [
+        [words, *(_cell(scores[measure]) for scores in columns.values())]
+        for measure, words in MEASURES.items()
+    ]
+    rate = true_rate(first.rollouts(None))
+    caption = f'Optimism: {rate.count} rollouts, of which {rate.value:.0%} really succeed'
+    return caption, ['judged on', *columns], rows
+
+
+def _by_kind(name: str, found: Optimism) -> Table:
+    rows = []
+    for kind in found.kinds:
+        scores, rule = (found.scores(judge, kind) for judge in ('imagined', 'no_picture'))
+        rate = true_rate(found.rollouts(kind))
+        rows.append(
+            [
+                kind if FAULTS[kind].contact else f'{kind} *',
+                str(rate.count),
+                _number(rate.value),
+                f'{_number(scores["auroc"].value)} / {_number(rule["auroc"].value)}',
+                _cell(scores['false_success']),
+                _number(rule['false_success'].value),
+                _number(scores['abstention'].value),
+                _cell(scores['flips']),
+            ]
+        )
+    head = ['kind', 'n', 'true', 'AUROC/rule', 'false success', 'rule', 'abst', 'flips']
+    return f'{name}, by fault kind (* shows in the path of the arm)', head, rows
+
+
+def _short(name: str) -> str:
+    """The end of a checkpoint's path, for the head of a column."""
+    return name if len(name) <= _NAME_LENGTH else f'…{name[1 - _NAME_LENGTH :]}'
+
+
+def _cell(score: Score) -> str:
+    if not isfinite(score.value):
+        return '–'
+    low, high = score.interval
+    interval = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
+    return f'{_number(score.value)}{interval} {score.count}'
+
+
+def _number(value: float) -> str:
+    """Two decimals without the zero in front, 0 or 1 without any; a dash where there is none."""
+    if not isfinite(value):
+        return '–'
+    return {'0.00': '0', '-0.00': '0', '1.00': '1'}.get(
+        f'{value:.2f}', f'{value:.2f}'.replace('0.', '.', 1)
+    )

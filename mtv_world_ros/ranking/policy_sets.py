@@ -1,0 +1,73 @@
+"""Which policies a ranking on the fault catalogue runs, by split of the fault kinds."""
+
+from __future__ import annotations
+
+#: the expert, and each kind of a split at sizes around its typical one
+POLICY_SETS: dict[str, tuple[str, ...]] = {
+    'train': (
+        'expert',
+        'expert-noise-0.04',
+        'expert-miss-1',
+        'expert-late-0.6',
+        'expert-high-0.015',
+        'expert-high-0.03',
+        'expert-shift-0.015',
+        'expert-aside-0.025',
+        'expert-turn-0.8',
+        'expert-loose-0.4',
+        'expert-drops-0.5',
+        'expert-push-0.04',
+        'expert-wrong-1',
+        'expert-place-0.03',
+        'expert-slow-0.25',
+        'expert-stop-0.5',
+        'expert-retry-0.03',
+    ),
+    'calibrate': (
+        'expert',
+        'expert-hang-0.8',
+        'expert-hang-1',
+        'expert-hang-1.2',
+        'expert-drop_high-0.04',
+        'expert-drop_high-0.07',
+        'expert-along-0.012',
+        'expert-along-0.018',
+        'expert-along-0.03',
+        'expert-slack-0.6',
+        'expert-slack-0.7',
+        'expert-slack-0.9',
+        'expert-low_carry-0.04',
+        'expert-low_carry-0.06',
+        'expert-low_carry-0.09',
+        'expert-fast-2',
+        'expert-fast-3',
+    ),
+    'test': (
+        'expert',
+        'expert-early-0.3',
+        'expert-early-0.5',
+        'expert-lean-0.3',
+        'expert-lean-0.45',
+        'expert-narrow-0.4',
+        'expert-narrow-0.6',
+        'expert-blink-0.06',
+        'expert-blink-0.2',
+        'expert-sweep-0.01',
+        'expert-sweep-0.03',
+        'expert-elsewhere-0.03',
+        'expert-elsewhere-0.06',
+        'expert-stall-0.4',
+        'expert-stall-1.2',
+        'expert-regrasp-0.01',
+        'expert-regrasp-0.03',
+    ),
+}
+#: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
+BENCHMARK_TASKS = (
+    'place_block_a2b_left',
+    'stack_blocks_two',
+    'place_bread_plate',
+    'place_cup_plate',
+    'move_object_two',
+    'collect_toy',
+)

@@ -1,0 +1,128 @@
+from math import isnan, nan
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.ranking.optimism import (
+    areas_under_roc,
+    find_flips,
+    is_nearer,
+    last_frames_png,
+    name_of,
+    Optimism,
+    read_last_frames,
+    resampled_weights,
+)
+from mtv_world_ros.ranking.optimism_tables import optimism_tables
+from mtv_world_ros.ranking.policy_sets import POLICY_SETS
+from mtv_world_ros.sim.expert.faults import FAULTS, kinds_of, parse_variant
+
+
+@pytest.mark.parametrize('split', ['train', 'calibrate', 'test'])
+def test_a_policy_set_covers_its_split_and_no_other(split):
+    names = POLICY_SETS[split]
+    kinds = {kind for name in names for kind in parse_variant(name).kinds}
+    assert kinds == set(kinds_of(split))
+    assert len(names) >= 16 and names[0] == 'expert' and len(set(names)) == len(names)
+    assert all(parse_variant(name).name == name for name in names)
+
+
+@pytest.fixture
+def optimism(make_result):
+    """Eight scenes: the expert succeeds; `high` really fails and is called a success."""
+    results = []
+    for index in range(8):
+        results += [
+            make_result('expert', index, True, 0.9),
+            make_result('expert-high-0.03', index, False, 0.8, rule=index < 2),
+            make_result('expert-elsewhere-0.1', index, False, nan if index < 4 else 0.1),
+        ]
+    flips = {name_of(r): r.policy == 'expert-elsewhere-0.1' for r in results if not r.final}
+    return Optimism(results=results, flips=flips)
+
+
+def test_false_successes_abstentions_and_flips_are_counted(optimism):
+    found = optimism.scores('imagined')
+    assert (found['false_success'].value, found['false_success'].count) == (8 / 12, 12)
+    low, high = found['false_success'].interval
+    assert low < 8 / 12 < high
+    assert (found['abstention'].value, found['abstention'].count) == (4 / 24, 24)
+    assert (found['flips'].value, found['flips'].count) == (0.5, 16)
+    assert (found['contact_flips'].value, found['contact_flips'].count) == (0.0, 8)
+    assert found['auroc'].value == 1.0 and found['over_rule'].count == 20
+    # the rule: two of twelve failures called a success, of eight of them ties with successes
+    assert found['over_rule'].value == pytest.approx(1 - (1 - 0.5 * 2 / 12))
+
+
+def test_a_kind_is_measured_against_the_expert(optimism):
+    assert optimism.kinds == ('high', 'elsewhere')
+    high, elsewhere = (optimism.scores('imagined', kind) for kind in optimism.kinds)
+    assert high['false_success'].value == 1.0 and high['auroc'].value == 1.0
+    assert high['pearson'].count == 2 and high['flips'].count == 8
+    assert elsewhere['false_success'].value == 0.0 and elsewhere['abstention'].value == 0.5
+    assert elsewhere['contact_flips'].count == 0 and isnan(elsewhere['contact_flips'].value)
+    rule = optimism.scores('no_picture', 'high')
+    assert rule['false_success'].value == 0.25
+    assert rule['flips'].count == 0 and isnan(rule['over_rule'].value)
+
+
+def test_tables_fit_a_console(optimism):
+    from mtv_world_ros.evaluation.report.tables import grid
+
+    both = {'/home/somebody/new': optimism, 'bundled': optimism}
+    for by_model in ({'bundled': optimism}, both):
+        tables = optimism_tables(by_model)
+        assert len(tables) == 1 + len(by_model)
+        lines = '\n'.join(grid(head, rows) for _, head, rows in tables).splitlines()
+        assert max(map(len, lines)) <= 100
+    assert '.67 [.34 .88] 12' in '\n'.join(lines) and 'elsewhere *' in '\n'.join(lines)
+    assert optimism_tables({}) == []
+
+
+def test_areas_agree_with_the_plain_one_and_scenes_are_drawn_whole():
+    rng = np.random.default_rng(0)
+    said, real = rng.integers(0, 5, 40) / 4, rng.uniform(size=40) < 0.4
+    scenes = [('stack', k // 4) for k in range(40)]
+    weights = resampled_weights(scenes, seed=1)
+    areas = areas_under_roc(said, real, weights)
+    assert areas[0] == pytest.approx(area_under_roc(said, real))
+    assert (weights.reshape(len(weights), 10, 4) == weights[:, ::4, None]).all()
+    assert (weights.sum(1) == 40).all() and len(weights) == 2001
+    rows = np.repeat(np.arange(40), weights[1].astype(int))
+    assert areas[1] == pytest.approx(area_under_roc(said[rows], real[rows]))
+
+
+def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_path, make_result):
+    rng = np.random.default_rng(0)
+    table = rng.integers(0, 200, (2, 6, 8, 3), dtype=np.uint8)
+    placed, left = table.copy(), table.copy()
+    placed[:, :2, :2], left[:, 4:, 5:] = 255, 255
+    ends = {'expert': (placed, placed), 'expert-high-0.03': (left, placed),
+            'expert-late-0.6': (left, left), 'expert-turn-1': (placed, placed),
+            'expert-loose-1': (left, left)}  # fmt: skip
+    results = [make_result(p, 0, p in ('expert', 'expert-turn-1'), 0.9) for p in ends]
+    for result in results[:-1]:  # the last one has no picture
+        png = last_frames_png(*ends[result.policy])
+        (tmp_path / f'{name_of(result)}.png').write_bytes(png)
+    assert find_flips(results, tmp_path) == {
+        'stack_blocks_two_00000_expert-high-0.03': False,
+        'stack_blocks_two_00000_expert-late-0.6': True,
+    }
+    real, imagined = read_last_frames(tmp_path / 'stack_blocks_two_00000_expert-high-0.03.png')
+    np.testing.assert_array_equal(real, np.concatenate(list(left), axis=1))
+    np.testing.assert_array_equal(imagined, np.concatenate(list(placed), axis=1))
+
+
+def test_pixels_that_are_alike_in_both_ends_do_not_count():
+    real, other = np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)
+    other[0, 0] = 100
+    imagined = np.full((4, 4, 3), 255, np.uint8)
+    imagined[0, 0] = 49
+    assert is_nearer(imagined, real, other)
+    imagined[0, 0] = 51
+    assert not is_nearer(imagined, real, other)
+
+
+def test_contact_is_in_the_catalogue():
+    assert not FAULTS['elsewhere'].contact and FAULTS['lean'].contact
