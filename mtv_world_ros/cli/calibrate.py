@@ -17,9 +17,9 @@ from mtv_world_ros.cli.options import (
     add_serving,
     add_task,
     pipeline_choices,
+    provenance,
     threads_of_workers,
 )
-from mtv_world_ros.cli.provenance import provenance
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection

@@ -17,9 +17,9 @@ from mtv_world_ros.cli.options import (
     add_task,
     names,
     pipeline_choices,
+    provenance,
     threads_of_workers,
 )
-from mtv_world_ros.cli.provenance import provenance
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _import(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from mtv_world_ros.importing.run import import_dataset
+    from mtv_world_ros.importing.convert import import_dataset
 
     summary = import_dataset(
         arguments.dataset,

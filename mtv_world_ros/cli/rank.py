@@ -14,9 +14,9 @@ from mtv_world_ros.cli.options import (
     add_segmenter,
     add_serving,
     pipeline_choices,
+    provenance,
     threads_of_workers,
 )
-from mtv_world_ros.cli.provenance import provenance
 
 if TYPE_CHECKING:
     from mtv_world_ros.ranking.jobs import Job

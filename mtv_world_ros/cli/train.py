@@ -175,7 +175,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
 def _dry_run(config: TrainingConfig, dtype: torch.dtype) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.action_features import action_names
+    from mtv_world_ros.model.actions import action_names
     from mtv_world_ros.training.dry_run import step_cost
 
     video = config.video

@@ -1,6 +1,6 @@
-"""What a control representation makes of a chunk's joint positions, learned from the training set.
+"""Actions as the transformer takes them: scaled joint positions or tool poses, or FAST tokens.
 
-Shape letters: T frames of a chunk, J joints, D numbers an action, L tokens.
+Shape letters: T frames of a chunk, J joints, A arms, D numbers an action, L tokens.
 """
 
 from __future__ import annotations
@@ -12,19 +12,122 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.action_features import (
-    action_features,
-    action_names,
-    ActionScaling,
-    FAST_TOKENS,
-)
+from mtv_world_ros.errors import CheckpointError, ConfigError, nearest, TrainingError
 
 if TYPE_CHECKING:
+    from tokenizers import Tokenizer
+
     from mtv_world_ros.geometry.robot import RobotModel
-    from mtv_world_ros.model.fast_tokens import FastTokenizer
+
+#: how actions may enter the model: the paper's method and its three baselines
+CONTROLS = ('trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens')
+TRAJECTORY_VIDEO, POLICY2VEC, EE_MLP, FAST_TOKENS = CONTROLS
+
+#: tokens of `fast_tokens`
+VOCABULARY = 1024
+#: these percentiles become -1 and 1
+PERCENTILES = (1.0, 99.0)
+#: how far outside of them a scaled number may lie. Ctrl-World clips at the percentiles. The others
+#: need a bound too: the range of a joint that rarely moves is next to nothing
+CLIP = {POLICY2VEC: 1.5, EE_MLP: 1.0, FAST_TOKENS: 1.5}
+#: half of the least range that is stretched to [-1, 1] [m or rad]: below is noise
+_LEAST_HALF_RANGE = 1e-3
+#: cosine of the pitch from which on yaw is not told from roll
+_VERTICAL = 1e-9
+
+
+def check_control(name: str) -> str:
+    """Returns the name; raises ConfigError if it is none of `CONTROLS`."""
+    if name not in CONTROLS:
+        raise ConfigError(
+            f"control '{name}' is not one of {', '.join(CONTROLS)}{nearest(str(name), CONTROLS)}; "
+            'set video.control or --control'
+        )
+    return name
+
+
+def action_names(control: str, robot: RobotModel) -> tuple[str, ...]:
+    """Returns the D names of what an action consists of."""
+    if control != EE_MLP:
+        return robot.joint_names
+    parts = ('x', 'y', 'z', 'roll', 'pitch', 'yaw', 'opening')
+    return tuple(f'{tool.arm} {part}' for tool in robot.tools for part in parts)
+
+
+def action_features(control: str, robot: RobotModel, positions: FloatArray) -> FloatArray:
+    """Returns (T, D) unscaled actions of joint positions (T, J) [rad or m]."""
+    return tool_features(robot, positions) if control == EE_MLP else np.asarray(positions, float)
+
+
+def tool_features(robot: RobotModel, positions: FloatArray) -> FloatArray:
+    """Returns (T, 7 A): per arm x, y, z [m], roll, pitch, yaw [rad] and the opening in [0, 1].
+
+    The poses are those of the tool points in the base frame. Angles jump at +-pi, as they do in
+    Ctrl-World, which takes them like this.
+    """
+    poses = robot.tool_poses(positions)
+    openings = robot.gripper_openings(positions)[..., None]
+    angles = roll_pitch_yaw(poses[..., :3, :3])
+    rows = np.concatenate([poses[..., :3, 3], angles, openings], axis=-1)
+    return rows.swapaxes(0, 1).reshape(len(positions), -1)
+
+
+def roll_pitch_yaw(rotations: FloatArray) -> FloatArray:
+    """Returns (..., 3) angles [rad] of (..., 3, 3): R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Straight up and down, where roll and yaw turn about the same axis, yaw is zero.
+    """
+    r = rotations
+    level = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    pitch = np.arctan2(-r[..., 2, 0], level)
+    yaw = np.where(level < _VERTICAL, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    sine, cosine = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(
+        sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
+    )
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionScaling:
+    """Stretches each number of an action so that its 1st and 99th percentile become -1 and 1.
+
+    Attributes:
+        names: D names.
+        low: (D,) 1st percentiles.
+        high: (D,) 99th percentiles.
+        clip: scaled numbers stay in [-clip, clip].
+    """
+
+    names: tuple[str, ...]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    clip: float
+
+    @staticmethod
+    def fit(control: str, robot: RobotModel, features: Sequence[FloatArray]) -> ActionScaling:
+        """Returns the scaling of features, each (T, D)."""
+        low, high = np.percentile(np.concatenate(features), PERCENTILES, axis=0)
+        names = action_names(control, robot)
+        return ActionScaling(names=names, low=low, high=high, clip=CLIP[control])
+
+    def apply(self, features: FloatArray) -> FloatArray:
+        """Returns (..., D) scaled numbers."""
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        scaled = (features - middle) / np.maximum(half, _LEAST_HALF_RANGE)
+        return scaled.clip(-self.clip, self.clip)
+
+    def check(self, names: tuple[str, ...]) -> None:
+        """Raises CheckpointError if these are not the numbers that it was made for."""
+        if names != self.names:
+            raise CheckpointError(
+                f'the model was trained on actions {list(self.names)}, the robot has '
+                f"{list(names)}; set 'robot_file' to the robot it was trained with"
+            )
+
 
 STATISTICS = 'action_statistics.json'
 TOKENIZER = 'action_tokenizer.json'
@@ -51,8 +154,6 @@ class ActionEncoding:
         scaling = ActionScaling.fit(control, robot, features)
         tokenizer = None
         if control == FAST_TOKENS:
-            from mtv_world_ros.model.fast_tokens import FastTokenizer
-
             tokenizer = FastTokenizer.train([scaling.apply(part) for part in features])
         return ActionEncoding(control=control, scaling=scaling, tokenizer=tokenizer)
 
@@ -122,8 +223,6 @@ class ActionEncoding:
 
 
 def _load_tokenizer(folder: Path) -> Any:
-    from mtv_world_ros.model.fast_tokens import FastTokenizer
-
     return FastTokenizer.from_json(json.loads((folder / TOKENIZER).read_text(encoding='utf-8')))
 
 
@@ -135,3 +234,110 @@ def collate(encoded: Sequence[np.ndarray]) -> np.ndarray:
     for row, tokens in zip(rows, encoded, strict=True):
         row[: len(tokens)] = tokens
     return rows
+
+
+IntArray = NDArray[np.int64]
+
+#: coefficients are multiplied by this before they are rounded
+SCALE = 10.0
+#: a coefficient becomes a character from here on: a long run of letters without case or spaces
+_FIRST_CHARACTER = 0x4E00
+
+
+def cosine_matrix(size: int) -> FloatArray:
+    """Returns the orthonormal (size, size) matrix of the cosine transform (DCT-II)."""
+    frequency, time = np.arange(size)[:, None], np.arange(size)[None]
+    matrix = np.cos(np.pi * frequency * (2 * time + 1) / (2 * size)) * np.sqrt(2 / size)
+    matrix[0] /= np.sqrt(2)
+    return matrix
+
+
+def quantise(actions: FloatArray) -> IntArray:
+    """Returns (T, D) rounded coefficients, lowest frequency first, of scaled actions (T, D)."""
+    return np.rint(SCALE * cosine_matrix(len(actions)) @ actions).astype(np.int64)
+
+
+def dequantise(coefficients: IntArray) -> FloatArray:
+    """Returns the (T, D) actions that rounded coefficients (T, D) stand for."""
+    return cosine_matrix(len(coefficients)).T @ (coefficients / SCALE)
+
+
+class FastTokenizer:
+    """FAST: chunks of scaled actions to a few discrete tokens and back.
+
+    Cosine transform along time, rounding, byte-pair encoding (Pertsch et al., "FAST: Efficient
+    Action Tokenization for Vision-Language-Action Models", 2025).
+
+    Args:
+        tokenizer: byte-pair encoding of the coefficients written as characters.
+        smallest: coefficient that the first character stands for; lower ones are raised to it.
+        largest: highest coefficient; higher ones are lowered to it.
+    """
+
+    def __init__(self, tokenizer: Tokenizer, smallest: int, largest: int) -> None:
+        self._tokenizer = tokenizer
+        self.smallest, self.largest = smallest, largest
+
+    @staticmethod
+    def train(chunks: Sequence[FloatArray], vocabulary: int = VOCABULARY) -> FastTokenizer:
+        """Learns which coefficients come together, from chunks of scaled actions (T, D).
+
+        Raises:
+            TrainingError: the coefficients take more values than there are tokens.
+        """
+        from tokenizers import models, Tokenizer, trainers
+
+        coefficients = [quantise(chunk) for chunk in chunks]
+        smallest = min(int(part.min()) for part in coefficients)
+        largest = max(int(part.max()) for part in coefficients)
+        if largest - smallest >= vocabulary:
+            raise TrainingError(
+                f'rounded action coefficients run from {smallest} to {largest}, more values than '
+                f'the {vocabulary} tokens; shorten video.num_frames'
+            )
+        made = FastTokenizer(Tokenizer(models.BPE()), smallest, largest)
+        alphabet = [chr(_FIRST_CHARACTER + i) for i in range(largest - smallest + 1)]
+        trainer = trainers.BpeTrainer(
+            vocab_size=vocabulary,
+            min_frequency=2,
+            initial_alphabet=alphabet,
+            special_tokens=[],
+            show_progress=False,
+        )
+        made._tokenizer.train_from_iterator((made._text(c) for c in coefficients), trainer)
+        return made
+
+    @property
+    def vocabulary(self) -> int:
+        """Tokens in use."""
+        return self._tokenizer.get_vocab_size()
+
+    def encode(self, actions: FloatArray) -> IntArray:
+        """Returns the (L,) tokens of a chunk of scaled actions (T, D)."""
+        return np.array(self._tokenizer.encode(self._text(quantise(actions))).ids, dtype=np.int64)
+
+    def decode(self, tokens: IntArray, num_actions: int) -> FloatArray:
+        """Returns the (T, D) actions that (L,) tokens stand for."""
+        words = [self._tokenizer.id_to_token(int(token)) or '' for token in tokens]
+        values = [ord(letter) - _FIRST_CHARACTER + self.smallest for letter in ''.join(words)]
+        return dequantise(np.array(values, dtype=np.int64).reshape(num_actions, -1))
+
+    def _text(self, coefficients: IntArray) -> str:
+        bounded = coefficients.clip(self.smallest, self.largest) - self.smallest
+        return ''.join(chr(_FIRST_CHARACTER + value) for value in bounded.ravel().tolist())
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values."""
+        return {
+            'smallest': self.smallest,
+            'largest': self.largest,
+            'tokenizer': json.loads(self._tokenizer.to_str()),
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> FastTokenizer:
+        """The inverse of `as_json`."""
+        from tokenizers import Tokenizer
+
+        tokenizer = Tokenizer.from_str(json.dumps(values['tokenizer']))
+        return FastTokenizer(tokenizer, int(values['smallest']), int(values['largest']))

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field
 from mtv_world_ros.config import expected, ListOf, Positive, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.action_features import CONTROLS
+from mtv_world_ros.model.actions import CONTROLS
 
 CARD = 'world_model.json'
 

@@ -12,8 +12,7 @@ from typing import Any, cast
 import torch
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
-from mtv_world_ros.model.actions import ActionEncoding
+from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CARD, check_card, read_card
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler

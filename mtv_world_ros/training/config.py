@@ -22,7 +22,7 @@ from mtv_world_ros.config import (
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import bundled
-from mtv_world_ros.model.action_features import check_control, TRAJECTORY_VIDEO
+from mtv_world_ros.model.actions import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import HistorySettings, spec_of
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 
@@ -40,7 +40,7 @@ class VideoConfig(Schema):
     robot: str = 'yam_bimanual'
     control: Annotated[str, AfterValidator(check_control)] = Field(
         default=TRAJECTORY_VIDEO,
-        description='how the actions enter, of `action_features.CONTROLS`',
+        description='how the actions enter, of `actions.CONTROLS`',
     )
     object_mask: bool = Field(
         default=True, description="the trajectory video carries the objects' masks"

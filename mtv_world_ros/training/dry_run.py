@@ -13,8 +13,7 @@ from torch import nn, Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
-from mtv_world_ros.model.action_features import EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
-from mtv_world_ros.model.actions import ActionEncoding
+from mtv_world_ros.model.actions import ActionEncoding, EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.model.action_features import EE_MLP
-from mtv_world_ros.model.actions import ActionEncoding
+from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
 from mtv_world_ros.model.card import OPTIONAL_KEYS
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.history_tokens import check_history

@@ -199,7 +199,7 @@ def check_values(given: dict[str, Any]) -> None:
     """Raises a user error where a preset, policy, task ... does not exist."""
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.cli.train import set_overrides
-    from mtv_world_ros.model.action_features import check_control
+    from mtv_world_ros.model.actions import check_control
     from mtv_world_ros.model.serving.options import ServingOptions
     from mtv_world_ros.sim.expert.faults import parse_variant
     from mtv_world_ros.sim.tasks.tasks import tasks_named

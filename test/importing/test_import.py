@@ -14,7 +14,7 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[i
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
-from mtv_world_ros.importing.run import import_dataset
+from mtv_world_ros.importing.convert import import_dataset
 
 START_NS = 1_000_000_000
 KINDS = ('v2.0', 'v2.1', 'v3.0', 'v3.0, unnamed index', 'images')

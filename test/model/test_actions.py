@@ -13,8 +13,15 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.action_features import check_control, roll_pitch_yaw, tool_features
-from mtv_world_ros.model.actions import ActionEncoding, collate, STATISTICS, TOKENIZER
+from mtv_world_ros.model.actions import (
+    ActionEncoding,
+    check_control,
+    collate,
+    roll_pitch_yaw,
+    STATISTICS,
+    TOKENIZER,
+    tool_features,
+)
 
 
 @pytest.fixture(scope='module')

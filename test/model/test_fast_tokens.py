@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.model.fast_tokens import cosine_matrix, dequantise, FastTokenizer, quantise
+from mtv_world_ros.model.actions import cosine_matrix, dequantise, FastTokenizer, quantise
 
 
 @pytest.fixture(scope='module')

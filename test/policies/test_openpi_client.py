@@ -78,7 +78,7 @@ def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_pat
 def test_images_arrive_in_the_size_and_layout_that_the_server_wants(tmp_path, server):
     policy = make_policy(tmp_path, server)
     policy.reset(seed=0)
-    from mtv_world_ros.policies.msgpack_arrays import pack
+    from mtv_world_ros.policies.openpi_client import pack
 
     answer = policy._exchange(pack(policy._mapping.request(observe(), 'stack')))
     assert answer['seen'] == {

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.sim import shape_geoms
+from mtv_world_ros.sim import shapes
 from mtv_world_ros.success.relations import (
     Apart,
     AsPictured,
@@ -204,7 +204,7 @@ def test_served_on_the_floor_of_a_plate(offset, succeeds):
 
 
 def test_floors_are_as_thick_as_those_that_are_simulated():
-    assert shape_geoms.FLOOR_M == FLOOR_M
+    assert shapes.FLOOR_M == FLOOR_M
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import torch
 from torch import nn, Tensor
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.action_features import (
+from mtv_world_ros.model.actions import (
     check_control,
     EE_MLP,
     POLICY2VEC,

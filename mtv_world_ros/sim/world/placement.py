@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mtv_world_ros.sim.shape_geoms import FLOOR_M, RIM_M
-from mtv_world_ros.sim.shapes import SHAPES
+from mtv_world_ros.sim.shapes import FLOOR_M, RIM_M, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, START, Task
 from mtv_world_ros.sim.world.arm import BASE_POSITIONS
 from mtv_world_ros.sim.world.scene import Place, SceneObject

@@ -11,8 +11,7 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
-from mtv_world_ros.sim.shape_geoms import Size
-from mtv_world_ros.sim.shapes import shape_named
+from mtv_world_ros.sim.shapes import shape_named, Size
 from mtv_world_ros.sim.world.arm import actuators_xml, arm_xml, ARMS
 from mtv_world_ros.sim.world.cameras import camera_xml
 

@@ -1,14 +1,19 @@
-"""Batches by step and clip number: the same numbers give the same clip, in whatever process.
+"""Training batches by step and clip number, the same in any process, prepared in forked workers.
 
 Shape letters: B batch, V views, T frames, H W pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+import multiprocessing
+import os
+from threading import Thread
+import time
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +26,6 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
-from mtv_world_ros.training.clips.clip_workers import ClipWorkers
 from mtv_world_ros.training.clips.past import (
     draw_past,
     history_before,
@@ -275,3 +279,66 @@ def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> B
     mixed = (1 - share) * frames + share * blurred
     mixed = mixed + rng.normal(0, 255 * noise_std * rng.random(), mixed.shape)
     return mixed.round().clip(0, 255).astype(np.uint8)
+
+
+#: makes the clip of a step and a number
+MakeClip = Callable[[int, int], Any]
+
+_make_clip: MakeClip | None = None
+
+
+class ClipWorkers:
+    """Makes clips in processes of its own.
+
+    Args:
+        make_clip: its results are sent between processes; it must not use a GPU.
+        count: processes.
+    """
+
+    def __init__(self, make_clip: MakeClip, count: int) -> None:
+        self._pool = ProcessPoolExecutor(
+            count,
+            mp_context=multiprocessing.get_context('fork'),  # nothing is copied or pickled
+            initializer=_begin,
+            initargs=(make_clip, os.getpid()),
+        )
+
+    def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
+        """Returns the clips of a step.
+
+        Raises:
+            TrainingError: a process was killed.
+        """
+        try:
+            return list(self._pool.map(_run, [step] * len(numbers), numbers))
+        except BrokenProcessPool as error:
+            raise TrainingError(
+                f'a process that prepares clips was killed at step {step}, perhaps for memory '
+                '(see dmesg); the last saved state is whole: run the same command again, with '
+                'fewer --data-workers if there is too little memory'
+            ) from error
+
+    def close(self) -> None:
+        """Ends the processes."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _begin(make_clip: MakeClip, parent: int) -> None:
+    global _make_clip
+    _make_clip = make_clip
+    # thread pools do not survive a fork, and the processes are the parallelism
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """Ends this process when the training was killed, which cannot end it any more."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def _run(step: int, number: int) -> Any:
+    assert _make_clip is not None
+    return _make_clip(step, number)

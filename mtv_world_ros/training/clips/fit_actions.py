@@ -12,8 +12,7 @@ from mtv_world_ros.data.recording import clip_starts, commanded, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.model.action_features import TRAJECTORY_VIDEO
-from mtv_world_ros.model.actions import ActionEncoding, STATISTICS
+from mtv_world_ros.model.actions import ActionEncoding, STATISTICS, TRAJECTORY_VIDEO
 from mtv_world_ros.training.config import TrainingConfig
 
 #: clips that are looked at, spread evenly over all

@@ -27,9 +27,9 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.serving import compiled, memory_check
-from mtv_world_ros.model.serving.float8 import convert, Float8Linear
+from mtv_world_ros.model.serving import memory_check, prepare
 from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.prepare import Float8Linear, to_float8
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.config import load_training_config
@@ -119,7 +119,7 @@ def test_cuda_graphs_need_cuda(folder: Path) -> None:
 
 
 class FakeCuda:
-    """What `compiled` takes of `torch.cuda`: a replay computes the captured pass once more."""
+    """What `prepare` takes of `torch.cuda`: a replay computes the captured pass once more."""
 
     def __init__(self) -> None:
         self.now = ['cuda:0']
@@ -172,7 +172,7 @@ def test_a_captured_pass_reads_its_inputs_anew_on_its_own_device(
         return fake.passes[-1][1]
 
     model: Any = SimpleNamespace(forward=forward)
-    compiled.capture(model, torch.device('cuda:1'))
+    prepare.capture_graphs(model, torch.device('cuda:1'))
     given = [torch.full((size,), float(value)) for value, size in enumerate((2, 3, 2, 3))]
     found = [model.forward(x, y=None) for x in given]
     for x, out in zip(given, found, strict=True):  # none is overwritten by a later replay
@@ -205,7 +205,7 @@ def test_a_block_compiles_without_a_break_and_without_a_compiler_is_refused(
     model = build(TRANSFORMER).eval().requires_grad_(False)
     monkeypatch.setenv('CXX', 'no-such-compiler')
     with pytest.raises(ConfigError, match=r'needs a compiler \(.*\) on the path or named by CXX'):
-        compiled.compile_blocks(model, torch.device('cpu'))
+        prepare.compile_blocks(model, torch.device('cpu'))
     monkeypatch.setenv('CXX', sys.executable)
     plain = model(**values(model))
     compiles = model.compile_repeated_blocks
@@ -213,7 +213,7 @@ def test_a_block_compiles_without_a_break_and_without_a_compiler_is_refused(
         model, 'compile_repeated_blocks', lambda **how: compiles(**how, backend='eager')
     )
     with torch._dynamo.config.patch(recompile_limit=1):
-        compiled.compile_blocks(model, torch.device('cpu'))
+        prepare.compile_blocks(model, torch.device('cpu'))
         torch._dynamo.utils.counters.clear()
         torch.testing.assert_close(model(**values(model)), plain, rtol=0, atol=1e-5)
         assert torch._dynamo.utils.counters['stats']['unique_graphs'] == 1
@@ -241,7 +241,7 @@ def test_float8_halves_the_blocks_and_stays_within_six_percent() -> None:
     model = build(TRANSFORMER).eval().requires_grad_(False)
     plain = model(**values(model))
     linear = sum(m.weight.numel() for m in model.blocks.modules() if isinstance(m, nn.Linear))
-    convert(model)
+    to_float8(model)
     assert not any(isinstance(m, nn.Linear) for m in model.blocks.modules())
     kept: Any = [m.weight for m in model.blocks.modules() if isinstance(m, Float8Linear)]
     assert sum(w.numel() * w.element_size() for w in kept) == linear
@@ -466,9 +466,9 @@ def test_blocks_in_float8_compile_on_a_gpu() -> None:
     given = {name: v.to('cuda', kinds[name]) for name, v in values(model).items()}
     with torch.inference_mode():
         plain = model(**given).float()
-        convert(model)
+        to_float8(model)
         eager = model(**given).float()
-        compiled.compile_blocks(model, torch.device('cuda'))
+        prepare.compile_blocks(model, torch.device('cuda'))
         quick = model(**given).float()
     for found in (eager, quick):
         error = (found - plain).square().mean().sqrt() / plain.square().mean().sqrt()
