@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
@@ -141,7 +142,7 @@ def load_network(folder: Path) -> ObjectMotionNetwork | None:
     try:
         network = ObjectMotionNetwork(**json.loads((folder / _CONFIG).read_text()))
         network.load_state_dict(load_file(folder / _WEIGHTS))
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError, SafetensorError) as error:
         raise CheckpointError(f"'{folder}' cannot be used: {error}; train it anew") from error
     return network
 

@@ -1,0 +1,99 @@
+"""Objects that move rigidly: their pictures go where a pinhole camera has them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
+
+FOCAL, SIZE = 100.0, (60, 80)
+POSE = np.eye(4)
+
+
+@pytest.fixture
+def camera() -> CameraModel:
+    height, width = SIZE
+    return CameraModel(
+        view='low',
+        width=width,
+        height=height,
+        K=np.array([[FOCAL, 0, 39.5], [0, FOCAL, 29.5], [0, 0, 1]]),
+        distortion_model='none',
+        distortion=np.zeros(0),
+        mount_link='base',
+        T_mount_camera=POSE,
+    )
+
+
+def square(row: int, column: int, half: int) -> np.ndarray:
+    mask = np.zeros(SIZE, bool)
+    mask[row - half : row + half + 1, column - half : column + half + 1] = True
+    return mask
+
+
+def shown(camera, masks, colours, reference, points, rotations=None):
+    """(T, H, W, 4) of one view, the optical axis along the base's z."""
+    frame = np.full((*SIZE, 3), 200, np.uint8)
+    for mask, colour in zip(masks, colours, strict=True):
+        frame[mask] = colour
+    points = np.asarray(points, float)
+    turns = np.tile(np.eye(3), (*points.shape[:2], 1, 1)) if rotations is None else rotations
+    motion = ObjectMotion(reference=np.asarray(reference, float), points=points, rotations=turns)
+    poses = np.tile(POSE, (1, len(points), 1, 1))
+    return moved_pictures(frame[None], np.stack(masks)[None], motion, [camera], [POSE], poses)[0]
+
+
+def centre_and_area(picture: np.ndarray) -> tuple[np.ndarray, float]:
+    cover = picture[..., 3] / 255.0
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+    area = cover.sum()
+    return np.array([(columns * cover).sum(), (rows * cover).sum()]) / area, float(area)
+
+
+def test_a_shift_in_space_is_a_shift_by_focal_length_over_depth(camera):
+    mask = square(30, 40, 4)
+    start = np.array([0.005, 0.005, 1.0])
+    moved = shown(camera, [mask], [(255, 0, 0)], [start], [[start], [start + [0.1, -0.05, 0]]])
+    (at_start, area), (at_end, area_after) = map(centre_and_area, moved)
+    np.testing.assert_allclose(at_end - at_start, [10.0, -5.0], atol=0.05)
+    assert area_after == pytest.approx(area, rel=0.02)
+    assert (moved[1, 25, 50] == (255, 0, 0, 255)).all()
+
+
+def test_half_the_depth_is_four_times_the_area(camera):
+    start = np.array([0.005, 0.005, 1.0])
+    moved = shown(camera, [square(30, 40, 4)], [(9, 9, 9)], [start], [[start], [start * 0.5]])
+    (_, area), (_, area_after) = map(centre_and_area, moved)
+    assert area_after == pytest.approx(4 * area, rel=0.1)
+
+
+def test_a_turn_about_the_line_of_sight_turns_the_picture(camera):
+    mask = np.zeros(SIZE, bool)
+    mask[28:33, 30:51] = True  # wide and low, about pixel (40, 30)
+    start = np.array([0.005, 0.005, 1.0])
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turns = np.stack([np.eye(3), quarter])[:, None]
+    moved = shown(camera, [mask], [(9, 9, 9)], [start], [[start], [start]], turns)
+    rows, columns = np.nonzero(moved[1, ..., 3] > 127)
+    assert np.ptp(rows) == 20 and np.ptp(columns) == 4
+
+
+def test_near_objects_hide_far_ones_and_unknown_ones_stay(camera):
+    masks = [square(30, 20, 4), square(30, 40, 4), square(10, 60, 3)]
+    colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+    reference = [[-0.195, 0.005, 1.0], [0.005, 0.005, 1.0], [np.nan] * 3]
+    end = [[0.0045, 0.0045, 0.9], reference[1], [np.nan] * 3]
+    moved = shown(camera, masks, colours, reference, [end])[0]
+    assert (moved[30, 40, :3] == (255, 0, 0)).all()  # the red one came nearer, before the green
+    assert moved[30, 20, 3] == 0
+    assert (moved[10, 60] == (0, 0, 255, 255)).all()
+    assert not moved[50:, :, 3].any()
+
+
+def test_what_goes_behind_the_camera_is_held(camera):
+    mask = square(30, 40, 4)
+    start = [0.005, 0.005, 1.0]
+    moved = shown(camera, [mask], [(255, 0, 0)], [start], [[[0.0, 0.0, -1.0]]])[0]
+    np.testing.assert_array_equal(moved[..., 3] == 255, mask)

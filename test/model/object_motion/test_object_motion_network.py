@@ -1,0 +1,119 @@
+"""The object motion network: chunks, padding, files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork, Scene
+from mtv_world_ros.model.object_motion.predictor import (
+    load_network,
+    ObjectMotionPredictor,
+    save_network,
+    TrackedObjects,
+)
+
+STEPS = 12
+
+
+@pytest.fixture
+def network() -> ObjectMotionNetwork:
+    torch.manual_seed(0)
+    network = ObjectMotionNetwork(width=32, hidden=16)
+    with torch.no_grad():  # an untrained one would hold everything still
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return network.eval()
+
+
+def scene(num_objects: int, present: int) -> Scene:
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    tools = torch.eye(4).repeat(1, STEPS + 1, 2, 1, 1)
+    tools[..., :3, 3] = 0.1 * random(1, STEPS + 1, 2, 3)
+    known = torch.arange(num_objects) < present
+    return Scene(
+        points=torch.where(known[:, None], 0.1 * random(1, num_objects, 3), 0.0),
+        features=torch.where(known[:, None, None], 0.1 * random(1, num_objects, 2, 9), 0.0),
+        present=known[None],
+        tools=tools,
+        openings=random(1, STEPS + 1, 2),
+    )
+
+
+def test_two_calls_one_after_the_other_are_one_call(network):
+    given = scene(3, 3)
+    with torch.inference_mode():
+        whole = network(given)
+        part = replace(given, tools=given.tools[:, :6], openings=given.openings[:, :6])
+        first, memory = network.roll(part)
+        part = replace(given, tools=given.tools[:, 4:], openings=given.openings[:, 4:])
+        second, _ = network.roll(part, memory, skip=1)
+    torch.testing.assert_close(first.points, whole.points[:, :6])
+    torch.testing.assert_close(second.points, whole.points[:, 5:])
+    torch.testing.assert_close(second.rotations, whole.rotations[:, 5:])
+
+
+def test_padding_changes_nothing_and_rotations_stay_rotations(network):
+    given = scene(2, 2)
+    padded = replace(
+        given,
+        points=torch.cat([given.points, torch.zeros(1, 1, 3)], 1),
+        features=torch.cat([given.features, torch.zeros(1, 1, 2, 9)], 1),
+        present=torch.tensor([[True, True, False]]),
+    )
+    with torch.inference_mode():
+        alone, among = network(given), network(padded)
+    torch.testing.assert_close(among.points[:, :, :2], alone.points)
+    assert (alone.points[:, -1] - alone.points[:, 0]).abs().max() > 1e-3
+    product = alone.rotations @ alone.rotations.mT
+    torch.testing.assert_close(product, torch.eye(3).expand_as(product), atol=1e-4, rtol=0)
+    assert (alone.held.sum(-1) <= 1 + 1e-5).all() and (alone.spread.diff(dim=1) >= 0).all()
+
+
+def test_a_shift_of_the_whole_scene_in_the_plane_shifts_the_answer(network):
+    given, way = scene(2, 2), torch.tensor([0.3, -0.2, 0.0])
+    tools = given.tools.clone()
+    tools[..., :3, 3] += way
+    with torch.inference_mode():
+        here = network(given)
+        there = network(replace(given, points=given.points + way, tools=tools))
+    torch.testing.assert_close(there.points, here.points + way, atol=1e-5, rtol=0)
+
+
+def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network):
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    rng = np.random.default_rng(0)
+    positions = np.cumsum(rng.normal(0, 0.02, (9, len(robot.joint_names))), axis=0)
+    tracked = TrackedObjects(
+        model=ObjectMotionPredictor(network, robot),
+        reference=np.array([[0.1, 0.2, 0.02], [np.nan] * 3]),
+        features=np.full((2, 2, 9), 0.04),
+    )
+    whole, _ = tracked.advance(positions)
+    first, later = tracked.advance(positions[:5])
+    second, _ = later.advance(positions[4:])
+    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=1e-6)
+    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=1e-6)
+    assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()
+
+
+def test_what_is_saved_is_read_again_and_damage_is_named(network, tmp_path):
+    assert load_network(tmp_path / 'object_motion') is None
+    save_network(network, tmp_path / 'object_motion')
+    read = load_network(tmp_path / 'object_motion')
+    assert read is not None
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(read.state_dict()[name], value)
+    (tmp_path / 'object_motion' / 'model.safetensors').write_bytes(b'no')
+    with pytest.raises(CheckpointError, match=r'object_motion.*cannot be used'):
+        load_network(tmp_path / 'object_motion')

@@ -1,0 +1,86 @@
+"""Training of the object motion network on recorded episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.object_motion.predictor import load_network
+from mtv_world_ros.sim.collect.collect import collect
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+from mtv_world_ros.sim.collect.record import RecordConfig
+from mtv_world_ros.sim.expert.faults import kinds_of
+from mtv_world_ros.sim.world.opengl import missing_opengl
+from mtv_world_ros.training.object_motion.tracks import object_tracks
+from mtv_world_ros.training.object_motion.train import (
+    end_errors,
+    MotionTraining,
+    read_tracks,
+    train_motion,
+)
+
+VIEWS = ('low', 'high')
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='module')
+def episodes(tmp_path_factory) -> list[Path]:
+    """Two episodes with a picture of the first frame alone, and where the objects went."""
+    if reason := missing_opengl():
+        pytest.skip(reason)
+    out = tmp_path_factory.mktemp('first_pictures')
+    config = CollectConfig(kinds=kinds_of('train'), record=RecordConfig(pictures='first'))
+    collect('stack_blocks_two', 2, 5, out, config=config, progress=False)
+    return sorted(path.parent for path in out.rglob('metadata.yaml'))
+
+
+def test_tracks_are_the_recorded_poses_from_where_the_masks_have_the_objects(episodes, robot):
+    track = object_tracks(episodes[0], robot, VIEWS)
+    recorded = read_episode(episodes[0]).object_poses
+    assert recorded is not None and track.turns_known and track.known.all()
+    true = recorded.T_base_object[:, :, :3, 3]
+    assert np.linalg.norm(track.points[0] - true[0], axis=-1).max() < 0.015
+    np.testing.assert_allclose(track.points - track.points[0], true - true[0], atol=1e-6)
+    assert track.tools.shape[:2] == (len(track.points), 2)
+
+
+def test_without_recorded_poses_the_masks_tell(robot):
+    demo = share_path('resource', 'demo_episode')
+    track = object_tracks(demo, robot, VIEWS)
+    assert not track.turns_known and track.known.any(axis=0).all()
+    assert np.isfinite(track.points).all()
+    # the demo stacks a block: something rises by more than its own height
+    assert (track.points[..., 2].max(0) - track.points[0, :, 2]).max() > 0.03
+
+
+def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_path):
+    tracks, skipped = read_tracks(episodes, robot, VIEWS)
+    assert len(tracks) == 2 and not skipped
+    torch.manual_seed(0)
+    config = MotionTraining(steps=1, batch_size=2, learning_rate=1e-9)
+    before, _ = end_errors(train_motion(tracks, tmp_path / 'a', config), tracks)
+    config = MotionTraining(steps=25, batch_size=4)
+    network = train_motion(tracks, tmp_path / 'b', config)
+    after, _ = end_errors(network, tracks)
+    assert after.mean() < 0.8 * before.mean()
+    read = load_network(tmp_path / 'b' / 'object_motion')
+    assert read is not None
+    np.testing.assert_allclose(end_errors(read, tracks)[0], after, atol=1e-6)
+    with pytest.raises(TrainingError, match='exists; choose another --out'):
+        train_motion(tracks, tmp_path / 'b', config)
+
+
+def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
+    with pytest.raises(TrainingError, match='no episode can be trained on'):
+        read_tracks([tmp_path], robot, VIEWS)
