@@ -72,17 +72,18 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
     from mtv_world_ros.evaluation.calibration.report import write_calibration_report
+    from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
     from mtv_world_ros.success.calibration import save_calibration
     from mtv_world_ros.success.trusted_horizon import save_horizon
 
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     print(f'{arguments.dataset}: {selection}')
+    refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
     runs = _imagine(arguments, selection)
     segmenter = str(runs[0].settings['segmenter'])
-    found = calibrate(
-        samples_of([run.results for run in runs]), segmenter=segmenter, l2=arguments.l2, made=made
-    )
+    samples = samples_of([run.results for run in runs], recorded_kinds(selection.paths))
+    found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
     if arguments.store:

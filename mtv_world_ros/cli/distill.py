@@ -57,6 +57,7 @@ def _distill(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.card import read_card
     from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.config import load_training_config
     from mtv_world_ros.training.distill import distill, DistillConfig
 
@@ -66,9 +67,11 @@ def _distill(arguments: argparse.Namespace) -> int:
     teacher = checkpoint_path(arguments.checkpoint)
     overrides = {**_DEFAULTS, **set_overrides(arguments.overrides)}
     torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    refuse_test_kinds(paths, 'training')
     folder = distill(
         teacher,
-        select(arguments.dataset, arguments.split, default='train').paths,
+        paths,
         arguments.out,
         load_training_config(arguments.preset, overrides),
         settings,

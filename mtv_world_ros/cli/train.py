@@ -95,6 +95,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.config import load_training_config
     from mtv_world_ros.training.run import train
 
@@ -111,6 +112,7 @@ def _train(arguments: argparse.Namespace) -> int:
     cores = max(1, len(os.sched_getaffinity(0)) // processes)
     torch.set_num_threads(arguments.threads or cores)
     paths = select(arguments.dataset, arguments.split, default='train').paths
+    refuse_test_kinds(paths, 'training')
     folder = train(
         config,
         paths,

@@ -36,6 +36,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.object_motion.predictor import FOLDER, load_network
     from mtv_world_ros.model.runtime import set_num_threads
+    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.train import (
         end_errors,
         MotionTraining,
@@ -47,7 +48,9 @@ def _train(arguments: argparse.Namespace) -> int:
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     views = [view.strip() for view in arguments.views.split(',')]
-    tracks, skipped = read_tracks(find_episodes(arguments.dataset), robot, views)
+    paths = find_episodes(arguments.dataset)
+    refuse_test_kinds(paths, 'training')
+    tracks, skipped = read_tracks(paths, robot, views)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     held_out = tracks[::20]

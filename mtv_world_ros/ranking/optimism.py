@@ -23,7 +23,12 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
     pearson,
     rates,
 )
-from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson, Interval, UNKNOWN
+from mtv_world_ros.evaluation.metrics.statistics import (
+    clustered_wilson,
+    Interval,
+    MIN_SCENES,
+    UNKNOWN,
+)
 from mtv_world_ros.ranking.jobs import Judged, Result
 from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, parse_variant
 
@@ -192,7 +197,8 @@ class Optimism:
         areas = [areas_under_roc(one, real, weights) for one in said]
         found = areas[0] - areas[1] if len(areas) > 1 else areas[0]
         known = found[1:][np.isfinite(found[1:])]
-        low, high = np.percentile(known, [2.5, 97.5]) if len(known) else UNKNOWN
+        enough = len(known) and len(set(scenes)) >= MIN_SCENES
+        low, high = np.percentile(known, [2.5, 97.5]) if enough else UNKNOWN
         return Score(value=float(found[0]), interval=(float(low), float(high)), count=len(results))
 
 

@@ -320,7 +320,7 @@ def test_lines_are_right(block):
         ('mtv-world train data/sim --out x --presett small', 'unrecognized arguments'),
         ('mtv-world train data/sim --out x --epis 3', 'unrecognized arguments'),
         ('mtv-world trian data/sim', 'is none of'),
-        ('mtv-world train data/sim --out x --preset smal', 'smal.yaml'),
+        ('mtv-world train data/sim --out x --preset smal', "did you mean 'small'"),
         ('mtv-world train data/sim --out x --set optimizer.step=3', "did you mean 'steps'"),
         ('mtv-world collect --task stack_block --episodes 1 --out x', 'stack_block'),
         ('mtv-world collect --episodes 1 --policies expert-lat-0.3 --out x', 'lat'),

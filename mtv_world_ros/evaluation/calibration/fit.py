@@ -24,7 +24,7 @@ MIN_EPISODES = 8
 #: of a fitted logistic; all labels equal would have no finite one
 MAX_BIAS = 30.0
 #: what the scores are called, in the order of the tables
-BEFORE, AFTER, FITTED = 'before', 'after', 'fitted'
+BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
 ALWAYS = 'always success'
 
 
@@ -39,6 +39,7 @@ class Sample:
         features: of the estimate by seed; empty where it abstained.
         before: probabilities by seed with the stated weights; NaN = abstained.
         reasons: of the first seed's estimate.
+        kinds: faults of the policy that acted; empty = none, or not a scripted policy.
     """
 
     episode: str
@@ -47,6 +48,7 @@ class Sample:
     features: tuple[Mapping[str, float], ...]
     before: tuple[float, ...]
     reasons: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,8 +58,10 @@ class Calibrated:
     Attributes:
         calibration: fitted on all samples.
         samples: with known outcome.
-        judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it), `FITTED`
-            (on what it was fitted on: too good) -> one per sample.
+        judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
+            `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
+            only where there are faults), `FITTED` (on what it was fitted on: too good) -> one
+            per sample.
     """
 
     calibration: Calibration
@@ -65,8 +69,16 @@ class Calibrated:
     judgements: Mapping[str, tuple[Judgement, ...]]
 
 
-def samples_of(runs: Sequence[Sequence[EpisodeResult]]) -> list[Sample]:
-    """Returns the episodes of known outcome; `runs` hold the same episodes, one run a seed."""
+def samples_of(
+    runs: Sequence[Sequence[EpisodeResult]], kinds: Mapping[str, tuple[str, ...]] | None = None
+) -> list[Sample]:
+    """Returns the episodes of known outcome.
+
+    Args:
+        runs: of the same episodes, one run a seed.
+        kinds: faults of the policies that acted, by episode; episodes may be missing.
+    """
+    known_kinds = kinds or {}
     by_name = [{result.episode: result for result in run} for run in runs]
     samples = []
     for name, first in sorted(by_name[0].items()):
@@ -80,6 +92,7 @@ def samples_of(runs: Sequence[Sequence[EpisodeResult]]) -> list[Sample]:
                     features=tuple(result.features for result in found),
                     before=tuple(result.probability for result in found),
                     reasons=first.reasons,
+                    kinds=known_kinds.get(name, ()),
                 )
             )
     return samples
@@ -107,10 +120,13 @@ def calibrate(
     fitted = _fit(samples, segmenter, l2)
     judgements = {
         BEFORE: tuple(_judged(s, _mean_of(s.before)) for s in samples),
-        AFTER: _left_out(samples, segmenter, l2),
+        AFTER: _left_out(samples, [{s.task} for s in samples], segmenter, l2),
         FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
         ALWAYS: tuple(_judged(s, 1.0) for s in samples),
     }
+    if any(sample.kinds for sample in samples):
+        groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
+        judgements[AFTER_KINDS] = _left_out(samples, groups, segmenter, l2)
     scores = {name: agreement(found) for name, found in judgements.items()}
     calibration = Calibration(**fitted, scores=scores, made=dict(made or {}))
     return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
@@ -127,16 +143,22 @@ def _check(samples: Sequence[Sample]) -> None:
         )
 
 
-def _left_out(samples: Sequence[Sample], segmenter: str, l2: float) -> tuple[Judgement, ...]:
-    """Every sample judged by a fit that has not seen its task."""
-    fits: dict[str, dict[str, Any] | None] = {}
-    for task in {sample.task for sample in samples}:
-        others = [sample for sample in samples if sample.task != task and any(sample.features)]
+def _left_out(
+    samples: Sequence[Sample], groups: Sequence[set[str]], segmenter: str, l2: float
+) -> tuple[Judgement, ...]:
+    """Every sample judged by a fit that has seen no sample which shares a group with it."""
+    fits: dict[frozenset[str], dict[str, Any] | None] = {}
+    for left_out in set(map(frozenset, groups)):
+        others = [
+            sample
+            for sample, group in zip(samples, groups, strict=True)
+            if not group & left_out and any(sample.features)
+        ]
         enough = len({sample.success for sample in others}) == 2
-        fits[task] = _fit(others, segmenter, l2) if enough else None
+        fits[left_out] = _fit(others, segmenter, l2) if enough else None
     judged = []
-    for sample in samples:
-        fit = fits[sample.task]
+    for sample, group in zip(samples, groups, strict=True):
+        fit = fits[frozenset(group)]
         judged.append(_judged(sample, nan if fit is None else _probability(fit, sample)))
     return tuple(judged)
 

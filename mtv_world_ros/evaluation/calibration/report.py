@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.evaluation.calibration.fit import AFTER, ALWAYS, BEFORE, Calibrated, FITTED
+from mtv_world_ros.evaluation.calibration.fit import (
+    AFTER,
+    AFTER_KINDS,
+    ALWAYS,
+    BEFORE,
+    Calibrated,
+    FITTED,
+    Sample,
+)
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.evaluation.report.markup import element, Markup
@@ -27,9 +35,15 @@ _COLUMNS = {
 _ROWS = {
     BEFORE: 'before: stated weights',
     AFTER: 'after: each task left out of the fit',
+    AFTER_KINDS: 'after: each fault kind left out of the fit',
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }
+
+
+_GROUP_COLUMNS = (
+    'episodes', 'succeed', 'mean estimate', 'accuracy', 'false-success rate', 'abstained',
+)  # fmt: skip
 
 
 def write_calibration_report(out: Path, found: Calibrated, horizon: HorizonCurve | None) -> str:
@@ -47,6 +61,7 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
     scores = [
         [words, *(_number(calibration.scores[name].get(key)) for key in _COLUMNS)]
         for name, words in _ROWS.items()
+        if name in calibration.scores
     ]
     weights = [
         [name, *(f'{value:.3f}' for value in row)]
@@ -60,8 +75,8 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
         _summary(found),
         _table(['', *_COLUMNS.values()], scores),
         '## By task, each left out of the fit that judges it',
-        _table(['task', 'episodes', 'succeed', 'mean estimate', 'accuracy', 'false-success rate',
-                'abstained'], _task_rows(found)),
+        _table(['task', *_GROUP_COLUMNS], _group_rows(found, AFTER, lambda s: (s.task,))),
+        *_kinds(found),
         '## Weights',
         _table(['feature', 'logit per scale', 'mean', 'scale'], weights)
         + f'\n\nBias {calibration.bias:.3f}.',
@@ -84,15 +99,27 @@ def _summary(found: Calibrated) -> str:
     )
 
 
-def _task_rows(found: Calibrated) -> list[list[str]]:
+def _kinds(found: Calibrated) -> list[str]:
+    if AFTER_KINDS not in found.judgements:
+        return []
+    rows = _group_rows(found, AFTER_KINDS, lambda sample: sample.kinds or ('(no fault)',))
+    return [
+        '## By fault kind, each left out of the fit that judges it',
+        _table(['kind', *_GROUP_COLUMNS], rows),
+    ]
+
+
+def _group_rows(
+    found: Calibrated, name: str, groups: Callable[[Sample], tuple[str, ...]]
+) -> list[list[str]]:
     rows = []
-    for task in sorted({sample.task for sample in found.samples}):
-        pairs = zip(found.samples, found.judgements[AFTER], strict=True)
-        judged = [judgement for sample, judgement in pairs if sample.task == task]
+    for group in sorted({group for sample in found.samples for group in groups(sample)}):
+        pairs = zip(found.samples, found.judgements[name], strict=True)
+        judged = [judgement for sample, judgement in pairs if group in groups(sample)]
         numbers = agreement(judged)
         rows.append(
             [
-                task,
+                group,
                 str(len(judged)),
                 str(sum(item.outcome == 'success' for item in judged)),
                 _number(numbers['estimated_success_rate']),
@@ -119,7 +146,9 @@ def _horizon_text(horizon: HorizonCurve) -> str:
 def reliability_page(found: Calibrated) -> str:
     """Returns a page with two charts that needs no other file."""
     figures = []
-    for name in (BEFORE, AFTER):
+    for name in (BEFORE, AFTER, AFTER_KINDS):
+        if name not in found.judgements:
+            continue
         title = f'Share of real successes against the estimate, {_ROWS[name]}'
         chart = reliability_chart(title, reliability_bins(found.judgements[name]), 'c0')
         figures.append(element('figure', element('figcaption', _ROWS[name]), chart))
@@ -141,6 +170,7 @@ def _values(found: Calibrated) -> dict[str, Any]:
             {
                 'episode': sample.episode,
                 'task': sample.task,
+                'kinds': list(sample.kinds),
                 'success': sample.success,
                 'features': list(sample.features),
                 'reasons': sample.reasons,

@@ -13,6 +13,7 @@ from scipy.special import expit, log_expit
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.evaluation.calibration.fit import (
     AFTER,
+    AFTER_KINDS,
     BEFORE,
     calibrate,
     fit_logistic,
@@ -226,6 +227,23 @@ def test_left_out_tasks_do_not_leak_into_what_judges_them():
     ]
     assert max(moved) > 0.05
     assert fitted.judgements[FITTED] != other.judgements[FITTED]
+
+
+def test_left_out_fault_kinds_do_not_leak_into_what_judges_them():
+    kinds = ((), ('high',), ('late',), ('high', 'late'))
+    samples = [replace(s, kinds=kinds[i // 2 % 4]) for i, s in enumerate(made_samples())]
+    assert AFTER_KINDS not in calibrate(made_samples(), segmenter='colour').judgements
+    fitted = calibrate(samples, segmenter='colour')
+    flipped = [replace(s, success=not s.success) if 'high' in s.kinds else s for s in samples]
+    other = calibrate(flipped, segmenter='colour')
+    pairs = zip(fitted.judgements[AFTER_KINDS], other.judgements[AFTER_KINDS], strict=True)
+    same = [a.probability == b.probability or np.isnan(a.probability) for a, b in pairs]
+    # those with the kind have not seen any of it; those with another kind, or none, have
+    assert all(same[i] for i, s in enumerate(samples) if 'high' in s.kinds)
+    assert not all(same[i] for i, s in enumerate(samples) if s.kinds == ('late',))
+    text = markdown(fitted, None)
+    assert '| after: each fault kind left out of the fit |' in text
+    assert '## By fault kind' in text and '| (no fault) |' in text
 
 
 def test_task_that_is_all_there_is_cannot_be_left_out():

@@ -1,0 +1,45 @@
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Episodes without frames, one a policy; the last two are not scripted."""
+    policies = ('expert', 'expert-late-0.6', 'expert-high-0.02-lean-0.4', 'pi0', '')
+    for number, policy in enumerate(policies):
+        metadata = {'policy': policy} if policy else {}
+        with EpisodeWriter(
+            tmp_path / 'set' / f'stack_{number:05d}', task='stack', instruction='stack',
+            robot='yam_bimanual', cameras=[], seed=0, objects=(), metadata=metadata,
+        ) as writer:  # fmt: skip
+            writer.outcome = 'failure'
+            writer.write_instruction(1_700_000_000_000_000_000)
+    return tmp_path / 'set'
+
+
+def test_kinds_are_those_of_the_recorded_policy(dataset):
+    assert recorded_kinds(sorted(dataset.iterdir())) == {
+        'stack_00000': (), 'stack_00001': ('late',), 'stack_00002': ('high', 'lean'),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('command', 'what'),
+    [
+        (['train', '{set}', '--out', '{out}'], 'training'),
+        (['train-motion', '{set}', '--out', '{out}'], 'training'),
+        (['calibrate', 'bundled', '{set}', '--out', '{out}'], 'calibration'),
+    ],
+)
+def test_a_test_kind_in_a_training_or_calibration_set_is_refused(
+    command, what, dataset, tmp_path, capsys
+):
+    out = tmp_path / 'out'
+    assert main([word.format(set=dataset, out=out) for word in command]) == 1
+    said = capsys.readouterr().err
+    assert f'fault kinds of the split test are not for {what}' in said
+    assert "'expert-high-0.02-lean-0.4' has lean; choose kinds of train, calibrate" in said
+    assert not out.exists()
