@@ -14,6 +14,9 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
 
+#: what moved or turned by less is taken to stand still
+_STILL_M, _STILL_RAD = 0.004, 0.08
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectMotion:
@@ -28,6 +31,12 @@ class ObjectMotion:
     reference: FloatArray
     points: FloatArray
     rotations: FloatArray
+
+    def moves(self) -> BoolArray:
+        """Returns (T, O) whether an object is elsewhere than at first, by more than an error."""
+        way = np.linalg.norm(self.points - self.reference, axis=-1)
+        turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
+        return (way > _STILL_M) | turned
 
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
@@ -50,7 +59,8 @@ def moved_pictures(
 
     Each object is moved as the picture of a plane through its centre that faces the camera:
     shifted by the projected way, scaled by the ratio of depths, turned by the rotation about the
-    line of sight; near ones over far ones. What is not known, or behind a camera, is held.
+    line of sight. What has moved lies over what has not, as a thing does over the container that
+    it was put into; else near ones over far ones. What is not known, or behind a camera, is held.
 
     Args:
         frames: (V, H, W, 3) uint8 RGB of the reference.
@@ -63,21 +73,27 @@ def moved_pictures(
     num_frames = len(motion.points)
     views, _, height, width = masks.shape
     shown = np.zeros((views, num_frames, height, width, 4), np.uint8)
+    moves = motion.moves()
     for view, camera in enumerate(cameras):
         before, depth = project(camera, reference_poses[view], motion.reference)
         after, depths = project(camera, poses[view][:, None], motion.points)
         turns = _turns(motion.rotations, poses[view])
         cut = [_cut_out(frames[view], mask) for mask in masks[view]]
         for frame in range(num_frames):
-            # what is not known counts as far away
-            for item in np.argsort(-np.nan_to_num(depths[frame], nan=np.inf), kind='stable'):
+            for item in _from_behind(depths[frame], moves[frame]):
                 picture = cut[item]
-                if np.isfinite(after[frame, item]).all() and np.isfinite(before[item]).all():
+                if moves[frame, item] and np.isfinite([*after[frame, item], *before[item]]).all():
                     zoom = float(depth[item] / depths[frame, item])
                     turn = float(turns[frame, item])
                     picture = _warped(picture, before[item], after[frame, item], zoom, turn)
                 _lay(shown[view, frame], picture)
     return shown
+
+
+def _from_behind(depths: FloatArray, moves: BoolArray) -> list[int]:
+    """Items in the order in which they are laid over each other; unknown depths count as far."""
+    far = np.nan_to_num(depths, nan=np.inf)
+    return sorted(range(len(far)), key=lambda item: (bool(moves[item]), -float(far[item])))
 
 
 def _cut_out(frame: ByteArray, mask: BoolArray) -> ByteArray:

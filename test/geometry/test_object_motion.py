@@ -92,6 +92,15 @@ def test_near_objects_hide_far_ones_and_unknown_ones_stay(camera):
     assert not moved[50:, :, 3].any()
 
 
+def test_what_was_put_into_a_container_is_seen_in_it(camera):
+    masks = [square(30, 20, 3), square(30, 50, 10)]
+    reference = [[-0.195, 0.005, 1.0], [0.105, 0.005, 1.0]]
+    into = [[0.107, 0.005, 1.02], [0.1055, 0.005, 1.0]]  # farther than the container's centre
+    moved = shown(camera, masks, [(255, 0, 0), (0, 255, 0)], reference, [into])[0]
+    assert (moved[30, 50, :3] == (255, 0, 0)).all() and (moved[30, 42, :3] == (0, 255, 0)).all()
+    assert not moved[30, 61, 3]  # half a millimetre is no motion
+
+
 def test_what_goes_behind_the_camera_is_held(camera):
     mask = square(30, 40, 4)
     start = [0.005, 0.005, 1.0]
