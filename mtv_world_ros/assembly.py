@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, PolicyError
-from mtv_world_ros.files import content_digest, share_path
+from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModel
@@ -73,12 +73,10 @@ def robot_path(name: str | Path) -> Path:
     Raises:
         ConfigError: neither.
     """
-    path = Path(name)
-    if path.suffix in _YAML:
-        if not path.is_file():
-            raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
-        return path
-    return share_path('config', 'robots', f'{name}.yaml')
+    path = bundled('robots', name, 'robot_file')
+    if not path.is_file():
+        raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
+    return path
 
 
 def load_pipeline(
@@ -223,15 +221,12 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     Raises:
         ConfigError, PolicyError: no such policy, or its file is wrong.
     """
-    path = Path(name)
     if str(name).startswith('expert'):
         return _scripted(ScriptedPolicySettings(variant=str(name)), robot)
-    if path.suffix not in _YAML:
-        path = share_path('config', 'policies', f'{name}.yaml')
-    config = load_policy_config(path)
+    config = load_policy_config(bundled('policies', name, 'policy'), robot)
     if isinstance(config, ScriptedPolicySettings):
         return _scripted(config, robot)
-    made = config.make(robot)
+    made = config.make()
     return lambda task, scene_seed: made
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import BeforeValidator, Field, model_validator, PrivateAttr, ValidationInfo
 
-from mtv_world_ros.config import check_keys, number, numbers, word
+from mtv_world_ros.config import expected, Pair, Schema
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
 
 #: factor to rad or m
 UNITS = {'rad': 1.0, 'm': 1.0, 'deg': np.pi / 180, 'cm': 0.01, 'mm': 0.001}
-_ROW_KEYS = ('column', 'unit', 'sign', 'offset', 'closed', 'open', 'from', 'to', 'constant')
+Unit = Literal['rad', 'm', 'deg', 'cm', 'mm']
 _LINEAR = {'unit', 'sign', 'offset'}
 
 
@@ -36,84 +37,109 @@ class JointColumn:
     offset: float = 0.0
 
 
-def parse_joints(
-    rows: Any, unit: str, robot: RobotModel, where: str, *, allow_missing: bool = False
-) -> tuple[JointColumn, ...]:
-    """Reads `joints`, one entry for each joint of the robot, unless some may be missing.
+class ColumnEntry(Schema):
+    """What a joint's values are made of: a column with unit, sign and offset, or with a range."""
 
-    An entry is a column (name or number), or keys: `column` with `unit`, `sign` and `offset`
-    (added last, rad or m); or with `closed` and `open`, the gripper's values in the dataset; or
-    with `from` and `to`, two values in the dataset and what they mean (rad or m); or `constant`
-    alone. Without `joints` the columns have the joints' names.
+    column: Annotated[int | str | None, expected('a name or a number')] = None
+    unit: Unit | None = Field(default=None, description="null = that of the joints' table")
+    sign: float = Field(default=1, description='1 or -1')
+    offset: float = Field(default=0.0, description='added last [rad or m]')
+    closed: float | None = Field(default=None, description="a gripper's value in the dataset")
+    open: float | None = Field(default=None, description="a gripper's value in the dataset")
+    from_: Pair | None = Field(default=None, alias='from', description='values in the dataset')
+    to: Pair | None = Field(default=None, description='what `from` means [rad or m]')
+    constant: float | None = Field(default=None, description='instead of a column [rad or m]')
 
-    Raises:
-        ConfigError: a joint is missing or unknown, or an entry is wrong.
+    @model_validator(mode='after')
+    def _keys_go_together(self) -> Self:
+        given = {name.rstrip('_') for name in self.model_fields_set}
+        if 'constant' in given and len(given) > 1:
+            raise ValueError(f"'constant' stands alone, got {sorted(given)}")
+        if 'constant' not in given and self.column is None:
+            raise ValueError("'column' is None, must be a name or a number")
+        if abs(self.sign) != 1:
+            raise ValueError(f"'sign' is {self.sign:g}, must be 1 or -1")
+        given -= {'column', 'constant'}
+        if not given <= _LINEAR and given not in ({'from', 'to'}, {'closed', 'open'}):
+            raise ValueError(
+                f"{sorted(given)} do not go together; give 'unit', 'sign', 'offset', or 'closed' "
+                "and 'open', or 'from' and 'to'"
+            )
+        low, high = self.from_ or (self.closed, self.open)
+        if low is not None and low == high:
+            raise ValueError(f'both ends of the range are {low:g}')
+        return self
+
+    def of(self, joint: str, unit: Unit, robot: RobotModel) -> JointColumn:
+        """Returns what it says of a joint of a robot, whose unit is `unit` by default."""
+        if self.column is None:
+            return JointColumn(joint=joint, column=None, offset=self.constant or 0.0)
+        if self.from_ and self.to:
+            (a, b), (c, d) = self.from_, self.to
+        elif self.closed is not None and self.open is not None:
+            tool = next((t for t in robot.tools if t.gripper_joint == joint), None)
+            if tool is None:
+                raise ValueError("'closed' and 'open' are for grippers; use 'from', 'to'")
+            a, b, c, d = self.closed, self.open, tool.gripper_closed, tool.gripper_open
+        else:
+            factor = UNITS[self.unit or unit] * self.sign
+            return JointColumn(joint=joint, column=self.column, factor=factor, offset=self.offset)
+        factor = (d - c) / (b - a)
+        return JointColumn(joint=joint, column=self.column, factor=factor, offset=c - factor * a)
+
+
+def _entry(value: Any) -> Any:
+    is_column = isinstance(value, str | int) and not isinstance(value, bool)
+    return {'column': value} if is_column else value
+
+
+JointEntries = dict[str, Annotated[ColumnEntry, BeforeValidator(_entry)]]
+
+
+class JointTable(Schema):
+    """Which column each joint of the robot is; validated with `robot` in the context.
+
+    An entry is a column (name or number) or a `ColumnEntry`. Without `joints` the columns have
+    the joints' names.
     """
-    if rows is None:
-        rows = {joint: joint for joint in robot.joint_names}
-    check_keys(rows, robot.joint_names, (), f'{where}: joints')
-    missing = [joint for joint in robot.joint_names if joint not in rows]
-    if missing and not allow_missing:
-        raise ConfigError(
-            f"{where}: joints {missing} of robot '{robot.name}' are missing; name their columns, "
-            'or give `{constant: 0.0}` for one that the dataset does not have'
-        )
-    return tuple(
-        _joint(joint, rows[joint], unit, robot, f"{where}: joint '{joint}'")
-        for joint in robot.joint_names
-        if joint in rows
-    )
 
+    allow_missing: ClassVar[bool] = False
 
-def _joint(joint: str, row: Any, unit: str, robot: RobotModel, where: str) -> JointColumn:
-    if isinstance(row, str | int) and not isinstance(row, bool):
-        row = {'column': row}
-    row = check_keys(row, _ROW_KEYS, (), where)
-    given = set(row) - {'column'}
-    if 'constant' in row:
-        if set(row) != {'constant'}:
-            raise ConfigError(f"{where}: 'constant' stands alone, got {sorted(row)}")
-        return JointColumn(joint=joint, column=None, offset=number(row, 'constant', 0.0, where))
-    column = row.get('column')
-    if isinstance(column, bool) or not isinstance(column, str | int):
-        raise ConfigError(f"{where}: 'column' is {column!r}, must be a name or a number")
-    if given <= _LINEAR:
-        factor = UNITS[word({'unit': unit, **row}, 'unit', UNITS, where)]
-        factor *= _sign(row, where)
-        offset = number(row, 'offset', 0.0, where)
-        return JointColumn(joint=joint, column=column, factor=factor, offset=offset)
-    factor, offset = _range(joint, row, given, robot, where)
-    return JointColumn(joint=joint, column=column, factor=factor, offset=offset)
+    unit: Unit = Field(default='rad', description='of joints that say no other')
+    joints: JointEntries | None
+    _columns: tuple[JointColumn, ...] = PrivateAttr(default=())
+    _joint_names: tuple[str, ...] = PrivateAttr(default=())
 
+    @property
+    def columns(self) -> tuple[JointColumn, ...]:
+        """One a joint, in the robot's order."""
+        return self._columns
 
-def _sign(row: Mapping[str, Any], where: str) -> float:
-    sign = number(row, 'sign', 1, where)
-    if abs(sign) != 1:
-        raise ConfigError(f"{where}: 'sign' is {sign:g}, must be 1 or -1")
-    return sign
+    @model_validator(mode='after')
+    def _fits_the_robot(self, info: ValidationInfo) -> Self:
+        robot: RobotModel | None = info.context and info.context.get('robot')
+        if robot is not None:  # else its own error is told
+            self._columns, self._joint_names = self._of(robot), robot.joint_names
+        return self
 
-
-def _range(
-    joint: str, row: Mapping[str, Any], given: set[str], robot: RobotModel, where: str
-) -> tuple[float, float]:
-    """Factor and offset that take two values of the dataset to two of the joint."""
-    if given == {'from', 'to'}:
-        (a, b), (c, d) = numbers(row, 'from', 2, where), numbers(row, 'to', 2, where)
-    elif given == {'closed', 'open'}:
-        tool = next((t for t in robot.tools if t.gripper_joint == joint), None)
-        if tool is None:
-            raise ConfigError(f"{where}: 'closed' and 'open' are for grippers; use 'from', 'to'")
-        a, b = number(row, 'closed', 0.0, where), number(row, 'open', 1.0, where)
-        c, d = tool.gripper_closed, tool.gripper_open
-    else:
-        raise ConfigError(
-            f"{where}: {sorted(given)} do not go together; give 'unit', 'sign', 'offset', or "
-            "'closed' and 'open', or 'from' and 'to'"
-        )
-    if a == b:
-        raise ConfigError(f'{where}: both ends of the range are {a:g}')
-    factor = (d - c) / (b - a)
-    return factor, c - factor * a
+    def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
+        known = robot.joint_names
+        entries = self.joints
+        if entries is None:
+            entries = {joint: ColumnEntry(column=joint) for joint in known}
+        for joint in entries:
+            if joint not in known:
+                raise ValueError(
+                    f"joints: unknown key '{joint}'{nearest(joint, known)}; known are "
+                    f'{", ".join(known)}'
+                )
+        missing = [joint for joint in known if joint not in entries]
+        if missing and not self.allow_missing:
+            raise ValueError(
+                f"joints {missing} of robot '{robot.name}' are missing; name their columns, or "
+                'give `{constant: 0.0}` for one that the dataset does not have'
+            )
+        return tuple(entries[j].of(j, self.unit, robot) for j in known if j in entries)
 
 
 def to_positions(

@@ -3,90 +3,88 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from pydantic import BeforeValidator, Field, model_validator, ValidationInfo
 
-from mtv_world_ros.config import check_keys, numbers, text, word
+from mtv_world_ros.config import Pair, Schema
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.joint_columns import UNITS
+from mtv_world_ros.geometry.joint_columns import Unit, UNITS
 from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
 
-_VIEW_KEYS = ('feature', 'calibration', 'camera')
-_CAMERA_KEYS = ('file', 'intrinsics', 'extrinsics', 'rotation', 'translation', 'pose', 'axes',
-                'quaternion', 'unit', 'distortion', 'distortion_model', 'size',
-                'mount_link')  # fmt: skip
-_POSES = ('camera_in_mount', 'mount_in_camera')
-_AXES = ('opencv', 'opengl')
-_ORDERS = ('xyzw', 'wxyz')
 #: names that a camera's four numbers go by
 _FOCAL_NAMES = (('fx', 'fy', 'cx', 'cy'), ('fx', 'fy', 'ppx', 'ppy'))
+_PATHS = ('intrinsics', 'extrinsics', 'rotation', 'translation', 'distortion')
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraSource:
-    """Where a view is from.
+class CameraParameters(Schema):
+    """The dataset's own camera parameters: paths in a JSON file, or names of features."""
 
-    Attributes:
-        view: its name.
-        feature: of its images.
-        calibration_file: YAML with this view, or None.
-        parameters: keys of the mapping's `camera`, or None.
-        where: the place in the mapping file, for error texts.
-    """
+    file: str | None = Field(
+        default=None, description='JSON, may hold `{episode_index}`; null = features'
+    )
+    intrinsics: str
+    extrinsics: str | None = None
+    rotation: str | None = None
+    translation: str | None = None
+    pose: Literal['camera_in_mount', 'mount_in_camera'] = 'camera_in_mount'
+    axes: Literal['opencv', 'opengl'] = 'opencv'
+    quaternion: Literal['xyzw', 'wxyz'] = 'xyzw'
+    unit: Unit = Field(default='m', description='of the translation')
+    distortion: str | None = None
+    distortion_model: str | None = None
+    size: Pair | None = Field(default=None, description='width and height that K is for [px]')
+    mount_link: str
 
-    view: str
-    feature: str
-    calibration_file: Path | None
-    parameters: Mapping[str, Any] | None
-    where: str
+    @model_validator(mode='after')
+    def _has_one_pose(self) -> Self:
+        if bool(self.extrinsics) == bool(self.rotation and self.translation):
+            raise ValueError("give either 'extrinsics', or 'rotation' and 'translation'")
+        return self
+
+
+def _is_there(name: str, info: ValidationInfo[dict[str, Any]]) -> Path:
+    file = info.context['folder'] / name
+    if not file.is_file():
+        raise ValueError(f"calibration file '{file}' does not exist")
+    return file
+
+
+class CameraSource(Schema):
+    """Where a view is from."""
+
+    view: str = Field(default='', description='its name; set by the mapping')
+    feature: str = Field(description='of its images')
+    calibration: Annotated[Path | None, BeforeValidator(_is_there)] = Field(
+        default=None, description='YAML with this view'
+    )
+    camera: CameraParameters | None = None
+
+    @model_validator(mode='after')
+    def _has_one_source(self) -> Self:
+        if (self.calibration is None) == (self.camera is None):
+            raise ValueError(
+                "give either 'calibration' (a calibration YAML) or 'camera' (keys of the "
+                "dataset's own camera parameters)"
+            )
+        return self
+
+    @property
+    def where(self) -> str:
+        """The place in the mapping file, for error texts."""
+        return f"view '{self.view}': camera"
 
     def features(self) -> list[str]:
         """Features that the camera parameters are read from."""
-        if self.parameters is None or 'file' in self.parameters:
+        if self.camera is None or self.camera.file is not None:
             return []
-        keys = ('intrinsics', 'extrinsics', 'rotation', 'translation', 'distortion')
-        return [self.parameters[key] for key in keys if key in self.parameters]
-
-
-def parse_camera(view: str, row: Any, folder: Path, where: str) -> CameraSource:
-    """Reads one view of the mapping.
-
-    Raises:
-        ConfigError: unknown, missing or wrong values.
-    """
-    check_keys(row, _VIEW_KEYS, ('feature',), where)
-    if ('calibration' in row) == ('camera' in row):
-        raise ConfigError(
-            f"{where}: give either 'calibration' (a calibration YAML) or 'camera' (keys of the "
-            "dataset's own camera parameters)"
-        )
-    feature = text(row, 'feature', '', where)
-    if 'calibration' in row:
-        file = folder / text(row, 'calibration', '', where)
-        if not file.is_file():
-            raise ConfigError(f"{where}: calibration file '{file}' does not exist")
-        return CameraSource(
-            view=view, feature=feature, calibration_file=file, parameters=None, where=where
-        )
-    where = f'{where}: camera'
-    camera = check_keys(row['camera'], _CAMERA_KEYS, ('intrinsics', 'mount_link'), where)
-    if ('extrinsics' in camera) == ({'rotation', 'translation'} <= set(camera)):
-        raise ConfigError(f"{where}: give either 'extrinsics', or 'rotation' and 'translation'")
-    for key, known in (('pose', _POSES), ('axes', _AXES), ('quaternion', _ORDERS),
-                       ('unit', ('m', *UNITS))):  # fmt: skip
-        word(camera, key, known, where)
-    if 'size' in camera:
-        numbers(camera, 'size', 2, where)
-    return CameraSource(
-        view=view, feature=feature, calibration_file=None, parameters=camera, where=where
-    )
+        return [path for key in _PATHS if (path := getattr(self.camera, key)) is not None]
 
 
 def camera_model(
@@ -108,27 +106,27 @@ def camera_model(
     Raises:
         CalibrationError: the parameters are missing or wrong, or change within the episode.
     """
-    if source.calibration_file is not None:
-        cameras = load_calibration(source.calibration_file)
+    if source.calibration is not None:
+        cameras = load_calibration(source.calibration)
         if source.view not in cameras:
             raise CalibrationError(
-                f"'{source.calibration_file}' has no view '{source.view}'"
+                f"'{source.calibration}' has no view '{source.view}'"
                 f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
             )
         return scaled(cameras[source.view], *size)
-    row = source.parameters
+    row = source.camera
     assert row is not None
     look_up = _Lookup(source, dataset, episode_index, values)
-    model = str(row.get('distortion_model', 'plumb_bob' if 'distortion' in row else 'none'))
-    width, height = (int(n) for n in row.get('size', size))
+    model = row.distortion_model or ('plumb_bob' if row.distortion else 'none')
+    width, height = (int(n) for n in row.size or size)
     camera = CameraModel(
         view=source.view,
         width=width,
         height=height,
         K=_intrinsics(look_up('intrinsics'), source.where),
         distortion_model=model,
-        distortion=np.ravel(look_up('distortion')) if 'distortion' in row else np.zeros(0),
-        mount_link=str(row['mount_link']),
+        distortion=np.ravel(look_up('distortion')) if row.distortion else np.zeros(0),
+        mount_link=row.mount_link,
         T_mount_camera=_pose(row, look_up, source.where),
     )
     return scaled(camera, *size)
@@ -144,16 +142,16 @@ class _Lookup:
         episode_index: int,
         values: Mapping[str, FloatArray],
     ) -> None:
-        assert source.parameters is not None
-        self._source, self._row, self._values = source, source.parameters, values
+        assert source.camera is not None
+        self._source, self._row, self._values = source, source.camera, values
         self._file: Path | None = None
         self._document: Any = None
-        if 'file' in self._row:
-            self._file = dataset / _formatted(str(self._row['file']), episode_index, source.where)
+        if self._row.file is not None:
+            self._file = dataset / _formatted(self._row.file, episode_index, source.where)
             self._document = _read_json(self._file, source.where)
 
     def __call__(self, key: str) -> Any:
-        path = str(self._row[key])
+        path = getattr(self._row, key)
         if self._file is None:
             return self._constant(path)
         found = self._document
@@ -220,9 +218,9 @@ def _intrinsics(value: Any, where: str) -> FloatArray:
     return K.reshape(3, 3)
 
 
-def _pose(row: Mapping[str, Any], look_up: _Lookup, where: str) -> FloatArray:
+def _pose(row: CameraParameters, look_up: _Lookup, where: str) -> FloatArray:
     T = np.eye(4)
-    if 'extrinsics' in row:
+    if row.extrinsics is not None:
         given = _numbers(look_up('extrinsics'), where, 'extrinsics')
         if given.size not in (12, 16):
             raise CalibrationError(f"{where}: 'extrinsics' has {given.size} numbers, not 12 or 16")
@@ -233,24 +231,22 @@ def _pose(row: Mapping[str, Any], look_up: _Lookup, where: str) -> FloatArray:
         if translation.size != 3:
             raise CalibrationError(f"{where}: 'translation' has {translation.size} numbers, not 3")
         T[:3, 3] = translation
-    T[:3, 3] *= UNITS[str(row.get('unit', 'm'))]
+    T[:3, 3] *= UNITS[row.unit]
     if not is_rigid(T):
         raise CalibrationError(
             f'{where}: the pose is {T.tolist()}, not a rotation and a translation (is it stored '
             'transposed, or in another order?)'
         )
-    T = inverse(T) if row.get('pose') == 'mount_in_camera' else T
+    T = inverse(T) if row.pose == 'mount_in_camera' else T
     # OpenGL's camera looks along -z with y up
-    return T @ np.diag([1.0, -1, -1, 1]) if row.get('axes') == 'opengl' else T
+    return T @ np.diag([1.0, -1, -1, 1]) if row.axes == 'opengl' else T
 
 
-def _rotation(value: FloatArray, row: Mapping[str, Any], where: str) -> FloatArray:
+def _rotation(value: FloatArray, row: CameraParameters, where: str) -> FloatArray:
     if value.size == 9:
         return value.reshape(3, 3)
     if value.size == 4:
-        x, y, z, w = (
-            value.ravel() if row.get('quaternion') != 'wxyz' else np.roll(value.ravel(), -1)
-        )
+        x, y, z, w = value.ravel() if row.quaternion != 'wxyz' else np.roll(value.ravel(), -1)
         return rotation([x, y, z, w])
     raise CalibrationError(f"{where}: 'rotation' has {value.size} numbers, not 9 or 4")
 

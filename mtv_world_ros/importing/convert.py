@@ -190,7 +190,7 @@ def _positions(
 ) -> FloatArray:
     values = rows[stream.feature].reshape(len(rows['timestamp']), -1)
     names = dataset.column_names(stream.feature)
-    positions = to_positions(values, names, stream.joints, stream.feature)
+    positions = to_positions(values, names, stream.columns, stream.feature)
     try:
         check_positions(mapping.robot, positions, tolerance=mapping.limit_tolerance)
     except TrajectoryError as error:

@@ -1,64 +1,51 @@
-"""Which policy: YAML read into dataclasses, unknown keys refused."""
+"""Which policy: files like those in `config/policies`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal
 
-from mtv_world_ros.config import check_keys, number, read_yaml, text
+from pydantic import BeforeValidator, Field
+
+from mtv_world_ros.config import read_yaml, Schema, validated
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.policies.lerobot_client import lerobot_config
-from mtv_world_ros.policies.openpi_client import openpi_config
+from mtv_world_ros.policies.lerobot_client import LeRobotConfig
+from mtv_world_ros.policies.openpi_client import OpenPiConfig
 from mtv_world_ros.policies.policy import Policy
 
-_SERVERS = {'openpi': openpi_config, 'lerobot': lerobot_config}
-KINDS = ('scripted', 'python', 'openpi', 'lerobot')
+
+class ScriptedPolicySettings(Schema):
+    """A policy of the simulator, which this layer does not know."""
+
+    kind: Literal['scripted'] = 'scripted'
+    variant: str = Field(
+        default='expert', description='e.g. `expert` or, with faults, `expert-noise-0.02`'
+    )
+    hold_s: float = Field(
+        default=0.6, description='from the end of its plan to the end of the episode [s]'
+    )
 
 
-class PolicyConfig(Protocol):
-    """What describes a policy and makes it."""
+class PythonPolicyConfig(Schema):
+    """A policy in Python code of the user's."""
 
-    def make(self, robot: RobotModel) -> Policy:
-        """Returns the policy for a robot."""
-        ...
+    kind: Literal['python'] = 'python'
+    factory: str = Field(
+        description='`package.module:function`; called with the arguments it returns a `Policy`'
+    )
+    arguments: Annotated[dict[str, Any], BeforeValidator(lambda value: value or {})] = Field(
+        default={}, description='by keyword'
+    )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScriptedPolicySettings:
-    """A policy of the simulator, which this layer does not know.
-
-    Attributes:
-        variant: e.g. `expert` or `expert-noise-0.02`.
-        hold_s: from the end of its plan to the end of the episode [s].
-    """
-
-    variant: str = 'expert'
-    hold_s: float = 0.6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PythonPolicyConfig:
-    """A policy in Python code of the user's.
-
-    Attributes:
-        factory: `package.module:function`; called with the arguments it returns a `Policy`.
-        arguments: by keyword.
-    """
-
-    factory: str
-    arguments: Mapping[str, Any] = field(default_factory=dict)
-
-    def make(self, robot: RobotModel) -> Policy:
+    def make(self) -> Policy:
         """Calls the factory.
 
         Raises:
             ConfigError: there is no such function, or it does not take the arguments.
         """
-        del robot
         module, _, function = self.factory.partition(':')
         try:
             return getattr(import_module(module), function)(**self.arguments)
@@ -69,35 +56,28 @@ class PythonPolicyConfig:
             ) from error
 
 
-def load_policy_config(path: Path) -> PolicyConfig | ScriptedPolicySettings:
+PolicyConfig = ScriptedPolicySettings | PythonPolicyConfig | OpenPiConfig | LeRobotConfig
+_KINDS: dict[str, type[PolicyConfig]] = {
+    'scripted': ScriptedPolicySettings,
+    'python': PythonPolicyConfig,
+    'openpi': OpenPiConfig,
+    'lerobot': LeRobotConfig,
+}
+
+
+def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
     """Reads a file like those in `config/policies`.
 
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
     """
     values = read_yaml(path, 'policy file', 'policy')
-    return policy_config(values, str(path))
-
-
-def policy_config(values: Any, where: str = 'policy') -> PolicyConfig | ScriptedPolicySettings:
-    """Returns the configuration that plain values describe; see `load_policy_config`."""
     if not isinstance(values, Mapping) or 'kind' not in values:
-        raise ConfigError(f"{where}: expected a key 'kind': {', '.join(KINDS)}")
-    kind, rest = values['kind'], {k: v for k, v in values.items() if k != 'kind'}
-    if kind not in KINDS:
+        raise ConfigError(f"{path}: expected a key 'kind': {', '.join(_KINDS)}")
+    kind = values['kind']
+    if kind not in _KINDS:
         raise ConfigError(
-            f"{where}: kind '{kind}' is none{nearest(str(kind), KINDS)}; valid are "
-            f'{", ".join(KINDS)}'
+            f"{path}: kind '{kind}' is none{nearest(str(kind), _KINDS)}; valid are "
+            f'{", ".join(_KINDS)}'
         )
-    if kind == 'scripted':
-        check_keys(rest, ('variant', 'hold_s'), (), where)
-        default = ScriptedPolicySettings()
-        return ScriptedPolicySettings(
-            variant=text(rest, 'variant', default.variant, where),
-            hold_s=number(rest, 'hold_s', default.hold_s, where),
-        )
-    if kind in _SERVERS:
-        return _SERVERS[kind](rest, where)
-    check_keys(rest, ('factory', 'arguments'), ('factory',), where)
-    arguments = check_keys(rest.get('arguments') or {}, rest.get('arguments') or (), (), where)
-    return PythonPolicyConfig(factory=text(rest, 'factory', '', where), arguments=arguments)
+    return validated(_KINDS[kind], values, str(path), context={'robot': robot})

@@ -10,124 +10,86 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 import io
 import pickle
 import time
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 import warnings
 
 import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
 
-from mtv_world_ros.config import check_keys, number, text
+from mtv_world_ros.config import Count, Positive, Schema
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.policies.server_mapping import read_mapping, ServerMapping
+from mtv_world_ros.policies.server_mapping import ServerMapping
 
-_MAPPING_KEYS = ('images', 'state', 'actions')
-_KEYS = ('server', 'timeout_s', 'setup_timeout_s', 'policy', *_MAPPING_KEYS)
-_POLICY_KEYS = ('type', 'path', 'device', 'actions_per_chunk', 'rename')
 _SERVICE = '/transport.AsyncInference/'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LeRobotConfig:
-    """Which server and policy, and what it gets and gives.
+class LeRobotPolicySettings(Schema):
+    """What the server loads."""
 
-    Attributes:
-        server: e.g. `localhost:8080`.
-        timeout_s: longest wait for an answer [s].
-        setup_timeout_s: longest wait until the server has loaded the policy [s].
-        policy_type: as LeRobot names it, e.g. `act`, `smolvla`, `pi0`.
-        path: folder or name of the pretrained policy, for the server.
-        device: of the policy, on the server.
-        actions_per_chunk: actions of an answer.
-        rename: from keys of the observation to those of the policy.
-        values: the file's mapping keys, see `read_mapping`.
-        where: the file.
-    """
+    type: str = Field(description='as LeRobot names it, e.g. `act`, `smolvla`, `pi0`')
+    path: str = Field(description='folder or name of the pretrained policy, for the server')
+    device: str = Field(default='cpu', description='of the policy, on the server')
+    actions_per_chunk: Count = Field(default=50, description='actions of an answer')
+    rename: Annotated[dict[str, str], BeforeValidator(lambda value: value or {})] = Field(
+        default={}, description='from keys of the observation to those of the policy'
+    )
 
-    server: str
-    timeout_s: float
-    setup_timeout_s: float
-    policy_type: str
-    path: str
-    device: str
-    actions_per_chunk: int
-    rename: Mapping[str, str]
-    values: Mapping[str, Any]
-    where: str
 
-    def make(self, robot: RobotModel) -> LeRobotPolicy:
+class LeRobotConfig(ServerMapping):
+    """A policy file of kind `lerobot`: which server and policy, and what it gets and gives."""
+
+    kind: Literal['lerobot'] = 'lerobot'
+    server: str = Field(description='e.g. `localhost:8080`')
+    timeout_s: Positive = Field(default=60.0, description='longest wait for an answer [s]')
+    setup_timeout_s: Positive = Field(
+        default=600.0, description='longest wait until the server has loaded the policy [s]'
+    )
+    policy: LeRobotPolicySettings
+
+    @model_validator(mode='after')
+    def _fits_the_protocol(self) -> Self:
+        if len(self.state) != 1 or not self.state[0].names:
+            raise ValueError(
+                "'state' must have one entry with 'names', the motors in the order of "
+                'observation.state'
+            )
+        nested = [image.key for image in self.images if len(image.key) > 1]
+        if nested or any(not image.width for image in self.images):
+            raise ValueError(
+                "every image needs a plain 'key', the camera's name, and 'width' and 'height' as "
+                "the robot's camera has them"
+            )
+        return self
+
+    def make(self) -> LeRobotPolicy:
         """Returns the client; it connects at its first reset.
 
         Raises:
-            ConfigError: a key is unknown or missing, a value is wrong, a package is missing.
+            ConfigError: a package is missing.
         """
         try:
             import grpc  # noqa: F401
         except ImportError as error:
             raise ConfigError(
-                f"{self.where}: the client of LeRobot's server needs the package 'grpcio'; "
-                "install it with: pip install 'mtv_world_ros[policies]'"
+                "the client of LeRobot's server needs the package 'grpcio'; install it with: pip "
+                "install 'mtv_world_ros[policies]'"
             ) from error
-        mapping = read_mapping(self.values, robot, self.where)
-        if len(mapping.states) != 1 or not mapping.states[0].names:
-            raise ConfigError(
-                f"{self.where}: 'state' must have one entry with 'names', the motors in the order "
-                'of observation.state'
-            )
-        nested = [image.key for image in mapping.images if len(image.key) > 1]
-        if nested or any(not (image.width and image.height) for image in mapping.images):
-            raise ConfigError(
-                f"{self.where}: every image needs a plain 'key', the camera's name, and 'width' "
-                "and 'height' as the robot's camera has them"
-            )
-        return LeRobotPolicy(self, mapping)
-
-
-def lerobot_config(values: Mapping[str, Any], where: str) -> LeRobotConfig:
-    """Reads a policy file of kind `lerobot`, without its `kind`.
-
-    Raises:
-        ConfigError: a key is unknown or missing, a value is wrong.
-    """
-    check_keys(values, _KEYS, ('server', 'policy', 'state', 'actions'), where)
-    inner = f'{where}: policy'
-    policy = check_keys(values['policy'], _POLICY_KEYS, ('type', 'path'), inner)
-    seconds = {
-        key: number(values, key, default, where)
-        for key, default in (('timeout_s', 60.0), ('setup_timeout_s', 600.0))
-    }
-    count = number(policy, 'actions_per_chunk', 50, inner)
-    for key, value in {**seconds, 'actions_per_chunk': count}.items():
-        if value <= 0:
-            raise ConfigError(f"{where}: '{key}' is {value:g}, must be positive")
-    rename = policy.get('rename') or {}
-    return LeRobotConfig(
-        server=text(values, 'server', '', where),
-        policy_type=text(policy, 'type', '', inner),
-        path=text(policy, 'path', '', inner),
-        device=text(policy, 'device', 'cpu', inner),
-        actions_per_chunk=int(count),
-        rename=check_keys(rename, rename, (), f'{inner}: rename'),
-        values={key: values[key] for key in _MAPPING_KEYS if key in values},
-        where=where,
-        **seconds,
-    )
+        return LeRobotPolicy(self)
 
 
 class LeRobotPolicy:
     """Asks the server, one observation at a time.
 
     Args:
-        config: which server and policy.
-        mapping: what it gets and gives.
+        config: which server and policy, and what it gets and gives.
     """
 
-    def __init__(self, config: LeRobotConfig, mapping: ServerMapping) -> None:
-        self._config, self._mapping = config, mapping
+    def __init__(self, config: LeRobotConfig) -> None:
+        self._config = config
         self._channel: Any = None
         self._is_set_up = False
         self._timestep = 0
@@ -135,7 +97,7 @@ class LeRobotPolicy:
     @property
     def name(self) -> str:
         """Type and path of the policy."""
-        return f'lerobot {self._config.policy_type} {self._config.path}'
+        return f'lerobot {self._config.policy.type} {self._config.policy.path}'
 
     def reset(self, *, seed: int) -> None:
         """Lets the server forget what it has, and load the policy if that is not done."""
@@ -145,12 +107,12 @@ class LeRobotPolicy:
         self._call('Ready', b'', config.timeout_s)
         if not self._is_set_up:
             setup = {
-                'policy_type': config.policy_type,
-                'pretrained_name_or_path': config.path,
+                'policy_type': config.policy.type,
+                'pretrained_name_or_path': config.policy.path,
                 'lerobot_features': self._features(),
-                'actions_per_chunk': config.actions_per_chunk,
-                'device': config.device,
-                'rename_map': dict(config.rename),
+                'actions_per_chunk': config.policy.actions_per_chunk,
+                'device': config.policy.device,
+                'rename_map': dict(config.policy.rename),
             }
             self._call('SendPolicyInstructions', policy_setup(setup), config.setup_timeout_s)
             self._is_set_up = True
@@ -161,9 +123,9 @@ class LeRobotPolicy:
         Raises:
             PolicyError: no connection, no answer in time, or one that cannot be used.
         """
-        mapping, state = self._mapping, self._mapping.states[0]
-        raw: dict[str, Any] = {image.key[0]: image.image(observation) for image in mapping.images}
-        raw |= dict(zip(state.names, mapping.columns(state, observation).tolist(), strict=True))
+        config, state = self._config, self._config.state[0]
+        raw: dict[str, Any] = {image.key[0]: image.image(observation) for image in config.images}
+        raw |= dict(zip(state.names, state.values(observation).tolist(), strict=True))
         values = {
             'timestamp': time.time(),
             'timestep': self._timestep,
@@ -171,10 +133,10 @@ class LeRobotPolicy:
             # or the server would leave out what looks like the one before
             'must_go': True,
         }
-        self._timestep += self._config.actions_per_chunk
+        self._timestep += self._config.policy.actions_per_chunk
         self._send_observation(values)
         answer = self._call('GetActions', b'', self._config.timeout_s)
-        return mapping.actions.trajectory(read_actions(answer), observation)
+        return config.actions.trajectory(read_actions(answer), observation)
 
     def close(self) -> None:
         """Closes the connection; the next reset sets the policy up again."""
@@ -184,11 +146,11 @@ class LeRobotPolicy:
 
     def _features(self) -> dict[str, dict[str, Any]]:
         """The observation's features as LeRobot's data sets describe them."""
-        names = list(self._mapping.states[0].names)
+        names = list(self._config.state[0].names)
         features: dict[str, dict[str, Any]] = {
             'observation.state': {'dtype': 'float32', 'shape': (len(names),), 'names': names}
         }
-        for image in self._mapping.images:
+        for image in self._config.images:
             features[f'observation.images.{image.key[0]}'] = {
                 'dtype': 'image',
                 'shape': (image.height, image.width, 3),

@@ -7,78 +7,74 @@ the byte keys `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 import os
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from mtv_world_ros.config import check_keys, number, text
+from mtv_world_ros.config import Positive
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.policies.server_mapping import find, MAPPING_KEYS, read_mapping, ServerMapping
-
-_KEYS = ('server', 'api_key_variable', 'timeout_s', *MAPPING_KEYS)
+from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OpenPiConfig:
-    """Which server, and what it gets and gives.
+def _address(server: str) -> str:
+    if not server.startswith(('ws://', 'wss://')):
+        raise ValueError(f"'server' is '{server}'; expected ws://host:port or wss://...")
+    return server
 
-    Attributes:
-        server: e.g. `ws://localhost:8000`.
-        api_key_variable: environment variable with the API key; empty = none is needed.
-        timeout_s: longest wait for the connection, and for an answer [s].
-        values: the file's mapping keys, see `read_mapping`.
-        where: the file.
-    """
 
-    server: str
-    api_key_variable: str
-    timeout_s: float
-    values: Mapping[str, Any]
-    where: str
+class OpenPiConfig(ServerMapping):
+    """A policy file of kind `openpi`: which server, and what it gets and gives."""
 
-    def make(self, robot: RobotModel) -> OpenPiPolicy:
+    kind: Literal['openpi'] = 'openpi'
+    server: Annotated[str, AfterValidator(_address)] = Field(
+        description='e.g. `ws://localhost:8000`'
+    )
+    api_key_variable: str = Field(
+        default='', description='environment variable with the API key; empty = none is needed'
+    )
+    timeout_s: Positive = Field(
+        default=60.0, description='longest wait for the connection, and for an answer [s]'
+    )
+    prompt: Annotated[Key | None, BeforeValidator(lambda value: value or None)] = Field(
+        default=None, description='where the instruction goes; empty = nowhere'
+    )
+
+    def make(self) -> OpenPiPolicy:
         """Returns the client; it connects at its first reset.
 
         Raises:
-            ConfigError: a key is unknown or missing, a value is wrong, a package is missing.
+            ConfigError: a package is missing.
         """
         try:
             import msgpack  # noqa: F401
             import websockets  # noqa: F401
         except ImportError as error:
             raise ConfigError(
-                f"{self.where}: the client of openpi's server needs the package '{error.name}'; "
-                "install it with: pip install 'mtv_world_ros[policies]'"
+                f"the client of openpi's server needs the package '{error.name}'; install it "
+                "with: pip install 'mtv_world_ros[policies]'"
             ) from error
-        return OpenPiPolicy(self, read_mapping(self.values, robot, self.where))
+        return OpenPiPolicy(self)
+
+    def request(self, observation: Observation, instruction: str) -> dict[str, Any]:
+        """The request as nested mappings of arrays and text."""
+        request: dict[str, Any] = {}
+        for image in self.images:
+            _put(request, image.key, image.image(observation))
+        for state in self.state:
+            _put(request, state.key, state.values(observation).astype(np.float32))
+        if self.prompt:
+            _put(request, self.prompt, instruction)
+        return request
 
 
-def openpi_config(values: Mapping[str, Any], where: str) -> OpenPiConfig:
-    """Reads a policy file of kind `openpi`, without its `kind`.
-
-    Raises:
-        ConfigError: a key is unknown or missing, a value is wrong.
-    """
-    check_keys(values, _KEYS, ('server', 'actions'), where)
-    server = text(values, 'server', '', where)
-    if not server.startswith(('ws://', 'wss://')):
-        raise ConfigError(f"{where}: 'server' is '{server}'; expected ws://host:port or wss://...")
-    timeout_s = number(values, 'timeout_s', 60.0, where)
-    if timeout_s <= 0:
-        raise ConfigError(f"{where}: 'timeout_s' is {timeout_s:g}, must be positive")
-    return OpenPiConfig(
-        server=server,
-        api_key_variable=text(values, 'api_key_variable', '', where),
-        timeout_s=timeout_s,
-        values={key: values[key] for key in MAPPING_KEYS if key in values},
-        where=where,
-    )
+def _put(request: dict[str, Any], key: Key, value: Any) -> None:
+    for part in key[:-1]:
+        request = request.setdefault(part, {})
+    request[key[-1]] = value
 
 
 class OpenPiPolicy:
@@ -88,12 +84,11 @@ class OpenPiPolicy:
         metadata: what the server said of itself.
 
     Args:
-        config: which server.
-        mapping: what it gets and gives.
+        config: which server, and what it gets and gives.
     """
 
-    def __init__(self, config: OpenPiConfig, mapping: ServerMapping) -> None:
-        self._config, self._mapping = config, mapping
+    def __init__(self, config: OpenPiConfig) -> None:
+        self._config = config
         self._connection: Any = None
         self._opened = ExitStack()
         self.metadata: dict[str, Any] = {}
@@ -117,9 +112,9 @@ class OpenPiPolicy:
                 cannot be used.
         """
         self.reset(seed=0)
-        request = self._mapping.request(observation, instruction)
+        request = self._config.request(observation, instruction)
         answer = self._exchange(pack(request))
-        actions = self._mapping.actions
+        actions = self._config.actions
         return actions.trajectory(find(answer, actions.key), observation)
 
     def close(self) -> None:
@@ -136,8 +131,7 @@ class OpenPiPolicy:
             key = os.environ.get(config.api_key_variable, '')
         if config.api_key_variable and not key:
             raise ConfigError(
-                f"{config.where}: the environment variable '{config.api_key_variable}' with the "
-                'API key is not set'
+                f"the environment variable '{config.api_key_variable}' with the API key is not set"
             )
         try:
             connecting = connect(

@@ -10,9 +10,10 @@ import pytest
 
 pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
 
+from mtv_world_ros.config import validated
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError, ConfigError
-from mtv_world_ros.importing.camera_parameters import camera_model, parse_camera
+from mtv_world_ros.importing.camera_parameters import camera_model, CameraSource
 from mtv_world_ros.importing.convert import import_dataset
 
 #: looks down from 2 m: x right, y down, z ahead in the camera
@@ -22,11 +23,15 @@ BASE = {'file': 'camera_{episode_index:06d}.json', 'intrinsics': 'head.K',
         'extrinsics': 'head.T', 'mount_link': 'base'}  # fmt: skip
 
 
+def source_of(row: dict, folder: Path) -> CameraSource:
+    return validated(CameraSource, {'view': 'head', **row}, 'mapping', context={'folder': folder})
+
+
 def model(folder: Path, document: object, size=(64, 48), **changes):
     row = {'feature': 'image', 'camera': {**BASE, **changes}}
     row['camera'] = {key: value for key, value in row['camera'].items() if value is not None}
     (folder / 'camera_000003.json').write_text(json.dumps(document))
-    source = parse_camera('head', row, folder, 'mapping: head')
+    source = source_of(row, folder)
     return camera_model(source, folder, 3, {}, size)
 
 
@@ -73,7 +78,7 @@ def test_k_is_for_another_size_than_the_video(tmp_path):
     document = {'head': {'K': K, 'T': POSE.tolist(), 'd': [-0.1, 0.01, 0, 0, 0]}}
     row = {**BASE, 'distortion': 'head.d', 'size': [64, 48]}
     (tmp_path / 'camera_000003.json').write_text(json.dumps(document))
-    source = parse_camera('head', {'feature': 'x', 'camera': row}, tmp_path, 'mapping')
+    source = source_of({'feature': 'x', 'camera': row}, tmp_path)
     camera = camera_model(source, tmp_path, 3, {}, (128, 96))
     assert (camera.width, camera.K[0, 0], camera.K[0, 2]) == (128, 140, 63.5)
     assert camera.distortion_model == 'plumb_bob'
@@ -117,7 +122,7 @@ def test_single_view_data_with_parameters_in_features(datasets, make_mapping, tm
 
 def test_a_pose_that_changes_within_the_episode_is_refused(tmp_path):
     row = {'feature': 'x', 'camera': {'intrinsics': 'K', 'extrinsics': 'T', 'mount_link': 'base'}}
-    source = parse_camera('head', row, tmp_path, 'mapping')
+    source = source_of(row, tmp_path)
     poses = np.repeat(POSE[None], 4, axis=0)
     poses[2, 0, 3] += 0.1
     values = {'K': np.repeat(np.array(K)[None], 4, axis=0), 'T': poses}

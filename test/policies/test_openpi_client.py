@@ -80,7 +80,7 @@ def test_images_arrive_in_the_size_and_layout_that_the_server_wants(tmp_path, se
     policy.reset(seed=0)
     from mtv_world_ros.policies.openpi_client import pack
 
-    answer = policy._exchange(pack(policy._mapping.request(observe(), 'stack')))
+    answer = policy._exchange(pack(policy._config.request(observe(), 'stack')))
     assert answer['seen'] == {
         'cam_high': [3, 224, 224, 'uint8'],
         'cam_low': [3, 224, 224, 'uint8'],
