@@ -388,7 +388,11 @@ class ImaginedEpisode:
         pipeline = self.pipeline
         if pipeline.object_motion is None or not pipeline.rendering.object_motion:
             return state, None
-        found = state.objects or self._find_objects(state, pipeline.object_motion)
+        found = state.objects
+        if found is None:
+            found = self._find_objects(state.observation, state.source)
+        elif found.names != self.names:  # only an imagined frame shows where they are now
+            found = self._find_objects(state.observation, state.observation)
         motion, tracked = found.tracked.advance(plan.fine_positions(found.tracked.step_s))
         rows = np.rint((plan.times - plan.times[0]) / found.tracked.step_s).astype(int)
         pictures = moved_pictures(
@@ -401,16 +405,21 @@ class ImaginedEpisode:
         )
         return replace(state, objects=replace(found, tracked=tracked)), pictures
 
-    def _find_objects(self, state: _RolloutState, model: ObjectMotionModel) -> _FoundObjects:
-        """The objects in the last real frame; their places are found at its own size."""
-        start, source = state.observation, state.source
+    def _find_objects(self, start: Observation, source: Observation) -> _FoundObjects:
+        """The named objects in a frame, given at the model's size and at its own."""
+        model, segmenter = self.pipeline.object_motion, self.pipeline.segmenter
+        assert model is not None
         poses = self._camera_poses(start.positions[None])[:, 0]
-        sharp = self.pipeline.segmenter.segment(source.frames[:, None], self.names)
+        sharp, small = (
+            segmenter.segment(seen.frames[:, None], self.names).masks[:, :, 0]
+            for seen in (source, start)
+        )
         return _FoundObjects(
+            names=self.names,
             frames=start.frames,
-            masks=self._find_start_masks(state).masks[:, :, 0],
+            masks=small,
             poses=poses,
-            tracked=model.find(sharp.masks[:, :, 0], source.cameras, list(poses)),
+            tracked=model.find(sharp, source.cameras, list(poses)),
         )
 
     def _camera_poses(self, positions: FloatArray) -> FloatArray:
@@ -493,12 +502,14 @@ class _FoundObjects:
     """The named objects as the last real frame shows them, and where they are now.
 
     Attributes:
+        names: O of them.
         frames: (V, H, W, 3) that frame, at the model's size.
         masks: (V, O, H, W) in it.
         poses: (V, 4, 4) T_base_camera then.
         tracked: where they are now.
     """
 
+    names: tuple[str, ...]
     frames: ByteArray
     masks: BoolArray
     poses: FloatArray

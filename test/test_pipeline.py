@@ -18,6 +18,9 @@ from mtv_world_ros.errors import (
 )
 from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.mask_geometry import centroids, locate
+from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline
 
@@ -347,3 +350,69 @@ def test_a_checkpoint_of_another_robot_is_refused(world_model: CountingWorldMode
     yam = share_path('config', 'robots', 'yam_bimanual.yaml')
     with pytest.raises(CheckpointError, match="trained with robot 'other'"):
         assemble({**CARD, 'robot': 'other'}, world_model, robot=yam)
+
+
+class SlidingObjects:
+    """Moves every object 1 cm along x in each step of 0.1 s; remembers how often it was asked."""
+
+    step_s = 0.1
+
+    def __init__(self, points: np.ndarray, steps: int = 0) -> None:
+        self.points, self.steps = points, steps
+
+    def advance(self, positions: np.ndarray) -> tuple[ObjectMotion, SlidingObjects]:
+        steps = self.steps + np.arange(len(positions))
+        way = np.zeros((len(steps), 1, 3))
+        way[:, 0, 0] = 0.01 * steps
+        turns = np.tile(np.eye(3), (len(steps), len(self.points), 1, 1))
+        motion = ObjectMotion(reference=self.points, points=self.points + way, rotations=turns)
+        return motion, SlidingObjects(self.points, int(steps[-1]))
+
+
+class SlidingModel:
+    """Finds objects where their masks are; remembers the sizes of the masks."""
+
+    def __init__(self) -> None:
+        self.sizes: list[tuple[int, ...]] = []
+
+    def find(self, masks, cameras, poses) -> SlidingObjects:
+        self.sizes.append(masks.shape)
+        pixels = centroids(masks)
+        points = np.full((masks.shape[1], 3), np.nan)
+        for item in range(len(points)):
+            if (place := locate(cameras, poses, pixels[:, item])) is not None:
+                points[item] = place.point
+        return SlidingObjects(points)
+
+
+def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
+    world_model: CountingWorldModel, recording: Recording
+) -> None:
+    card = {**CARD, 'rendering': {'object_motion': True}}
+    model = SlidingModel()
+    pipeline = replace(assemble(card, world_model), object_motion=model)
+    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    chunks = list(episode.extend(commands(recording, 3.2)))
+    num_objects = len(chunks[0].masks.names)
+    assert model.sizes == [(2, num_objects, *recording.frames.shape[2:4])]
+    point = (
+        SlidingModel()
+        .find(
+            chunks[0].start_masks.masks[:, :, 0],
+            chunks[0].start.cameras,
+            [camera.T_mount_camera for camera in chunks[0].start.cameras],
+        )
+        .points[0]
+    )
+    camera = chunks[0].start.cameras[1]
+    for chunk, seconds in zip(chunks, (0.0, 1.6), strict=True):
+        for frame in (0, 4):
+            there = point + [0.1 * (seconds + frame / SPEC.fps), 0, 0]
+            (x, y), _ = project(camera, camera.T_mount_camera, there)
+            shown = chunk.trajectory_video.frames[1, frame, round(y), round(x)].astype(int)
+            (u, v), _ = project(camera, camera.T_mount_camera, point)
+            colour = recording.frames[1, 0, round(v), round(u)].astype(int)
+            assert np.abs(shown - colour).max() < 60
+    episode.instruction = 'pick the red block'
+    (chunk,) = episode.extend(part_of(commands(recording, 4.8), 3.2, 4.8))
+    assert model.sizes[1:] == [(2, len(chunk.masks.names), *recording.frames.shape[2:4])]
