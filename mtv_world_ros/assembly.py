@@ -113,7 +113,6 @@ def load_pipeline(
         CheckpointError, ConfigError, RobotError: see their messages.
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import FOLDER as OBJECT_MOTION
     from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.options import ServingOptions
@@ -141,7 +140,7 @@ def load_pipeline(
         segmenter=assemble_segmenter(segmenter, device=device),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
-        object_motion=load_network(checkpoint_path(checkpoint) / OBJECT_MOTION),
+        object_motion=None if loaded.object_motion is None else load_network(loaded.object_motion),
     )
 
 

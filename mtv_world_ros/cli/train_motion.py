@@ -34,7 +34,8 @@ def _train(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.object_motion.predictor import FOLDER, load_network
+    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.train import (
@@ -54,7 +55,7 @@ def _train(arguments: argparse.Namespace) -> int:
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     held_out = tracks[::20]
-    init = None if arguments.init is None else load_network(arguments.init / FOLDER)
+    init = None if arguments.init is None else load_network(arguments.init / OBJECT_MOTION_FOLDER)
     network = train_motion(
         [track for number, track in enumerate(tracks) if number % 20],
         arguments.out,

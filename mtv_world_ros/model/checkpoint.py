@@ -22,6 +22,7 @@ from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTra
 
 WEIGHTS = 'diffusion_pytorch_model'
 ADAPTER_FOLDER = 'adapter'
+OBJECT_MOTION_FOLDER = 'object_motion'
 PARTS = ('transformer', 'autoencoder', 'scheduler')
 
 
@@ -40,6 +41,7 @@ class Checkpoint:
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.
         adapter: folder of a LoRA adapter to use on the transformer; see `lora.py`.
+        object_motion: folder of an object motion network; see `object_motion/predictor.py`.
     """
 
     transformer: MultiViewWanTransformer
@@ -50,6 +52,7 @@ class Checkpoint:
     text_encoder: TextEncoder | None = None
     image_encoder: ImageEncoder | None = None
     adapter: Path | None = None
+    object_motion: Path | None = None
 
 
 def save_checkpoint(
@@ -73,6 +76,8 @@ def save_checkpoint(
             encoder.save(partial)
     if checkpoint.adapter is not None:
         shutil.copytree(checkpoint.adapter, partial / ADAPTER_FOLDER)
+    if checkpoint.object_motion is not None:
+        shutil.copytree(checkpoint.object_motion, partial / OBJECT_MOTION_FOLDER)
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
     if folder.exists():
         old = folder.with_name(folder.name + '.old')
@@ -104,7 +109,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
     control = card['control']
     drawn = control == TRAJECTORY_VIDEO
     with_text = (folder / 'text_encoder').is_dir()
-    adapter = folder / ADAPTER_FOLDER
+    adapter, motion = folder / ADAPTER_FOLDER, folder / OBJECT_MOTION_FOLDER
     return Checkpoint(
         transformer=_load_transformer(folder / 'transformer', dtype),
         autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
@@ -114,6 +119,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
         text_encoder=TextEncoder(folder, dtype=dtype) if with_text else None,
         image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
         adapter=adapter if adapter.is_dir() else None,
+        object_motion=motion if motion.is_dir() else None,
     )
 
 

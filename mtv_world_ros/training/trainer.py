@@ -16,7 +16,12 @@ from torch import Tensor
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
 from mtv_world_ros.model.card import OPTIONAL_KEYS
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    OBJECT_MOTION_FOLDER,
+    save_checkpoint,
+)
 from mtv_world_ros.model.history_tokens import check_history
 from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
@@ -135,6 +140,7 @@ class Trainer:
             weight_decay=settings.weight_decay,
         )
         self.step = 0
+        self._object_motion: Path | None = None
         self._recent: deque[float] = deque(maxlen=_WINDOW)
 
     def _clips(self, settings: OptimizerConfig) -> range:
@@ -153,7 +159,9 @@ class Trainer:
             CheckpointError: the folder holds no checkpoint.
             TrainingError: its transformer is of another shape.
         """
-        given = load_checkpoint(folder).transformer.state_dict()
+        loaded = load_checkpoint(folder)
+        self._object_motion = loaded.object_motion
+        given = loaded.transformer.state_dict()
         given = with_new_source(given, self.weights.worker.state_dict())
         try:
             self.weights.worker.load_state_dict(given)
@@ -299,7 +307,10 @@ class Trainer:
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
         if self.config.lora.rank:
             return export_adapter(folder, self.weights, card, self.base)
-        parts = (self.config, self.encoders, self.actions)
+        # what `train-motion` put there stays
+        mine = folder / OBJECT_MOTION_FOLDER
+        motion = mine if mine.is_dir() else self._object_motion
+        parts = (self.config, self.encoders, self.actions, motion)
         export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)
 
 
@@ -318,6 +329,7 @@ def export_checkpoint(
     config: TrainingConfig,
     encoders: Encoders,
     actions: ActionEncoding | None,
+    object_motion: Path | None,
     dtype: torch.dtype,
 ) -> None:
     """Writes the averaged weights in a number format, with all other parts beside them."""
@@ -327,6 +339,7 @@ def export_checkpoint(
         scheduler=build_scheduler(config.scheduler),
         card=_with_text(card, base),
         actions=actions,
+        object_motion=object_motion,
         text_encoder=base and base.checkpoint.text_encoder,
         image_encoder=base and base.checkpoint.image_encoder,
     )

@@ -28,8 +28,6 @@ from mtv_world_ros.model.object_motion.network import (
     STEP_S,
 )
 
-#: of a checkpoint
-FOLDER = 'object_motion'
 _CONFIG, _WEIGHTS = 'config.json', 'model.safetensors'
 
 
@@ -131,14 +129,12 @@ def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
     write_json(folder / _CONFIG, network.config)
 
 
-def load_network(folder: Path) -> ObjectMotionNetwork | None:
-    """Returns the network of a folder; None where there is no such folder.
+def load_network(folder: Path) -> ObjectMotionNetwork:
+    """Reads a network.
 
     Raises:
-        CheckpointError: what it holds is not whole.
+        CheckpointError: the folder is not there, or what it holds is not whole.
     """
-    if not folder.is_dir():
-        return None
     try:
         network = ObjectMotionNetwork(**json.loads((folder / _CONFIG).read_text()))
         network.load_state_dict(load_file(folder / _WEIGHTS))

@@ -18,8 +18,9 @@ from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
-from mtv_world_ros.model.object_motion.predictor import FOLDER, num_features, save_network
+from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 
 #: steps of a training window
@@ -105,7 +106,7 @@ def train_motion(
     Raises:
         TrainingError: the folder is there already, or the loss is not finite.
     """
-    folder = Path(out) / FOLDER
+    folder = Path(out) / OBJECT_MOTION_FOLDER
     if folder.exists():
         raise TrainingError(f"'{folder}' exists; choose another --out, or remove it")
     torch.manual_seed(config.seed)

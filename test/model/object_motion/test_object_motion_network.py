@@ -108,10 +108,8 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network)
 
 
 def test_what_is_saved_is_read_again_and_damage_is_named(network, tmp_path):
-    assert load_network(tmp_path / 'object_motion') is None
     save_network(network, tmp_path / 'object_motion')
     read = load_network(tmp_path / 'object_motion')
-    assert read is not None
     for name, value in network.state_dict().items():
         torch.testing.assert_close(read.state_dict()[name], value)
     (tmp_path / 'object_motion' / 'model.safetensors').write_bytes(b'no')

@@ -77,7 +77,6 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
     after, _ = end_errors(network, tracks)
     assert after.mean() < 0.9 * before.mean()
     read = load_network(tmp_path / 'b' / 'object_motion')
-    assert read is not None
     np.testing.assert_allclose(end_errors(read, tracks)[0], after, atol=1e-6)
     with pytest.raises(TrainingError, match='exists; choose another --out'):
         train_motion(tracks, tmp_path / 'b', config)
