@@ -25,8 +25,7 @@ import torch
 from tqdm import tqdm
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
-from mtv_world_ros.data.recording_cache import cached_recording
+from mtv_world_ros.data.recording import cached_recording, clip_starts, cut_clip, Recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.training.run import spread

@@ -22,7 +22,7 @@ import numpy as np
 import page
 
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.vision.segmenters.mask_tracking import (
+from mtv_world_ros.vision.segmenters.prompted import (
     drop_old,
     reach,
     start_session,

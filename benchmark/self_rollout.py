@@ -24,7 +24,7 @@ import torch
 from tqdm import tqdm
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
-from mtv_world_ros.data.recording_cache import cached_recording
+from mtv_world_ros.data.recording import cached_recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.geometry.robot_file import load_robot

@@ -34,13 +34,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('dataset', type=Path)
+    parser.add_argument('datasets', type=Path, nargs='+')
     parser.add_argument('--machine', default=f'cpu{os.cpu_count()}')
     parser.add_argument('--out', type=Path, help='folder to write the page into')
     options = parser.parse_args()
     robot = load_robot(share_path(*ROBOT_FILE))
     counts: dict[str, Counter[str]] = {}
-    for path in list_episodes(options.dataset):
+    for path in (path for folder in options.datasets for path in list_episodes(folder)):
         episode = read_episode(path, with_cameras=False)
         poses, metadata = true_poses(episode, robot), episode.info.metadata
         success = task_named(episode.info.task).succeeds(poses)
@@ -67,7 +67,7 @@ def main() -> None:
     publish(
         'task_agreement',
         "The simulator's outcome and the tasks' relations on recorded true poses",
-        'python benchmark/task_agreement.py DIR',
+        'python benchmark/task_agreement.py DIR...',
         f'{(__doc__ or "").split(chr(10) * 2)[-1]}\n{table(HEAD, rows)}',
         options,
         '1 process',

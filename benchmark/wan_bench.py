@@ -22,7 +22,7 @@ from mtv_world_ros.model.sampler import denoise, sample_latents
 from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import prepare
-from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import TrainingConfig
 

@@ -15,10 +15,16 @@ from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.success.calibration import CALIBRATION, Calibration, load_calibration
+from mtv_world_ros.success.calibration import (
+    CALIBRATION,
+    Calibration,
+    HORIZON,
+    HorizonCurve,
+    load_calibration,
+    load_horizon,
+)
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
-from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon
 from mtv_world_ros.vision.describers.describer import Describer, InstructionDescriber
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -278,8 +284,7 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
     chat = _chat(config)
     if chat is None:
         return InstructionDescriber()
-    from mtv_world_ros.vision.describers.description_cache import DescriptionCache
-    from mtv_world_ros.vision.describers.vlm import VlmDescriber
+    from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber
 
     return VlmDescriber(chat, DescriptionCache(Path(config.cache)) if config.cache else None)
 

@@ -34,10 +34,9 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
+from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
-from mtv_world_ros.success.footage import footage_of
-from mtv_world_ros.success.rollout_memory import RolloutMemory
-from mtv_world_ros.success.trusted_horizon import HorizonCurve
+from mtv_world_ros.success.rollout_memory import footage_of, RolloutMemory
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 

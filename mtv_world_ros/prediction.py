@@ -18,7 +18,7 @@ from mtv_world_ros.data_types import (
     Observation,
     SuccessEstimate,
 )
-from mtv_world_ros.success.trusted_horizon import HorizonCurve
+from mtv_world_ros.success.calibration import HorizonCurve
 
 #: 97.5 % quantiles of Student's t for 1 ... 9 degrees of freedom; 2 bounds it from there on
 _T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)

@@ -12,7 +12,7 @@ from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import SEED_STEP
-from mtv_world_ros.success.trusted_horizon import HorizonCurve
+from mtv_world_ros.success.calibration import HorizonCurve
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=4, width=64, height=48, robot='yam_bimanual'

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.report.summary import Summary
     from mtv_world_ros.evaluation.results import EpisodeResult
-    from mtv_world_ros.success.trusted_horizon import HorizonCurve
+    from mtv_world_ros.success.calibration import HorizonCurve
 
 _EPILOG = """\
 Every episode is imagined as a whole from its first frame with its own commands; what the success
@@ -73,8 +73,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
     from mtv_world_ros.evaluation.calibration.report import write_calibration_report
     from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
-    from mtv_world_ros.success.calibration import save_calibration
-    from mtv_world_ros.success.trusted_horizon import save_horizon
+    from mtv_world_ros.success.calibration import save_calibration, save_horizon
 
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     print(f'{arguments.dataset}: {selection}')
@@ -142,7 +141,7 @@ def _horizon(
 ) -> HorizonCurve | None:
     """J of the objects that move against the horizon; None = nothing moves."""
     from mtv_world_ros.evaluation.metrics.horizon import curve
-    from mtv_world_ros.success.trusted_horizon import HorizonCurve
+    from mtv_world_ros.success.calibration import HorizonCurve
 
     rows: dict[str, list] = {}
     for result in (result for run in runs for result in run):

@@ -50,7 +50,8 @@ def select(
 
     Raises:
         EpisodeError: the folder holds no episodes, or no one of the split.
-        ConfigError: no such split, or the card cannot be read.
+        ConfigError: no such split, the card cannot be read, or siblings are not of one scene or
+            not in one split.
     """
     found = list_episodes(dataset)
     if not found:
@@ -60,6 +61,7 @@ def select(
         )
     card = _card(dataset)
     splits = card.get('splits', {})
+    _check_siblings(dataset, card.get('episodes', []), splits)
     if split is None:
         split = default if splits.get(default) else EVERY
     names = _names(dataset, splits, split)
@@ -88,6 +90,31 @@ def _card(dataset: Path) -> dict[str, Any]:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"'{file}' is not a data set card: {error}") from error
     return card
+
+
+def _check_siblings(
+    dataset: Path, entries: Sequence[Mapping[str, Any]], splits: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuses siblings of different scenes, and of different splits."""
+    places = {name: split for split, names in splits.items() for name in names}
+    firsts: dict[str, Mapping[str, Any]] = {}
+    for entry in entries:
+        scene = entry.get('scene')
+        if not scene:
+            continue
+        first = firsts.setdefault(scene, entry)
+        names = f"'{first['name']}' and '{entry['name']}' of '{dataset}'"
+        if first.get('seed') != entry.get('seed'):
+            raise ConfigError(
+                f'{names} are called siblings of scene {scene}, but their scenes are drawn from '
+                f'the seeds {first.get("seed")} and {entry.get("seed")}; siblings share a seed: '
+                "collect them with 'mtv-world collect --siblings'"
+            )
+        if places.get(first['name']) != places.get(entry['name']):
+            raise ConfigError(
+                f'{names} are siblings, but in the splits {places.get(first["name"])} and '
+                f'{places.get(entry["name"])}; keep the siblings of a scene in one split'
+            )
 
 
 def _names(dataset: Path, splits: Mapping[str, Any], split: str) -> set[str] | None:

@@ -19,8 +19,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.pipeline import ImaginedEpisode
-from mtv_world_ros.policies.execution import first_part
-from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.sim.collect.record import START_NS
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final

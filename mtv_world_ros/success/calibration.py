@@ -1,19 +1,24 @@
-"""A fitted logistic of the estimate's features, kept with the checkpoint that it is for."""
+"""What `mtv-world calibrate` keeps with a checkpoint: the fitted logistic, the trusted horizon."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+import json
 from math import exp, isfinite, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from mtv_world_ros.success.checkpoint_record import load_record, save_record
+from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.files import write_whole
 
 CALIBRATION = 'success_calibration.json'
+HORIZON = 'horizon.json'
 #: features that only speak against success: how what moved was grasped and carried. An object
 #: that stays where it was is grasped by nobody and still not a success.
 DOUBTS = frozenset({'grasp', 'carry'})
+
+Record = TypeVar('Record')
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
@@ -87,7 +92,7 @@ def save_calibration(folder: Path, calibration: Calibration) -> Path:
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    return save_record(Path(folder) / CALIBRATION, calibration, 'calibration')
+    return _save(Path(folder) / CALIBRATION, calibration, 'calibration')
 
 
 def load_calibration(folder: Path) -> Calibration | None:
@@ -96,4 +101,113 @@ def load_calibration(folder: Path) -> Calibration | None:
     Raises:
         CheckpointError: the file is not what `mtv-world calibrate` writes.
     """
-    return load_record(Path(folder) / CALIBRATION, Calibration)
+    return _load(Path(folder) / CALIBRATION, Calibration)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HorizonCurve:
+    """Mean J of the objects that move, of episodes imagined as a whole from their first frame.
+
+    Attributes:
+        period_s: between frames [s]; frame k is `(k + 1) * period_s` ahead.
+        values: (T,) mean J.
+        lower: (T,) lower end of the 95 % interval over episodes; 0 where too few reach it.
+        segmenter: that found the masks.
+        num_episodes: behind it.
+        made: command, date, machine.
+    """
+
+    period_s: float
+    values: tuple[float, ...]
+    lower: tuple[float, ...]
+    segmenter: str
+    num_episodes: int
+    made: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.period_s > 0 or len(self.values) != len(self.lower):
+            raise ValueError('the period is not positive, or the curves differ in length')
+
+    def trusted_seconds(self, level: float) -> float:
+        """Returns up to which time J is expected to be at least `level` [s].
+
+        By the lower bound, at every frame up to it; 0 = not even at the first. The curve's end
+        is the most that is known.
+        """
+        num_trusted = 0
+        for value in self.lower:
+            if not (isfinite(value) and value >= level):
+                break
+            num_trusted += 1
+        return num_trusted * self.period_s
+
+
+def save_horizon(folder: Path, curve: HorizonCurve) -> Path:
+    """Writes it into a checkpoint.
+
+    Raises:
+        CheckpointError: the folder cannot be written to.
+    """
+    return _save(Path(folder) / HORIZON, curve, 'horizon')
+
+
+def load_horizon(folder: Path) -> HorizonCurve | None:
+    """Returns the curve of a checkpoint; None = it has none.
+
+    Raises:
+        CheckpointError: the file is not what `mtv-world calibrate` writes.
+    """
+    return _load(Path(folder) / HORIZON, HorizonCurve)
+
+
+def _save(path: Path, record: Any, what: str) -> Path:
+    """Writes a dataclass into a checkpoint.
+
+    Args:
+        path: the file.
+        record: the dataclass.
+        what: what it is, for the error's text.
+
+    Raises:
+        CheckpointError: the folder cannot be written to.
+    """
+    try:
+        write_whole(path, json.dumps(asdict(record), indent=1) + '\n')
+    except OSError as error:
+        raise CheckpointError(
+            f"the {what} cannot be stored in the checkpoint '{path.parent}' ({error}); copy the "
+            'checkpoint to a folder of your own and calibrate that one'
+        ) from error
+    return path
+
+
+def _load(path: Path, kind: type[Record]) -> Record | None:
+    """Returns a dataclass of a checkpoint, its lists as tuples; None = there is no such file.
+
+    Args:
+        path: the file.
+        kind: the dataclass; it raises ValueError where its values do not fit each other.
+
+    Raises:
+        CheckpointError: the file is not what `mtv-world calibrate` writes.
+    """
+    if not path.is_file():
+        return None
+    try:
+        values = json.loads(path.read_text(encoding='utf-8'))
+        _check_keys(values, kind)
+        return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"'{path}' cannot be used: {error}; run 'mtv-world calibrate {path.parent} DATASET "
+            "--out DIR' again, or delete the file"
+        ) from error
+
+
+def _check_keys(values: Any, kind: Any) -> None:
+    known = [item.name for item in fields(kind)]
+    if not isinstance(values, dict):
+        raise ValueError('expected keys and values')
+    for key in values:
+        if key not in known:
+            raise ValueError(f"unknown key '{key}'{nearest(key, known)}")

@@ -8,8 +8,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.geometry.mask_geometry import centroids, locate, Location, moved_mask
-from mtv_world_ros.success.footage import Footage
-from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.jaccard import jaccard
 

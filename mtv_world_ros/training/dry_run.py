@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, 
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.transformer.context import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.config import TrainingConfig
 

@@ -22,10 +22,9 @@ from mtv_world_ros.model.conditioning import (
 from mtv_world_ros.model.encoders import ImageEncoder
 from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import Autoencoder
-from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
-from mtv_world_ros.training.objective import latent_weights, pixel_weights, pooled_weights
+from mtv_world_ros.training.objective import Draws, latent_weights, pixel_weights, pooled_weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

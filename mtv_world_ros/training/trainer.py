@@ -30,7 +30,6 @@ from mtv_world_ros.model.transformer.stem import with_new_source
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.base import Base
-from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
@@ -39,6 +38,7 @@ from mtv_world_ros.training.latent_cache.clips import CachedSource
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
+    Draws,
     Loss,
     sample_loss,
     sigma_weights,

@@ -3,7 +3,7 @@ import pytest
 
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.policies.execution import first_part
+from mtv_world_ros.policies.policy import first_part
 from mtv_world_ros.ranking.worlds import run_policy
 
 START_NS = 1_700_000_000_000_000_000

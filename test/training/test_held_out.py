@@ -14,8 +14,7 @@ from mtv_world_ros.evaluation.video_file import decode_video
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.held_out import HeldOut, Judged
-from mtv_world_ros.training.run import train
+from mtv_world_ros.training.run import HeldOut, Judged, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
-from mtv_world_ros.training.clip_noise import Draws
 from mtv_world_ros.training.config import ObjectiveConfig
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
+    Draws,
     latent_weights,
     pixel_weights,
     sample_loss,

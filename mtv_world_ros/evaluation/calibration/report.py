@@ -20,7 +20,7 @@ from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliab
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.evaluation.report.markup import element, Markup
 from mtv_world_ros.files import share_path, write_json, write_whole
-from mtv_world_ros.success.trusted_horizon import HorizonCurve
+from mtv_world_ros.success.calibration import HorizonCurve
 
 _COLUMNS = {
     'num_abstained': 'abstained',

@@ -26,7 +26,7 @@ from torch.distributed.device_mesh import init_device_mesh
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelError
 from mtv_world_ros.model.serving.options import ServingOptions
-from mtv_world_ros.model.transformer.context import ContextAttnProcessor
+from mtv_world_ros.model.transformer.cross_attention import ContextAttnProcessor
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 #: how long a process that does not answer is waited for; the first pass may compile

@@ -10,8 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.policies.execution import first_part
-from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.ros.bags.player import ENDS
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.policy.parameters import PolicySettings

@@ -30,7 +30,14 @@ from mtv_world_ros.sim.collect.dataset_card import (
 from mtv_world_ros.sim.collect.dataset_readme import write_readme
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
 from mtv_world_ros.sim.collect.jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
-from mtv_world_ros.sim.tasks.tasks import tasks_named
+from mtv_world_ros.sim.collect.siblings import (
+    SceneJob,
+    search_siblings,
+    SearchedScene,
+    sibling_jobs,
+    skipped_text,
+)
+from mtv_world_ros.sim.tasks.tasks import Task, tasks_named
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.zero_shot import kinds_named
 
@@ -60,7 +67,7 @@ def collect(
 
     Args:
         tasks: names, comma-separated names, or `all`.
-        num_episodes: episodes per task; of zero-shot sets, in all.
+        num_episodes: episodes per task, with siblings scenes per task; of zero-shot sets, in all.
         seed: of the data set.
         out: folder of the data set; one episode folder appears in it at a time.
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
@@ -84,25 +91,20 @@ def collect(
             f'episodes is {num_episodes} and workers is {workers}; both must be at least 1'
         )
     out, config = Path(out), config or CollectConfig()
-    if kinds and (config.policies or config.moved_share):
+    if kinds and (config.policies or config.moved_share or config.siblings):
         raise SimulatorError(
             'a zero-shot set is acted by the expert and brings its own cameras; leave '
-            '--policies and --moved-cameras out, or --zero-shot'
+            '--policies, --siblings and --moved-cameras out, or --zero-shot'
         )
     load_mujoco()
-    jobs = (
-        zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
-        if kinds
-        else jobs_of(
-            chosen,
-            num_episodes,
-            seed,
-            out,
-            0 if config.kinds else failures_of_ten,
-            config.policies,
-        )
-    )
+    if kinds:
+        jobs = zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
+    else:
+        num_missed = 0 if config.kinds else failures_of_ten
+        jobs = jobs_of(chosen, num_episodes, seed, out, num_missed, config.policies)
     with locked(out):
+        if config.siblings:
+            jobs = _sibling_jobs(chosen, num_episodes, seed, out, workers, config, progress)
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
         data_set.make(jobs, workers, config, progress=progress)
         data_set.describe(sheets=sheets)
@@ -111,6 +113,38 @@ def collect(
 
 def _maker(config: CollectConfig) -> Callable[[Job], Spent]:
     return EpisodeMaker(config).make
+
+
+def _searcher(config: CollectConfig) -> Callable[[SceneJob], SearchedScene]:
+    return EpisodeMaker(config).boundary_search().search
+
+
+def _sibling_jobs(
+    tasks: Sequence[Task],
+    num_scenes: int,
+    seed: int,
+    out: Path,
+    workers: int,
+    config: CollectConfig,
+    progress: bool,
+) -> list[Job]:
+    scenes = [
+        SceneJob(task=task.name, index=index, seed=seed)
+        for index in range(num_scenes)
+        for task in tasks
+    ]
+    check_same_set(out, TASKS_SET, seed, plain_config(config))
+    search = partial(_searcher, config)
+    found = search_siblings(scenes, search, out, workers, progress=progress)
+    if progress:
+        tqdm.write(skipped_text(found))
+    return sibling_jobs(found, scenes, out)
+
+
+def plain_config(config: CollectConfig) -> dict[str, Any]:
+    """Returns the configuration as the card has it."""
+    values = json.loads(json.dumps(asdict(config)))
+    return values if values['siblings'] else {k: v for k, v in values.items() if k != 'siblings'}
 
 
 @contextmanager
@@ -146,7 +180,7 @@ class _DataSet:
         self, out: Path, kind: str, seed: int, config: CollectConfig, jobs: Sequence[Job]
     ) -> None:
         self._out, self._kind, self._seed = out, kind, seed
-        self._config: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+        self._config = plain_config(config)
         check_same_set(out, kind, seed, self._config)
         remove_leftovers(out)
         self.entries = read_entries(out, {job.path.name for job in jobs})

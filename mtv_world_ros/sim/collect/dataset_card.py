@@ -40,6 +40,7 @@ class EpisodeEntry:
         duration_s: from the first to the last message [s].
         instruction: what the robot is told.
         objects: names, in the order of the mask ids.
+        scene: name of the scene that it shares with its siblings; empty = it has none.
     """
 
     name: str
@@ -54,6 +55,7 @@ class EpisodeEntry:
     duration_s: float
     instruction: str
     objects: tuple[str, ...]
+    scene: str = ''
 
 
 def read_entry(path: Path) -> EpisodeEntry:
@@ -87,6 +89,7 @@ def read_entry(path: Path) -> EpisodeEntry:
             duration_s=round((spans[1] - spans[0]) * 1e-9, 3),
             instruction=described['instruction'],
             objects=tuple(json.loads(described['objects'])),
+            scene=described.get('scene', ''),
         )
     except (OSError, KeyError, ValueError, McapError) as error:
         raise EpisodeError(

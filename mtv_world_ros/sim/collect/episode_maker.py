@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import time
 
 import numpy as np
@@ -13,6 +13,7 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import GO_ON
 from mtv_world_ros.sim.collect.jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate, Take, write_take
+from mtv_world_ros.sim.collect.siblings import BoundarySearch
 from mtv_world_ros.sim.expert.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.expert.faults import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.sim.tasks.tasks import task_named
@@ -38,6 +39,8 @@ class CollectConfig:
         policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
             whose grasps miss.
         kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
+        siblings: episodes of each scene, the expert's and some with faults of `kinds` whose sizes
+            lie on both sides of the boundary between success and failure; 0 = no siblings.
     """
 
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -48,6 +51,7 @@ class CollectConfig:
     moves: tuple[CameraMoves, ...] = TRAINING_MOVES
     policies: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
+    siblings: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.moved_share <= 1:
@@ -57,6 +61,11 @@ class CollectConfig:
             )
         for name in self.policies:
             parse_variant(name)
+        if self.siblings and (self.siblings < 2 or self.policies or not self.kinds):
+            raise SimulatorError(
+                f'{self.siblings} siblings of each scene: there must be at least 2, of the fault '
+                'kinds of a split; set --siblings and --faults, and leave --policies out'
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +94,8 @@ class EpisodeMaker:
                 cannot be written.
         """
         physics = rendering = 0.0
-        for attempt in range(self._config.record.max_attempts):
+        attempts = range(self._config.record.max_attempts)
+        for attempt in attempts if job.attempt is None else (job.attempt,):
             seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
             sim, take = self._attempt(job, seed)
             try:
@@ -108,6 +118,18 @@ class EpisodeMaker:
             f'{self._config.record.max_attempts} attempts; see sim/expert/expert.py'
         )
 
+    def boundary_search(self) -> BoundarySearch:
+        """Returns the search for siblings, with the physics of the episodes made here."""
+
+        def physics(seed: int) -> SimEpisode:
+            config = cameras_of(seed, self._config)
+            return SimEpisode(self._robot, self._expert.home, config, rendering=False)
+
+        record = replace(self._config.record, pictures='first')
+        return BoundarySearch(
+            self._expert, physics, self._config.kinds, self._config.siblings, record
+        )
+
     def _attempt(self, job: Job, seed: int) -> tuple[SimEpisode, Take | None]:
         """The episode of a seed; no take where its scene or plan is impossible."""
         config = self._config
@@ -127,14 +149,14 @@ class EpisodeMaker:
 
     def _policy(self, job: Job, seed: int) -> PolicyVariant | None:
         """What acts in place of the expert."""
-        if self._config.kinds:
+        if self._config.kinds and not self._config.siblings:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
             return draw_variant(self._config.kinds, rng)
         return parse_variant(job.policy) if job.policy else None
 
     def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
         started = time.process_time()
-        extra = {'attempt': str(attempt), 'index': str(job.index)}
+        extra = {'attempt': str(attempt), 'index': str(job.index), **dict(job.more)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
         policy = self._policy(job, seed)

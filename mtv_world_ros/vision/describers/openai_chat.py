@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, UTC
+from email.utils import parsedate_to_datetime
 import json
+from math import isfinite
 import os
 import time
 from typing import Any
@@ -15,9 +18,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError
-from mtv_world_ros.vision.describers.retries import attempt, RetryConfig
-from mtv_world_ros.vision.describers.vlm import Answer
-from mtv_world_ros.vision.describers.vlm_prompt import ANSWER_SCHEMA, excerpt
+from mtv_world_ros.vision.describers.vlm import Answer, ANSWER_SCHEMA, excerpt
 
 #: from the strictest to none; a server that refuses one is asked with the next
 _FORMATS: tuple[dict[str, Any] | None, ...] = (
@@ -91,7 +92,7 @@ class OpenAIChat:
         import openai
 
         try:
-            return attempt(lambda: self._post(messages, wanted), self._retries())
+            return _attempt(lambda: self._post(messages, wanted), self.config)
         except openai.APITimeoutError as error:
             raise self._too_slow() from error
         except openai.APIStatusError as error:
@@ -105,10 +106,6 @@ class OpenAIChat:
                 "up, and the describer's 'base_url' right?",
                 'unreachable',
             ) from error
-
-    def _retries(self) -> RetryConfig:
-        config = self.config
-        return RetryConfig(budget_s=config.retry_budget_s, first_wait_s=config.first_wait_s)
 
     def _post(self, messages: list[Any], wanted: dict[str, Any] | None) -> bytes:
         """One request. Reads piece by piece: some servers keep a slow answer alive with blanks."""
@@ -220,7 +217,7 @@ def _client(config: OpenAIConfig, key: str) -> Any:
         api_key=key or 'none',
         base_url=config.base_url,
         timeout=config.timeout_s,
-        max_retries=0,  # `attempt` has the only budget
+        max_retries=0,  # `_attempt` has the only budget
     )
 
 
@@ -238,3 +235,66 @@ def _messages(frame: ByteArray, turns: Sequence[str]) -> list[Mapping[str, Any]]
         for index, turn in enumerate(turns[1:])
     ]
     return [{'role': 'user', 'content': first}, *later]
+
+
+#: longest wait between attempts where the server names none [s]
+_LONGEST_WAIT_S = 30.0
+
+
+def _attempt(request: Callable[[], bytes], config: OpenAIConfig) -> bytes:
+    """Calls until it succeeds, fails for good, or the next attempt would exceed the budget.
+
+    The SDK's own retries know a number of attempts but no budget of time, and repeat timeouts and
+    what an account without credit asks.
+
+    Raises:
+        openai.OpenAIError: the last failure.
+    """
+    import openai
+
+    deadline = time.monotonic() + config.retry_budget_s
+    backoff = config.first_wait_s
+    while True:
+        try:
+            return request()
+        except openai.APIStatusError as error:
+            if not _is_passing(error.status_code, error.code):
+                raise
+            asked = retry_after(error.response.headers)
+            # "at once" would end in a flood of requests
+            wait = backoff if asked is None else max(asked, config.first_wait_s)
+            if time.monotonic() + wait > deadline:
+                raise
+        time.sleep(wait)
+        backoff = min(2 * backoff, _LONGEST_WAIT_S)
+
+
+def _is_passing(status: int, code: str | None) -> bool:
+    """Whether the same request may succeed later; an account without credit will not."""
+    return status >= 500 or (status == 429 and code != 'insufficient_quota')
+
+
+def retry_after(headers: Mapping[str, str]) -> float | None:
+    """Returns the wait that a server asks for [s], given in seconds or as a date; else None.
+
+    Source: RFC 9110, section 10.2.3.
+    """
+    value = headers.get('retry-after')
+    if value is None:
+        return None
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = _seconds_until(value)
+    return max(seconds, 0.0) if isfinite(seconds) else None
+
+
+def _seconds_until(date: str) -> float:
+    """NaN for what is no date."""
+    try:
+        moment = parsedate_to_datetime(date)
+    except ValueError:
+        return float('nan')
+    if moment.tzinfo is None:  # '-0000', which RFC 5322 gives to a UTC time of unknown zone
+        moment = moment.replace(tzinfo=UTC)
+    return (moment - datetime.now(UTC)).total_seconds()

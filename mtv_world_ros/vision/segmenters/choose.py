@@ -7,8 +7,7 @@ from pathlib import Path
 
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
-from mtv_world_ros.vision.segmenters.sam import sam2_segmenter
-from mtv_world_ros.vision.segmenters.sam3_segmenter import sam3_segmenter
+from mtv_world_ros.vision.segmenters.sam import sam2_segmenter, sam3_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 from mtv_world_ros.vision.segmenters.weights import find_weights, VISION_MODELS
 

@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.vision.colour_words import colour_of, PALETTE
-from mtv_world_ros.vision.segmenters.colour_parts import part_of, with_part
 from mtv_world_ros.vision.segmenters.segmenter import check_request
-from mtv_world_ros.vision.segmenters.tracking import Track, track, TrackingConfig
+from mtv_world_ros.vision.segmenters.tracking import (
+    part_of,
+    Track,
+    track,
+    TrackingConfig,
+    with_part,
+)
 
 Floats = NDArray[np.floating]
 

@@ -1,19 +1,129 @@
-"""Objects found by name in the first frame only, then followed from their masks there."""
+"""Segmenters that are told names: found in the first frame, carried on by a SAM tracker."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.errors import ModelMemoryError
-from mtv_world_ros.vision.segmenters.mask_tracking import SamVideo, track_masks
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import judge, TrackingConfig
+
+Tensor = Any  # torch is imported where it is used
+
+
+class SamVideo(Protocol):
+    """A video model of the SAM family: SAM 2 and the tracker inside SAM 3 share this interface."""
+
+    #: what a session is told of frames: where tensors lie, what type they have
+    device: str
+
+    @property
+    def tracker(self) -> Any:
+        """The model whose `config`, memory and `image_size` count."""
+        ...
+
+    def open_session(self, height: int, width: int) -> Any:
+        """Returns an empty session for frames of that size [px]."""
+        ...
+
+    def advance(self, session: Any, frame: ByteArray, index: int) -> Any:
+        """Runs one (H, W, 3) frame, the session's `index`-th, and returns the model's output."""
+        ...
+
+
+def track_masks(
+    model: SamVideo,
+    first_frame: ByteArray,
+    first_masks: BoolArray,
+    frames: Iterable[ByteArray],
+    *,
+    bounded: bool = True,
+) -> Iterator[BoolArray]:
+    """Yields the (O, H, W) masks in each frame as it comes.
+
+    Memory does not grow with the number of frames: what lies beyond the model's reach is dropped,
+    which changes no mask.
+
+    Args:
+        model: tracks.
+        first_frame: (H, W, 3) uint8 RGB, the frame that the masks belong to.
+        first_masks: (O, H, W), none of them empty.
+        frames: (H, W, 3) uint8 RGB, those that follow.
+        bounded: False keeps everything, to compare with.
+    """
+    if not len(first_masks):
+        for frame in frames:
+            yield np.zeros((0, *frame.shape[:2]), np.bool_)
+        return
+    session = start_session(model, first_frame, first_masks)
+    for index, frame in enumerate(frames, start=1):
+        yield output_masks(model.advance(session, frame, index), *frame.shape[:2])
+        if bounded:
+            drop_old(session, index, reach(model.tracker.config))
+
+
+def start_session(model: SamVideo, first_frame: ByteArray, first_masks: BoolArray) -> Any:
+    """Returns a session that remembers the objects of the first frame; arguments as above."""
+    session = model.open_session(*first_frame.shape[:2])
+    for number, mask in enumerate(first_masks):
+        index = session.obj_id_to_idx(number)
+        session.add_mask_inputs(index, 0, _square_mask(mask, model))
+    session.obj_with_new_inputs = list(range(len(first_masks)))
+    model.advance(session, first_frame, 0)
+    return session
+
+
+def output_masks(output: Any, height: int, width: int) -> BoolArray:
+    """Returns the (O, H, W) masks of a model's output, at the size of the frames."""
+    import torch
+
+    logits = torch.nn.functional.interpolate(
+        output.pred_masks.float(), size=(height, width), mode='bilinear', align_corners=False
+    )
+    return (logits[:, 0] > 0).cpu().numpy()
+
+
+def reach(config: Any) -> int:
+    """Returns how many frames back a tracker looks: mask memories and object pointers."""
+    return max(config.num_maskmem, config.max_object_pointers_in_encoder) + 1
+
+
+def drop_old(session: Any, index: int, kept: int) -> None:
+    """Forgets frames up to `index` and what was found more than `kept` frames before it."""
+    for old in [number for number in session.processed_frames if number <= index]:
+        del session.processed_frames[old]
+    for item, outputs in session.output_dict_per_obj.items():
+        tracked = session.frames_tracked_per_obj[item]
+        for store in (outputs['non_cond_frame_outputs'], tracked):
+            for old in [number for number in store if number < index - kept]:
+                del store[old]
+
+
+def stored_entries(session: Any) -> int:
+    """Returns how many frames and outputs a session holds."""
+    outputs = sum(
+        len(store) for stores in session.output_dict_per_obj.values() for store in stores.values()
+    )
+    tracked = sum(map(len, session.frames_tracked_per_obj.values()))
+    return len(session.processed_frames) + outputs + tracked
+
+
+def _square_mask(mask: BoolArray, model: SamVideo) -> Tensor:
+    """(1, 1, S, S) the prompt, at the model's own size; a small object keeps a pixel at least."""
+    import torch
+
+    size = int(model.tracker.image_size)
+    pixels = torch.tensor(mask, device=model.device)[None, None].float()
+    pixels = torch.nn.functional.interpolate(
+        pixels, size=(size, size), mode='bilinear', align_corners=False, antialias=True
+    )
+    return (pixels >= min(0.5, float(pixels.max()))).float()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The segmenter with public weights: MM-Grounding-DINO finds, SAM 2 outlines and follows."""
+"""The opt-in segmenters of the SAM family: MM-Grounding-DINO with SAM 2, and SAM 3."""
 
 from __future__ import annotations
 
@@ -8,16 +8,22 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
-from mtv_world_ros.vision.segmenters.grounding import GroundingConfig, MMGroundingDino
-from mtv_world_ros.vision.segmenters.image_normalisation import (
+from mtv_world_ros.vision.segmenters.grounding import (
+    choose_boxes,
+    GroundingConfig,
     IMAGENET,
+    MMGroundingDino,
     prepare,
     stated_normalisation,
+    SYMMETRIC,
 )
-from mtv_world_ros.vision.segmenters.mask_tracking import output_masks
-from mtv_world_ros.vision.segmenters.prompted import FirstMasks, PromptedSegmenter
+from mtv_world_ros.vision.segmenters.prompted import FirstMasks, output_masks, PromptedSegmenter
 from mtv_world_ros.vision.segmenters.tracking import TrackingConfig
-from mtv_world_ros.vision.segmenters.weights import load_vision_model, preprocessor_config
+from mtv_world_ros.vision.segmenters.weights import (
+    load_tokenizer,
+    load_vision_model,
+    preprocessor_config,
+)
 
 #: what SAM 2 calls the corners of a box among the points of a prompt
 _BOX_LABELS = (2, 3)
@@ -106,4 +112,136 @@ def sam2_segmenter(
         finder=BoxedFinder(detector, video),
         video=video,
         tracking=tracking or TrackingConfig(),
+    )
+
+
+#: tokens that SAM 3's text encoder reads of a name
+_TEXT_LENGTH = 32
+#: SAM 3's own threshold for detections is .5; it adds an object to a video from .7 on
+SAM3_SCORES = GroundingConfig(min_score=0.5, sure_score=0.7)
+
+
+class Sam3Video:
+    """`Sam3VideoModel` frame by frame; a `SamVideo` and a `Finder`.
+
+    Its own loop detects anew in every frame, so that two videos get identities of their own. Here
+    both halves are called one after the other: names are looked for in the first frame alone, and
+    the tracker starts from masks, the same for every video.
+    """
+
+    def __init__(
+        self, folder: Path, *, device: str = 'cpu', config: GroundingConfig = SAM3_SCORES
+    ) -> None:
+        """Loads the weights; see `load_vision_model` for the errors."""
+        self._model = load_vision_model(folder, 'sam3_video', device)
+        self._tokenizer = load_tokenizer(folder)
+        self._normalisation = stated_normalisation(preprocessor_config(folder), SYMMETRIC)
+        self._config = config
+        self.device = device
+
+    @property
+    def tracker(self) -> Any:
+        """See `SamVideo.tracker`."""
+        return self._model.tracker_model
+
+    def open_session(self, height: int, width: int) -> Any:
+        """See `SamVideo.open_session`."""
+        import torch
+        from transformers.models.sam3_tracker_video import modeling_sam3_tracker_video as module
+
+        return module.Sam3TrackerVideoInferenceSession(
+            video_height=height,
+            video_width=width,
+            inference_device=self.device,
+            inference_state_device=self.device,
+            video_storage_device=self.device,
+            dtype=torch.float32,
+        )
+
+    def advance(self, session: Any, frame: ByteArray, index: int) -> Any:
+        """See `SamVideo.advance`."""
+        import torch
+
+        with torch.inference_mode():
+            features, places = self._model.get_vision_features_for_tracker(self._see(frame))
+        session.cache.cache_vision_features(
+            index, {'vision_feats': features, 'vision_pos_embeds': places}
+        )
+        # the tracker has no image encoder of its own: it takes the features above, not the frame
+        return self.tracker(session, frame=torch.zeros(1, 3, 1, 1), frame_idx=index)
+
+    def find(self, frame: ByteArray, names: tuple[str, ...]) -> FirstMasks:
+        """See `Finder.find`."""
+        import torch
+
+        height, width = frame.shape[:2]
+        if not names:
+            return FirstMasks(masks=np.zeros((0, height, width), np.bool_), status=())
+        with torch.inference_mode():
+            seen = self._see(frame)
+            found = [self._detect(seen, name) for name in names]
+        masks = np.concatenate([logits for _, _, logits in found])
+        boxes = np.concatenate([boxes for _, boxes, _ in found]) * [width, height, width, height]
+        # every name has candidates of its own
+        scores = np.zeros((len(masks), len(names)))
+        for index, (own, _, _) in enumerate(found):
+            scores[index * len(own) : (index + 1) * len(own), index] = own
+        chosen = choose_boxes(boxes, scores, names, self._config)
+        best = scores.argmax(0)
+        known = np.isfinite(chosen.boxes).all(1)
+        first = np.zeros((len(names), height, width), np.bool_)
+        first[known] = _upscaled(masks[best[known]], height, width)
+        return FirstMasks(masks=first, status=chosen.status)
+
+    def _see(self, frame: ByteArray) -> Any:
+        """What the image encoder, shared by detector and tracker, makes of a frame."""
+        size = int(self.tracker.image_size)
+        pixels = prepare(frame, (size, size), self._normalisation, self.device)
+        return self._model.detector_model.get_vision_features(pixel_values=pixels)
+
+    def _detect(self, seen: Any, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Scores (Q,), corner boxes (Q, 4) as shares of the image, mask logits (Q, h, w)."""
+        text = self._tokenizer(
+            name,
+            return_tensors='pt',
+            padding='max_length',
+            truncation=True,
+            max_length=_TEXT_LENGTH,
+        ).to(self.device)
+        output = self._model.detector_model(
+            vision_embeds=seen, input_ids=text.input_ids, attention_mask=text.attention_mask
+        )
+        scores = output.pred_logits.sigmoid() * output.presence_logits.sigmoid()
+        parts = (scores[0], output.pred_boxes[0], output.pred_masks[0])
+        first, second, third = (part.float().cpu().double().numpy() for part in parts)
+        return first, second, third
+
+
+def _upscaled(logits: FloatArray, height: int, width: int) -> BoolArray:
+    """(N, H, W) masks of (N, h, w) logits."""
+    import torch
+
+    likely = torch.tensor(logits)[:, None].sigmoid()
+    likely = torch.nn.functional.interpolate(
+        likely, size=(height, width), mode='bilinear', align_corners=False
+    )
+    return (likely[:, 0] > 0.5).numpy()
+
+
+def sam3_segmenter(
+    folder: Path,
+    *,
+    device: str = 'cpu',
+    grounding: GroundingConfig = SAM3_SCORES,
+    tracking: TrackingConfig | None = None,
+) -> PromptedSegmenter:
+    """Loads the model.
+
+    Raises:
+        CheckpointError: the folder does not hold it.
+        ConfigError: transformers is not installed.
+    """
+    video = Sam3Video(folder, device=device, config=grounding)
+    return PromptedSegmenter(
+        name='sam3', finder=video, video=video, tracking=tracking or TrackingConfig()
     )

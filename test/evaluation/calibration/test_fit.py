@@ -27,9 +27,16 @@ from mtv_world_ros.evaluation.metrics.success_agreement import (
     expected_calibration_error,
     Judgement,
 )
-from mtv_world_ros.success.calibration import CALIBRATION, load_calibration, save_calibration
+from mtv_world_ros.success.calibration import (
+    CALIBRATION,
+    HORIZON,
+    HorizonCurve,
+    load_calibration,
+    load_horizon,
+    save_calibration,
+    save_horizon,
+)
 from mtv_world_ros.success.estimator import capped
-from mtv_world_ros.success.trusted_horizon import HORIZON, HorizonCurve, load_horizon, save_horizon
 
 
 def judgements(probabilities, outcomes):

@@ -16,11 +16,9 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError, DescriptionError
-from mtv_world_ros.vision.describers.description_cache import DescriptionCache
-from mtv_world_ros.vision.describers.openai_chat import OpenAIChat, OpenAIConfig
-from mtv_world_ros.vision.describers.retries import retry_after
+from mtv_world_ros.vision.describers.openai_chat import OpenAIChat, OpenAIConfig, retry_after
 from mtv_world_ros.vision.describers.scene_objects import SceneObject
-from mtv_world_ros.vision.describers.vlm import VlmDescriber
+from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber
 
 pytest.importorskip('openai')
 

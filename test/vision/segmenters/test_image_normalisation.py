@@ -12,7 +12,7 @@ from transformers.models.grounding_dino.image_processing_pil_grounding_dino impo
 )
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.vision.segmenters.image_normalisation import (
+from mtv_world_ros.vision.segmenters.grounding import (
     DINO_EDGES,
     IMAGENET,
     prepare,

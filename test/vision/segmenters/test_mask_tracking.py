@@ -4,16 +4,15 @@ import torch
 from transformers import Sam2VideoModel
 from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
-from mtv_world_ros.vision.segmenters.image_normalisation import IMAGENET, prepare
-from mtv_world_ros.vision.segmenters.mask_tracking import (
+from mtv_world_ros.vision.segmenters.grounding import IMAGENET, prepare
+from mtv_world_ros.vision.segmenters.prompted import (
     drop_old,
     reach,
     start_session,
     stored_entries,
     track_masks,
 )
-from mtv_world_ros.vision.segmenters.sam import Sam2Video
-from mtv_world_ros.vision.segmenters.sam3_segmenter import Sam3Video
+from mtv_world_ros.vision.segmenters.sam import Sam2Video, Sam3Video
 
 HEIGHT, WIDTH = 48, 64
 
@@ -57,7 +56,7 @@ def test_keeping_too_little_changes_masks(sam2, monkeypatch):
     """What the test above compares is sensitive to what is dropped."""
     frames, masks = clip(22)
     kept = np.array(list(track_masks(sam2, frames[0], masks, frames[1:])))
-    monkeypatch.setattr('mtv_world_ros.vision.segmenters.mask_tracking.reach', lambda config: 1)
+    monkeypatch.setattr('mtv_world_ros.vision.segmenters.prompted.reach', lambda config: 1)
     assert not np.array_equal(kept, list(track_masks(sam2, frames[0], masks, frames[1:])))
 
 

@@ -10,8 +10,12 @@ from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter, WEIGHTS_VARIABLE
 from mtv_world_ros.vision.segmenters.grounding import GroundingConfig, MMGroundingDino
 from mtv_world_ros.vision.segmenters.prompted import PromptedSegmenter
-from mtv_world_ros.vision.segmenters.sam import BoxedFinder, sam2_segmenter, Sam2Video
-from mtv_world_ros.vision.segmenters.sam3_segmenter import sam3_segmenter
+from mtv_world_ros.vision.segmenters.sam import (
+    BoxedFinder,
+    sam2_segmenter,
+    Sam2Video,
+    sam3_segmenter,
+)
 from mtv_world_ros.vision.segmenters.tracking import TrackingConfig
 
 HEIGHT, WIDTH = 48, 64

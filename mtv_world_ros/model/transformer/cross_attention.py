@@ -1,4 +1,4 @@
-"""What the blocks' cross-attention looks at: tokens for all, or for each time slot its own.
+"""What the cross-attention of the blocks looks at: tokens for all, or for each time slot its own.
 
 Shape letters: B batch, V views, S time slots (the reference image and f token frames), n tokens
 of a view and slot, N context tokens, G of them a slot, M image tokens, D width.
