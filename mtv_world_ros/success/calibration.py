@@ -14,15 +14,15 @@ from mtv_world_ros.files import write_whole
 
 CALIBRATION = 'success_calibration.json'
 HORIZON = 'horizon.json'
-#: features that only speak against success: how what moved was grasped and carried. An object
-#: that stays where it was is grasped by nobody and still not a success.
+#: features that only speak against success: how a moved object was grasped and carried. An object
+#: that never moves needs no grasp, which is no sign of success.
 DOUBTS = frozenset({'grasp', 'carry'})
 
 Record = TypeVar('Record')
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
-    """Returns a feature as it is weighed: of doubts only negative values; NaN = says nothing."""
+    """Returns a feature's value for the logistic: doubts count only if negative; NaN = unknown."""
     value = features.get(name, nan)
     return min(value, 0.0) if name in DOUBTS else value
 
@@ -78,7 +78,7 @@ class Calibration:
         return 1.0 / (1.0 + exp(-max(min(logit, 50.0), -50.0)))
 
     def objection(self, task: str, segmenter: str) -> str:
-        """Returns why it does not hold for a task and a segmenter; empty = it does."""
+        """Returns why it does not apply to a task and a segmenter; empty = it applies."""
         if segmenter != self.segmenter:
             return f"uncalibrated for the segmenter '{segmenter}' (fitted with '{self.segmenter}')"
         if task not in self.tasks:
@@ -129,7 +129,7 @@ class HorizonCurve:
             raise ValueError('the period is not positive, or the curves differ in length')
 
     def trusted_seconds(self, level: float) -> float:
-        """Returns up to which time J is expected to be at least `level` [s].
+        """Returns the time until which J is expected to stay at least `level` [s].
 
         By the lower bound, at every frame up to it; 0 = not even at the first. The curve's end
         is the most that is known.

@@ -24,8 +24,8 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 __all__ = ['EstimatorConfig', 'Judged', 'SuccessEstimator', 'load_tasks']
 
-#: probability at most, of a task that cannot be done yet: it asks for open grippers while one is
-#: closed, or something that has to move has not
+#: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
+#: or an object that has to move has not moved
 UNDONE_PROBABILITY = 0.1
 
 
@@ -60,7 +60,7 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
 
 
 class Judged(NamedTuple):
-    """The estimate after a chunk, and what to remember for the next one."""
+    """The estimate after a chunk, and the memory that the next chunk needs."""
 
     estimate: SuccessEstimate
     memory: RolloutMemory
@@ -77,7 +77,7 @@ class SuccessEstimator:
         calibration: Calibration | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
-        """Sets what may be judged.
+        """Sets the tasks that may be judged.
 
         Args:
             tasks: known tasks.
@@ -201,7 +201,7 @@ def _released(task: TaskSpec, openings: FloatArray | None) -> float:
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:
-    """Refuses a task that looks at views that there are not."""
+    """Refuses a task that needs views which do not exist."""
     known = [camera.view for camera in footage.cameras]
     wanted = dict.fromkeys([*task.views, *(view for view, _ in task.pictures)])
     missing = [view for view in wanted if view not in known]

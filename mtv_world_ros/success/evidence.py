@@ -33,9 +33,9 @@ MOVED_M = 0.03
 GRASP_M = 0.02
 #: the same for the distance outside the mask of an object that is held by its rim [m]
 RIM_GAP_M = 0.01
-#: a carried object may come to rest this far from where its tool carried it [m]
+#: largest distance of a carried object from where its tool carried it [m]
 CARRY_ERROR_M = 0.025
-#: J with the goal mask that a start can have and still be gained upon
+#: larger J of the start with the goal mask count as this much
 MAX_START_JACCARD = 0.5
 #: what the features are called, in order
 FEATURES = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry')
@@ -43,7 +43,7 @@ FEATURES = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """Of one rollout for one task.
+    """What one rollout says about one task.
 
     Attributes:
         worst: the condition nearest to failing, or furthest from holding.
@@ -132,7 +132,7 @@ def _goals(scene: ImaginedScene, task: TaskSpec) -> tuple[dict[int, FloatArray],
 
 
 def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
-    """(V, H, W) masks of the subject where it should be, if that is one place."""
+    """Goal masks (V, H, W): the subject where it should be; None if that is not one place."""
     if isinstance(relation, AsPictured):
         return scene.pictured(relation.subject, relation.pictures)
     goal = relation.goal(scene)
@@ -145,7 +145,7 @@ def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
 
 
 def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
-    """How much of the subjects lies on what they are to be in or on, in -1..1; the least."""
+    """Overlap of each subject with its container or plate, in -1..1; the smallest one."""
     shares = [
         scene.views.containment(scene.item(relation.subject), scene.item(relation.target))
         for relation in task.relations
@@ -161,7 +161,7 @@ def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
 
 
 def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
-    """How well grasps explain that the movers moved: by their place, and by the way they went.
+    """How well grasps explain that objects moved: by where a gripper closed, and by its path.
 
     Positive = explained, at most 1; an object that did not move needs no grasp. NaN = the robot's
     motion is not known.
@@ -182,7 +182,7 @@ def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
 
 
 def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
-    """0 where something that the task moves is known to be where it was, else 1."""
+    """0 if an object that the task moves is known to be still at its start, else 1."""
     for role in task.movers:
         trail = scene.views.memory.points[scene.item(role)]
         known = np.isfinite(trail).all(1)
@@ -193,7 +193,7 @@ def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
 
 
 def _nearest_grasp(scene: ImaginedScene, role: str, *, is_rim: bool) -> tuple[float, float]:
-    """How far off the nearest grasp was (1 = the limit), and by how much its way differs [m]."""
+    """Distance of the nearest grasp (1 = the limit), and the error of the path it explains [m]."""
     item = scene.item(role)
     best, error = np.inf, np.inf
     for grasp in scene.views.memory.grasps:

@@ -59,7 +59,7 @@ class Picture:
 
 
 def load_pictures(data: Any, folder: Path, where: str) -> dict[str, Picture]:
-    """Reads the files of a mapping from views to names, which count from a folder.
+    """Reads the picture files of a mapping from views to names, relative to a folder.
 
     Raises:
         ConfigError: it is no such mapping, or a file is no picture.
@@ -95,7 +95,7 @@ def load_regions(data: Any, folder: Path, where: str) -> dict[str, Picture]:
 
 
 class PictureMasks:
-    """Finds objects in pictures; what was found is kept.
+    """Finds objects in pictures, and caches the masks.
 
     Args:
         segmenter: finds them; None = there is nothing to find them with.

@@ -102,10 +102,10 @@ class Grasp(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutMemory:
-    """Of V views, O objects, A arms and N frames so far.
+    """What is remembered of a rollout: V views, O objects, A arms, N frames so far.
 
     Attributes:
-        start_masks: of the first frame of all (T = 1).
+        start_masks: of the rollout's first frame (T = 1).
         start_poses: (V, 4, 4) T_base_camera then.
         points: (O, N, 3) centres, NaN where fewer than two views know one [m].
         leans: (V, O, N) angles of the masks' long axes in the image [rad].
@@ -134,7 +134,7 @@ class RolloutMemory:
         return self.start_masks.names
 
     def start_point(self, item: int) -> FloatArray:
-        """Returns where an object was in the first frame of all (3,) [m], NaN = not known."""
+        """Returns where an object was in the rollout's first frame (3,) [m], NaN = not known."""
         return self.points[item, 0]
 
 
@@ -230,7 +230,7 @@ def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> R
 
 
 def _released(memory: RolloutMemory, arm: int, tool: FloatArray) -> RolloutMemory:
-    """All grasps of the arm that still hold end here: it closes in steps."""
+    """Ends all open grasps of the arm; a gripper that closes in steps has several."""
     ended = tuple(
         grasp._replace(released_at=tool)
         if grasp.arm == arm and grasp.released_at is None

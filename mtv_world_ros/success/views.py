@@ -136,7 +136,7 @@ class Views:
         return float(shares[known].min()) if known.any() else float('nan')
 
     def check_visible(self, item: int) -> None:
-        """Refuses an object that has all but vanished in every view that knows it.
+        """Refuses an object that has nearly vanished in every view that knows it.
 
         Raises:
             CannotTell: it has.

@@ -158,7 +158,7 @@ def skill(score: FloatArray | float, copy: FloatArray | float) -> FloatArray:
 
 
 def moves(true: BoolArray, first: BoolArray, max_overlap: float = 0.5) -> BoolArray:
-    """Returns (V, O) whether an object really moves in the recording.
+    """Returns (V, O) whether an object moves in the recording.
 
     It moves if in some frame its mask and its first mask share less than `max_overlap` of the
     smaller of the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show

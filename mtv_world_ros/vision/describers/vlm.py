@@ -218,7 +218,7 @@ class DescriptionCache:
 
     @staticmethod
     def key(frame: ByteArray, instruction: str, prompt_version: str, model: str) -> str:
-        """Returns the sha256 of everything that an answer depends on."""
+        """Returns the sha256 of everything that the answer depends on."""
         digest = hashlib.sha256()
         for part in (str(frame.shape), instruction, prompt_version, model):
             digest.update(f'{len(part)}:{part}'.encode())

@@ -194,7 +194,7 @@ class Sam3Video:
         return FirstMasks(masks=first, status=chosen.status)
 
     def _see(self, frame: ByteArray) -> Any:
-        """What the image encoder, shared by detector and tracker, makes of a frame."""
+        """Features of a frame from the image encoder that detector and tracker share."""
         size = int(self.tracker.image_size)
         pixels = prepare(frame, (size, size), self._normalisation, self.device)
         return self._model.detector_model.get_vision_features(pixel_values=pixels)

@@ -1,4 +1,4 @@
-"""From the pixels of a colour to one mask per frame, and whether to believe it."""
+"""Follows an object through the pixels of its colours: a mask per frame, and its status."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
 
 
 def _doubt_whole(masks: BoolArray, state: _State, config: TrackingConfig) -> None:
-    """Says why an object is not seen (never there, out of the image, lost) or hardly."""
+    """Sets the status of an object that is absent, out of view, lost or barely visible."""
     shown = [mask for mask in masks if mask.any()]
     if len(shown) >= (1 - config.max_missing) * len(masks) and shown:
         slivers = sum(not _has_body(mask) for mask in shown)
@@ -178,7 +178,7 @@ def _find(frame: BoolArray, state: _State, config: TrackingConfig) -> BoolArray 
 def _nearest(
     pieces: Labels, areas: FloatArray, centres: FloatArray, centre: FloatArray, reach: float
 ) -> int:
-    """Label of the piece near where the object was; a crumb must be a reach nearer to win."""
+    """Label of the piece nearest to the last position; small pieces must be clearly nearer."""
     steps = np.hypot(*(centres[pieces] - centre).T)
     size = np.sqrt(areas[pieces] / areas[pieces].max())
     return int(pieces[np.argmin(steps / reach - size)])
