@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from math import ceil
 from types import MappingProxyType
@@ -11,7 +11,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from mtv_world_ros.data_types import (
-    BoolArray,
     ByteArray,
     CameraModel,
     FloatArray,
@@ -25,7 +24,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import ObservationError, RolloutPreempted
 from mtv_world_ros.geometry.camera import camera_poses, scaled
-from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
+from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
@@ -80,29 +79,6 @@ class WorldModel(Protocol):
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
-        ...
-
-
-class TrackedObjects(Protocol):
-    """Objects on their way; what one chunk hands to the next."""
-
-    step_s: float
-
-    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
-        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
-
-        Row 0 is where they are now.
-        """
-        ...
-
-
-class ObjectMotionModel(Protocol):
-    """Says where objects go under commanded joints."""
-
-    def find(
-        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
-    ) -> TrackedObjects:
-        """Returns the objects of masks (V, O, H, W), seen by cameras at T_base_camera (4, 4)."""
         ...
 
 
@@ -289,14 +265,9 @@ class ImaginedEpisode:
         start_masks = self._find_start_masks(state)
         masks = self._follow_masks(state, start_masks, frames)
         success, memory = self._judge(state, positions, start_masks, masks)
-        end = replace(
-            state.observation,
-            frames=frames[:, -1],
-            positions=positions[-1],
-            stamp_ns=state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9),
-        )
-        state = state.after(frames, end, memory, spec.num_history)
-        self._rollouts = (replace(state, num_imagined=0, objects=None, source=end),)
+        stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
+        state = state.after(frames, positions[-1], stamp_ns, spec.num_history, memory)
+        self._rollouts = (replace(state, num_imagined=0, source=state.observation),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
 
     def _plan_chunks(self, trajectory: JointTrajectory) -> list[_ChunkPlan]:
@@ -330,7 +301,7 @@ class ImaginedEpisode:
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
         start_masks = self._find_start_masks(state)
         clock.lap('start masks')
-        state, pictures = self._move_objects(state, plan)
+        pictures, objects = self._move_objects(state, plan, start_masks)
         clock.lap('object motion')
         control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks, pictures)
         clock.lap('trajectory video')
@@ -350,13 +321,10 @@ class ImaginedEpisode:
         success, memory = self._judge(state, positions, start_masks, masks)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
-        end = replace(
-            start,
-            frames=frames[:, -1],
-            positions=positions[-1],
-            stamp_ns=plan.stamp_ns + round(float(times[-1]) * 1e9),
+        stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
+        state = state.after(
+            frames, positions[-1], stamp_ns, pipeline.spec.num_history, memory, objects
         )
-        state = state.after(frames, end, memory, pipeline.spec.num_history)
         prediction = Prediction(
             start=start,
             video=MultiViewVideo(views=start.views, times=times, frames=frames),
@@ -378,47 +346,37 @@ class ImaginedEpisode:
         return prediction, state
 
     def _move_objects(
-        self, state: _RolloutState, plan: _ChunkPlan
-    ) -> tuple[_RolloutState, ByteArray | None]:
-        """Where the plan takes the objects: the state then, and their pictures on the way.
+        self, state: _RolloutState, plan: _ChunkPlan, start_masks: ObjectMasks
+    ) -> tuple[ByteArray | None, FoundObjects | None]:
+        """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after it.
 
-        Pictures are (V, 1 + T, H, W, 4); None where the model is not shown them.
+        None where the model is not shown them.
         """
         pipeline = self.pipeline
         if pipeline.object_motion is None or not pipeline.rendering.object_motion:
-            return state, None
-        found = state.objects
-        if found is None:
-            found = self._find_objects(state.observation, state.source)
-        elif found.names != self.names:  # only an imagined frame shows where they are now
-            found = self._find_objects(state.observation, state.observation)
-        motion, tracked = found.tracked.advance(plan.fine_positions(found.tracked.step_s))
-        rows = np.rint((plan.times - plan.times[0]) / found.tracked.step_s).astype(int)
-        pictures = moved_pictures(
-            found.frames,
-            found.masks,
-            motion[np.minimum(rows, len(motion.points) - 1)],
+            return None, None
+        poses = self._camera_poses(plan.positions)
+        objects = state.objects
+        if objects is None or objects.names != self.names:
+            # at its own size the real frame shows better where they are; where the names have
+            # changed only an imagined frame shows where they are now
+            source = state.source if objects is None else state.observation
+            sharp = pipeline.segmenter.segment(source.frames[:, None], self.names)
+            found = pipeline.object_motion.find(
+                sharp.masks[:, :, 0], source.cameras, list(poses[:, 0])
+            )
+            objects = FoundObjects(
+                names=self.names,
+                frames=state.observation.frames,
+                masks=start_masks.masks[:, :, 0],
+                poses=poses[:, 0],
+                tracked=found,
+            )
+        return objects.move(
+            plan.fine_positions(objects.tracked.step_s),
+            plan.times - plan.times[0],
             state.observation.cameras,
-            found.poses,
-            self._camera_poses(plan.positions),
-        )
-        return replace(state, objects=replace(found, tracked=tracked)), pictures
-
-    def _find_objects(self, start: Observation, source: Observation) -> _FoundObjects:
-        """The named objects in a frame, given at the model's size and at its own."""
-        model, segmenter = self.pipeline.object_motion, self.pipeline.segmenter
-        assert model is not None
-        poses = self._camera_poses(start.positions[None])[:, 0]
-        sharp, small = (
-            segmenter.segment(seen.frames[:, None], self.names).masks[:, :, 0]
-            for seen in (source, start)
-        )
-        return _FoundObjects(
-            names=self.names,
-            frames=start.frames,
-            masks=small,
-            poses=poses,
-            tracked=model.find(sharp, source.cameras, list(poses)),
+            poses,
         )
 
     def _camera_poses(self, positions: FloatArray) -> FloatArray:
@@ -479,40 +437,40 @@ class _RolloutState:
     observation: Observation
     history: History
     source: Observation
-    objects: _FoundObjects | None = None
+    objects: FoundObjects | None = None
     memory: RolloutMemory | None = None
     num_imagined: int = 0
 
     def after(
-        self, frames: ByteArray, end: Observation, memory: RolloutMemory, num_history: int
+        self,
+        frames: ByteArray,
+        positions: FloatArray,
+        stamp_ns: int,
+        num_history: int,
+        memory: RolloutMemory,
+        objects: FoundObjects | None = None,
     ) -> _RolloutState:
-        """Returns the state at the last of the frames (V, T, H, W, 3), which is also in `end`."""
-        return replace(
-            self,
-            observation=end,
-            history=self.history.after(self.observation.frames, frames, num_history),
+        """Returns the state at the last of the frames (V, T, H, W, 3).
+
+        Args:
+            frames: (V, T, H, W, 3) uint8 RGB after `observation`.
+            positions: (J,) commanded at the last one [rad or m].
+            stamp_ns: of the last one [ns].
+            num_history: most frames to keep before it.
+            memory: what the estimate remembers then.
+            objects: where the objects are then.
+        """
+        start = self.observation
+        return _RolloutState(
+            observation=replace(
+                start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
+            ),
+            history=self.history.after(start.frames, frames, num_history),
+            source=self.source,
+            objects=objects,
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
         )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _FoundObjects:
-    """The named objects as the last real frame shows them, and where they are now.
-
-    Attributes:
-        names: O of them.
-        frames: (V, H, W, 3) that frame, at the model's size.
-        masks: (V, O, H, W) in it.
-        poses: (V, 4, 4) T_base_camera then.
-        tracked: where they are now.
-    """
-
-    names: tuple[str, ...]
-    frames: ByteArray
-    masks: BoolArray
-    poses: FloatArray
-    tracked: TrackedObjects
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

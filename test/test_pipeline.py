@@ -279,6 +279,47 @@ def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
     assert chunk.imagined_seconds == pytest.approx(1.6)  # since the last real frame
 
 
+class DriftingObjects:
+    """Objects that move by 1 cm along x at every step."""
+
+    step_s = 0.1
+
+    def __init__(self, log: list[int], num_steps: int = 0) -> None:
+        self._log, self._num_steps = log, num_steps
+
+    def find(self, masks, cameras, poses):
+        assert masks.shape[:2] == (len(cameras), 2) and len(poses) == len(cameras)
+        self._log.append(0)
+        return self
+
+    def advance(self, positions):
+        count = len(positions) - 1
+        points = np.zeros((count + 1, 2, 3))
+        points[..., 0] = 0.01 * (self._num_steps + np.arange(count + 1))[:, None]
+        turns = np.broadcast_to(np.eye(3), (count + 1, 2, 3, 3))
+        motion = ObjectMotion(reference=np.zeros((2, 3)), points=points, rotations=turns)
+        self._log.append(self._num_steps + count)
+        return motion, DriftingObjects(self._log, self._num_steps + count)
+
+
+def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
+    recording: Recording, world_model: CountingWorldModel
+) -> None:
+    log: list[int] = []
+    pipeline = replace(
+        assemble({**CARD, 'rendering': {'object_motion': True}}, world_model),
+        object_motion=DriftingObjects(log),
+    )
+    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    list(episode.extend(commands(recording, 3.2)))
+    assert log == [0, 16, 32]  # found once; two chunks of 1.6 s in steps of 0.1 s
+    first, second = world_model.trajectories
+    assert not np.array_equal(first[:, -1], second[:, -1])
+    episode.observe(recording.frames[:, 17:25], recording.positions[16:25])
+    list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
+    assert log == [0, 16, 32, 0, 16]
+
+
 def test_control_frame_zero_shows_the_observed_state(
     pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
 ) -> None:

@@ -6,7 +6,8 @@ V views, O objects, T frames, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -47,12 +48,78 @@ class ObjectMotion:
         )
 
 
+class TrackedObjects(Protocol):
+    """Objects on their way; what one chunk hands to the next."""
+
+    step_s: float
+
+    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
+        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
+
+        Row 0 is where they are now.
+        """
+        ...
+
+
+class ObjectMotionModel(Protocol):
+    """Says where objects go under commanded joints."""
+
+    def find(
+        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+    ) -> TrackedObjects:
+        """Returns the objects of masks (V, O, H, W), seen by cameras at T_base_camera (4, 4)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundObjects:
+    """The named objects as the last real frame shows them, and where they are now.
+
+    Attributes:
+        names: O of them.
+        frames: (V, H, W, 3) that frame, at the model's size.
+        masks: (V, O, H, W) in it.
+        poses: (V, 4, 4) T_base_camera then.
+        tracked: where they are now.
+    """
+
+    names: tuple[str, ...]
+    frames: ByteArray
+    masks: BoolArray
+    poses: FloatArray
+    tracked: TrackedObjects
+
+    def move(
+        self,
+        positions: FloatArray,
+        times: FloatArray,
+        cameras: Sequence[CameraModel],
+        poses: FloatArray,
+    ) -> tuple[ByteArray, FoundObjects]:
+        """Moves the objects as the robot moves.
+
+        Args:
+            positions: (N, J), `tracked.step_s` apart [rad or m]; row 0 where the robot is now.
+            times: (T,) at which they are shown, from row 0 on [s].
+            cameras: V cameras at the masks' size.
+            poses: (V, T, 4, 4) T_base_camera at these times.
+
+        Returns:
+            Their pictures (V, T, H, W, 4), and the objects after the last row.
+        """
+        motion, tracked = self.tracked.advance(positions)
+        rows = np.rint(times / self.tracked.step_s).astype(int)
+        shown = motion[np.minimum(rows, len(motion.points) - 1)]
+        pictures = moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)
+        return pictures, replace(self, tracked=tracked)
+
+
 def moved_pictures(
     frames: ByteArray,
     masks: BoolArray,
     motion: ObjectMotion,
     cameras: Sequence[CameraModel],
-    reference_poses: Sequence[FloatArray],
+    reference_poses: Sequence[FloatArray] | FloatArray,
     poses: FloatArray,
 ) -> ByteArray:
     """Returns the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
@@ -118,7 +185,8 @@ def _warped(
     cos, sin = zoom * np.cos(turn), zoom * np.sin(turn)
     linear = np.array([[cos, -sin], [sin, cos]])
     affine = np.column_stack([linear, after - linear @ before])
-    return cv2.warpAffine(picture, affine, picture.shape[1::-1], flags=cv2.INTER_LINEAR)
+    size = picture.shape[1::-1]
+    return cv2.warpAffine(picture, affine, size, flags=cv2.INTER_LINEAR).astype(np.uint8)
 
 
 def _turns(rotations: FloatArray, poses: FloatArray) -> FloatArray:
