@@ -42,7 +42,7 @@ def test_help_does_not_load_the_model(tmp_path: Path) -> None:
     ('arguments', 'message'),
     [
         (['train', 'nowhere', '--out', 'run'], 'holds no episodes'),
-        (['train', '.', '--out', 'run', '--preset', 'smal'], "config/models/smal.yaml"),
+        (['train', '.', '--out', 'run', '--preset', 'smal'], "did you mean 'small'"),
         (['train', '.', '--out', 'run', '--set', 'optimizer.step=3'], "did you mean 'steps'"),
         (['train', '.', '--out', 'run', '--dtype', 'int8'], "dtype 'int8' is not one of"),
         (['evaluate', 'nowhere', '.', '--out', 'x'], 'is not a checkpoint'),
