@@ -49,33 +49,37 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _distill(arguments: argparse.Namespace) -> int:
     import os
 
-    import torch
-
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.training.config import load_training_config
+
+    teacher = checkpoint_path(arguments.checkpoint)
+    robot = load_robot(robot_path(read_card(teacher)['robot']))
+    overrides = {**_DEFAULTS, **set_overrides(arguments.overrides)}
+    config = load_training_config(arguments.preset, overrides)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    # importing torch takes seconds: what is often mistyped is checked before
+    import torch
+
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.training.config import load_training_config
     from mtv_world_ros.training.distill import distill, DistillConfig
 
     settings = DistillConfig(
         num_steps=arguments.steps, teacher_steps=arguments.teacher_steps or 8 * arguments.steps
     )
-    teacher = checkpoint_path(arguments.checkpoint)
-    overrides = {**_DEFAULTS, **set_overrides(arguments.overrides)}
     torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
-    paths = select(arguments.dataset, arguments.split, default='train').paths
     refuse_test_kinds(paths, 'training')
     folder = distill(
         teacher,
         paths,
         arguments.out,
-        load_training_config(arguments.preset, overrides),
+        config,
         settings,
-        robot=load_robot(robot_path(read_card(teacher)['robot'])),
+        robot=robot,
         segmenter=assemble_segmenter(device=arguments.device),
         seed=arguments.seed,
         device=arguments.device,

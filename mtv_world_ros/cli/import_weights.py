@@ -40,11 +40,12 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _import_weights(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.model.wan_import.import_weights import import_weights
     from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
     # public weights never saw a history: they take one once they are trained with it
     config = load_training_config(arguments.preset).replace(history=HistoryConfig())
+    from mtv_world_ros.model.wan_import.import_weights import import_weights
+
     text = {
         'prompt': arguments.prompt,
         'negative_prompt': arguments.negative_prompt,

@@ -15,6 +15,7 @@ from mtv_world_ros.cli.options import (
     add_task,
     pipeline_of,
 )
+from mtv_world_ros.errors import EpisodeError
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -42,6 +43,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _replay(arguments: argparse.Namespace) -> int:
     if not arguments.offline:
         return _play(arguments)
+    if not arguments.episode.exists():
+        raise EpisodeError(f"there is no episode '{arguments.episode}'")
     from mtv_world_ros.replay.offline import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'

@@ -93,30 +93,32 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _train(arguments: argparse.Namespace) -> int:
     import os
 
-    import torch
-
-    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.runtime import choose_dtype
-    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.config import load_training_config
-    from mtv_world_ros.training.run import train
 
     config = load_training_config(arguments.preset, _overrides(arguments))
-    dtype = choose_dtype(arguments.dtype, arguments.device)
     if arguments.dry_run:
-        return _dry_run(config, dtype)
+        return _dry_run(config, arguments)
     if arguments.dataset is None or arguments.out is None:
         raise ConfigError(
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    # importing torch takes seconds: what is often mistyped is checked before
+    import torch
+
+    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.training.run import train
+
+    dtype = choose_dtype(arguments.dtype, arguments.device)
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(1, len(os.sched_getaffinity(0)) // processes)
     torch.set_num_threads(arguments.threads or cores)
-    paths = select(arguments.dataset, arguments.split, default='train').paths
     refuse_test_kinds(paths, 'training')
     folder = train(
         config,
@@ -179,12 +181,14 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
     return overrides
 
 
-def _dry_run(config: TrainingConfig, dtype: torch.dtype) -> int:
+def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.actions import action_names
+    from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.training.dry_run import step_cost
 
+    dtype = choose_dtype(arguments.dtype, arguments.device)
     video = config.video
     robot = load_robot(robot_path(video.robot))
     cost = step_cost(config, action_dim=len(action_names(video.control, robot)), dtype=dtype)
