@@ -20,6 +20,7 @@ from mtv_world_ros.cli.options import (
 
 if TYPE_CHECKING:
     from mtv_world_ros.ranking.jobs import Job
+    from mtv_world_ros.ranking.rank import Checkpoint
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -54,6 +55,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episodes', type=int, default=10, help='of each task')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument(
+        '--compare',
+        metavar='CHECKPOINT',
+        help='a second checkpoint beside the first; every rollout is simulated once. Its own '
+        'ranking goes to DIR/compared',
+    )
     parser.add_argument('--workers', type=int, default=1, help='processes')
     parser.add_argument(
         '--ray',
@@ -79,7 +86,6 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.ranking.optimism import Optimism
     from mtv_world_ros.ranking.rank import FOLDER, run_jobs
@@ -89,34 +95,57 @@ def _rank(arguments: argparse.Namespace) -> int:
 
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
-    make_pipeline = partial(
-        load_pipeline,
-        arguments.checkpoint,
-        num_threads=threads_of_workers(arguments),
-        **pipeline_choices(arguments),
-    )
-    settings = _settings(arguments)
-    results, failed = run_jobs(
+    names = [arguments.checkpoint, *([arguments.compare] if arguments.compare else [])]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--compare is '{arguments.compare}', as --checkpoint; give another one")
+    folders = [arguments.out, arguments.out / 'compared'][: len(names)]
+    checkpoints = [
+        _checkpoint(arguments, name, out) for name, out in zip(names, folders, strict=True)
+    ]
+    found, failed = run_jobs(
         _jobs(arguments),
-        make_pipeline,
-        arguments.out,
+        checkpoints,
         config=RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks),
-        settings=settings,
         workers=arguments.workers,
         ray_address=arguments.ray,
     )
-    summary = Summary(
-        results=results,
-        failed=failed,
-        num_true=arguments.true_episodes,
-        provenance={**provenance(arguments), 'checkpoint': settings['checkpoint']},
-        optimism={
-            str(arguments.checkpoint): Optimism.of(results, arguments.out / FOLDER, arguments.seed)
-        },
-    )
-    path = write_ranking(summary, arguments.out)
-    print(f'{console(summary)}\n\nreport: {path}')
+    optimism = {
+        name: Optimism.of(results, out / FOLDER, arguments.seed)
+        for name, out, results in zip(names, folders, found, strict=True)
+    }
+    summaries = [
+        Summary(
+            results=results,
+            failed=failed,
+            num_true=arguments.true_episodes,
+            provenance={
+                **provenance(arguments),
+                'checkpoint': checkpoint.settings['checkpoint'],
+            },
+            # the first report has all checkpoints side by side
+            optimism=optimism if number == 0 else {names[number]: optimism[names[number]]},
+        )
+        for number, (results, checkpoint) in enumerate(zip(found, checkpoints, strict=True))
+    ]
+    path, *_ = [
+        write_ranking(summary, out) for summary, out in zip(summaries, folders, strict=True)
+    ]
+    print(f'{console(summaries[0])}\n\nreport: {path}')
     return 0
+
+
+def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoint:
+    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.ranking.rank import Checkpoint
+
+    make_pipeline = partial(
+        load_pipeline,
+        name,
+        num_threads=threads_of_workers(arguments),
+        **pipeline_choices(arguments),
+    )
+    settings = _settings(arguments, name)
+    return Checkpoint(make_pipeline=make_pipeline, out=out, settings=settings)
 
 
 def _jobs(arguments: argparse.Namespace) -> list[Job]:
@@ -146,13 +175,13 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     return jobs
 
 
-def _settings(arguments: argparse.Namespace) -> dict[str, str]:
+def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
     """What rollouts depend on: those of other settings are run again."""
     from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.files import share_path
 
     return {
-        'checkpoint': fingerprint(arguments.checkpoint),
+        'checkpoint': fingerprint(name),
         'task files': fingerprint(share_path('config', 'tasks')).split()[-1],
         'robot': arguments.robot or '',
         'segmenter': arguments.segmenter,

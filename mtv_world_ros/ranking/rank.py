@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 import json
 import os
@@ -17,64 +18,100 @@ from mtv_world_ros.files import plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.jobs import Job, Result
-from mtv_world_ros.ranking.runner import make_runner, RolloutConfig
+from mtv_world_ros.ranking.runner import make_runner, RolloutConfig, WantedJob
 
 FOLDER = 'rollouts'
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checkpoint:
+    """A checkpoint that imagines the rollouts.
+
+    Attributes:
+        make_pipeline: called once in every process; has to be picklable for more than one.
+        out: results go into its folder `rollouts`.
+        settings: what the results depend on, e.g. which checkpoint.
+    """
+
+    make_pipeline: Callable[[], Pipeline]
+    out: Path
+    settings: Mapping[str, Any]
+
+
 def run_jobs(
     jobs: Sequence[Job],
-    make_pipeline: Callable[[], Pipeline],
-    out: Path,
+    checkpoints: Sequence[Checkpoint],
     *,
     config: RolloutConfig,
-    settings: Mapping[str, Any],
     workers: int = 1,
     ray_address: str | None = None,
     show_progress: bool = True,
-) -> tuple[list[Result], dict[str, str]]:
-    """Returns the results in the order of the jobs, and why others have none, by job.
+) -> tuple[list[list[Result]], dict[str, str]]:
+    """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
 
     Each result is written beside its name and renamed, and its last frames as a PNG, real ones
     over imagined ones; jobs that are there already with the same settings are not run again.
 
     Args:
-        jobs: what to run.
-        make_pipeline: called once in every process; has to be picklable for more than one.
-        out: results go into its folder `rollouts`.
+        jobs: what to run; each is simulated once for all checkpoints.
+        checkpoints: one or more.
         config: how episodes are run.
-        settings: what the results depend on besides, e.g. which checkpoint.
         workers: processes; with Ray, at most so many at once.
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
         show_progress: draw a progress bar.
 
     Raises:
-        ConfigError: less than one worker, or Ray is not installed.
+        ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
+            differ.
         MtvWorldError: a worker died, or no job has a result.
     """
-    kept = {**settings, 'steps': config.num_inference_steps, 'max_chunks': config.max_chunks}
-    found = {job: stored for job in jobs if (stored := _stored(out, job, kept)) is not None}
-    left = [job for job in jobs if job not in found]
+    stores = [_Store(checkpoint, config, jobs) for checkpoint in checkpoints]
+    wanted = {job: tuple(k for k, s in enumerate(stores) if job not in s.found) for job in jobs}
+    left = [WantedJob(job, numbers) for job, numbers in wanted.items() if numbers]
     failed: dict[str, str] = {}
-    outcomes = _scored(left, partial(make_runner, make_pipeline, config), workers, ray_address)
+    make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
+    outcomes = _scored(left, make, workers, ray_address)
     bar = tqdm(outcomes, total=len(left), unit='rollout', disable=not show_progress)
-    for job, outcome in bar:
+    for done, outcome in bar:
         if isinstance(outcome, str):
-            failed[job.name] = outcome
+            failed[done.job.name] = outcome
             continue
-        picture = base64.b64decode(outcome.pop('last_frames', ''))
-        if picture:
-            write_whole(_path(out, job).with_suffix('.png'), picture)
-        write_json(_path(out, job), {'settings': kept, 'result': outcome})
-        found[job] = Result.from_json(outcome)
-    if jobs and not found:
+        for number, result in outcome.items():
+            stores[int(number)].add(done.job, result)
+    if jobs and not all(store.found for store in stores):
         raise MtvWorldError(f'no rollout has a result; the first: {next(iter(failed.items()))}')
-    return [found[job] for job in jobs if job in found], failed
+    return [[store.found[job] for job in jobs if job in store.found] for store in stores], failed
+
+
+class _Store:
+    """The results of a checkpoint on disk.
+
+    Attributes:
+        found: results by job.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, config: RolloutConfig, jobs: Sequence[Job]) -> None:
+        self._out = checkpoint.out
+        self._settings = {
+            **checkpoint.settings,
+            'steps': config.num_inference_steps,
+            'max_chunks': config.max_chunks,
+        }
+        stored = {job: _stored(self._out, job, self._settings) for job in jobs}
+        self.found = {job: result for job, result in stored.items() if result is not None}
+
+    def add(self, job: Job, values: dict[str, Any]) -> None:
+        """Writes a result."""
+        path, picture = _path(self._out, job), base64.b64decode(values.pop('last_frames', ''))
+        if picture:
+            write_whole(path.with_suffix('.png'), picture)
+        write_json(path, {'settings': self._settings, 'result': values})
+        self.found[job] = Result.from_json(values)
 
 
 def _scored(
-    jobs: Sequence[Job], make: Callable[[], Any], workers: int, ray_address: str | None
-) -> Iterator[tuple[Job, Outcome]]:
+    jobs: Sequence[WantedJob], make: Callable[[], Any], workers: int, ray_address: str | None
+) -> Iterator[tuple[WantedJob, Outcome]]:
     if ray_address is not None:
         from mtv_world_ros.parallel import score_with_ray
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import nan
 import time
+from typing import Any
 
 import numpy as np
 
@@ -76,33 +77,49 @@ class RolloutRunner:
             PolicyError: the policy cannot answer.
             MtvWorldError: the episode cannot be simulated or imagined.
         """
+        return self.imagine(job, self.simulate(job))
+
+    def simulate(self, job: Job) -> SimulatedRollout:
+        """Returns what a policy reached in the simulator."""
         policy = self._make_policy(job.policy, job.task, job.seed, self._expert)
         world = SimulatedWorld(self._sim, self.pipeline.spec.fps, job.seed, job.task)
-        real = self._run(policy, world, world.instruction, job)
+        run = self._run(policy, world, world.instruction, job)
         ever, final = world.outcome()
+        return SimulatedRollout(
+            policy=policy,
+            world=world,
+            instruction=world.instruction,
+            run=run,
+            ever=ever,
+            final=final,
+        )
+
+    def imagine(self, job: Job, real: SimulatedRollout) -> Result:
+        """Returns what a policy reached, of a rollout that was simulated already."""
+        world = real.world
         begun = time.perf_counter()
-        observed = self._begin(world, job)
+        observed = self._begin(real, job)
         seen = judge(observed, world.chunks)
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
-        imagined = ImaginedWorld(self._begin(world, job))
-        run = self._run(policy, imagined, world.instruction, job)
+        imagined = ImaginedWorld(self._begin(real, job))
+        run = self._run(real.policy, imagined, real.instruction, job)
         imagining_s = time.perf_counter() - begun
         return Result(
             policy=job.policy,
             task=job.task,
             index=job.index,
             seed=job.seed,
-            ever=ever,
-            final=final,
+            ever=real.ever,
+            final=real.final,
             imagined=Judged.of(imagined.success),
             seen=Judged.of(seen),
-            no_picture=_judge_without_pictures(self._begin(world, job), world),
-            num_chunks=real.num_chunks,
+            no_picture=_judge_without_pictures(self._begin(real, job), world),
+            num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
-            is_over=real.is_over and run.is_over,
+            is_over=real.run.is_over and run.is_over,
             seconds={
-                'policy': real.policy_s,
+                'policy': real.run.policy_s,
                 'physics': world.physics_s,
                 'rendering': world.rendering_s,
                 'judging the simulated frames': judging_s,
@@ -113,11 +130,11 @@ class RolloutRunner:
             ).decode(),
         )
 
-    def _begin(self, simulated: SimulatedWorld, job: Job) -> ImaginedEpisode:
+    def _begin(self, real: SimulatedRollout, job: Job) -> ImaginedEpisode:
         """An episode that begins with the simulator's first observation."""
         return self.pipeline.begin(
-            simulated.start,
-            instruction=simulated.instruction,
+            real.world.start,
+            instruction=real.instruction,
             seed=job.seed,
             num_inference_steps=self.config.num_inference_steps,
         )
@@ -133,6 +150,73 @@ class RolloutRunner:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedRollout:
+    """A rollout in the simulator.
+
+    Attributes:
+        policy: that acted.
+        world: what was seen and commanded.
+        instruction: what the robot was told.
+        run: how the episode went.
+        ever: the task was done at some time.
+        final: it was done at the end.
+    """
+
+    policy: Policy
+    world: SimulatedWorld
+    instruction: str
+    run: PolicyRun
+    ever: bool
+    final: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """What one job reached, by checkpoint; None = it was not asked for."""
+
+    by_checkpoint: tuple[Result | None, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values by number of the checkpoint."""
+        return {str(k): r.as_json() for k, r in enumerate(self.by_checkpoint) if r is not None}
+
+
+class ComparisonRunner:
+    """Runs jobs in the imagination of several checkpoints; each is simulated once.
+
+    Args:
+        runners: one a checkpoint; their models have one frame rate.
+    """
+
+    def __init__(self, runners: Sequence[RolloutRunner]) -> None:
+        self._runners = runners
+        rates = {runner.pipeline.spec.fps for runner in runners}
+        if len(rates) > 1:
+            raise ConfigError(
+                f'the checkpoints have the frame rates {sorted(rates)} Hz; only those of one rate '
+                'can share simulated rollouts: rank them one after the other'
+            )
+
+    def score(self, wanted: WantedJob) -> Results:
+        """Returns what a policy reached, as the checkpoints imagine it that are asked for."""
+        job, real = wanted.job, self._runners[0].simulate(wanted.job)
+        return Results(
+            tuple(
+                runner.imagine(job, real) if number in wanted.checkpoints else None
+                for number, runner in enumerate(self._runners)
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class WantedJob:
+    """A job, and the numbers of the checkpoints that are to imagine it."""
+
+    job: Job
+    checkpoints: tuple[int, ...]
+
+
 def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> Judged:
     commands = np.concatenate([simulated.start.positions[None], *simulated.commands])
     try:
@@ -142,6 +226,8 @@ def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld)
     return Judged.stated(float(success), 'the no-picture rule')
 
 
-def make_runner(make_pipeline: Callable[[], Pipeline], config: RolloutConfig) -> RolloutRunner:
+def make_runner(
+    make_pipelines: Sequence[Callable[[], Pipeline]], config: RolloutConfig
+) -> ComparisonRunner:
     """Returns a runner of scripted policies; picklable with `functools.partial`."""
-    return RolloutRunner(make_pipeline(), config)
+    return ComparisonRunner([RolloutRunner(make(), config) for make in make_pipelines])

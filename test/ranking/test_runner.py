@@ -3,8 +3,8 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.ranking.jobs import make_jobs
-from mtv_world_ros.ranking.rank import run_jobs
-from mtv_world_ros.ranking.runner import RolloutConfig
+from mtv_world_ros.ranking.rank import Checkpoint, run_jobs
+from mtv_world_ros.ranking.runner import ComparisonRunner, Results, RolloutConfig, WantedJob
 
 TASK = 'place_block_a2b_left'
 
@@ -31,38 +31,58 @@ def test_a_perfect_imagination_is_judged_like_the_simulator_s_own_frames(results
     assert stopped.success == 0.0 or np.isnan(stopped.probability)
 
 
+def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, monkeypatch):
+    simulated = []
+    simulate = runner.simulate
+    monkeypatch.setattr(runner, 'simulate', lambda job: simulated.append(job) or simulate(job))
+    (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
+    both = ComparisonRunner([runner, runner])
+    first, none = both.score(WantedJob(job, (0,))).by_checkpoint
+    assert len(simulated) == 1 and none is None
+    assert first.seen.probability == results['expert-stop-0.3'].seen.probability
+    assert both.score(WantedJob(job, (1,))).as_json().keys() == {'1'}
+
+
 def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_result):
     """A second run takes what is there; other settings or a broken file are run again."""
     jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
     scored = []
 
     class Counting:
-        def score(self, job):
-            scored.append(job.index)
-            return make_result(job.policy, job.index, True, np.nan, job.task, seed=job.seed)
+        def score(self, wanted):
+            job = wanted.job
+            scored.append((job.index, *wanted.checkpoints))
+            result = make_result(job.policy, job.index, True, np.nan, job.task, seed=job.seed)
+            return Results(tuple(result if k in wanted.checkpoints else None for k in (0, 1)))
 
     monkeypatch.setattr(
         'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Counting()
     )
 
-    def run(**settings):
-        found, failed = run_jobs(
-            jobs, lambda: None, tmp_path, config=RolloutConfig(), settings=settings,
-            show_progress=False,
-        )  # fmt: skip
-        assert not failed
-        return found
+    def run(*names):
+        checkpoints = [
+            Checkpoint(
+                make_pipeline=lambda: None, out=tmp_path / str(k), settings={'checkpoint': name}
+            )
+            for k, name in enumerate(names)
+        ]
+        found, failed = run_jobs(jobs, checkpoints, config=RolloutConfig(), show_progress=False)
+        assert not failed and len(found) == len(names)
+        return found[0]
 
-    first = run(checkpoint='a')
-    assert scored == [0, 1] and [result.index for result in first] == [0, 1]
-    again = run(checkpoint='a')
-    assert scored == [0, 1]
+    first = run('a')
+    assert scored == [(0, 0), (1, 0)] and [result.index for result in first] == [0, 1]
+    again = run('a')
+    assert len(scored) == 2
     np.testing.assert_equal(again[0].as_json()['seen'], first[0].as_json()['seen'])
-    (tmp_path / 'rollouts' / f'{jobs[1].name}.json').write_text('{"settings"')
-    run(checkpoint='a')
-    assert scored == [0, 1, 1]
-    run(checkpoint='b')
-    assert scored == [0, 1, 1, 0, 1]
+    (tmp_path / '0' / 'rollouts' / f'{jobs[1].name}.json').write_text('{"settings"')
+    run('a')
+    assert scored[2:] == [(1, 0)]
+    run('b')
+    assert scored[3:] == [(0, 0), (1, 0)]
+    # a second checkpoint is imagined alone where the first one's results are there
+    run('b', 'c')
+    assert scored[5:] == [(0, 1), (1, 1)]
     assert not list(tmp_path.rglob('*.part'))
 
 
@@ -70,19 +90,18 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
     expert, tmp_path, monkeypatch, make_result
 ):
     class Failing:
-        def score(self, job):
-            if job.index == 0:
+        def score(self, wanted):
+            if wanted.job.index == 0:
                 raise PolicyError('its server is gone')
-            return make_result('expert', 1, True, 0.9, seed=job.seed)
+            return Results((make_result('expert', 1, True, 0.9, seed=wanted.job.seed),))
 
     monkeypatch.setattr(
         'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Failing()
     )
     jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
-    found, failed = run_jobs(
-        jobs, lambda: None, tmp_path, config=RolloutConfig(), settings={}, show_progress=False
-    )
-    assert [result.index for result in found] == [1]
+    alone = Checkpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
+    found, failed = run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False)
+    assert [result.index for result in found[0]] == [1]
     assert failed == {jobs[0].name: 'its server is gone'}
 
 
