@@ -94,7 +94,7 @@ def collect(
     if kinds and (config.policies or config.moved_share or config.siblings):
         raise SimulatorError(
             'a zero-shot set is acted by the expert and brings its own cameras; leave '
-            '--policies, --siblings and --moved-cameras out, or --zero-shot'
+            '--policies and --moved-cameras out, --siblings too, or --zero-shot'
         )
     load_mujoco()
     if kinds:
