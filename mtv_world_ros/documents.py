@@ -35,11 +35,17 @@ class Table:
     caption: str = ''
     num_labels: int = 1
 
-    def markdown(self) -> str:
-        """Returns the table without its caption; columns are as wide as their widest cell."""
+    def markdown(self, *, aligned: bool = True) -> str:
+        """Returns the table without its caption.
+
+        Args:
+            aligned: columns as wide as their widest cell, for those who read it as text.
+        """
         lines = [[str(cell) for cell in row] for row in (self.head, *self.rows)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        lines.insert(1, ['-' * width for width in widths])
+        if not aligned:
+            widths = [0] * len(widths)
+        lines.insert(1, ['-' * (width or 3) for width in widths])
         return '\n'.join(
             '| ' + ' | '.join(c.ljust(n) for c, n in zip(line, widths, strict=True)) + ' |'
             for line in lines

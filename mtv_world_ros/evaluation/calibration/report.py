@@ -126,7 +126,8 @@ def _horizon_text(horizon: HorizonCurve) -> str:
     return (
         f'Mean J of the objects that move, over {horizon.num_episodes} whole episodes; known up '
         f'to {len(horizon.values) * horizon.period_s:.1f} s. By the lower end of the 95 % '
-        'interval, J is at least\n\n' + Table(head=['J', 'up to'], rows=rows).markdown()
+        'interval, J is at least\n\n'
+        + Table(head=['J', 'up to'], rows=rows).markdown(aligned=False)
     )
 
 
