@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import isfinite
 
+from mtv_world_ros.documents import DASH, Table
 from mtv_world_ros.ranking.optimism import JUDGES, MEASURES, Optimism, Score, true_rate
 from mtv_world_ros.sim.expert.faults import FAULTS
 
@@ -23,11 +24,9 @@ REMARK = (
 #: characters in the head of a column
 _NAME_LENGTH = 17
 
-Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
-
 
 def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
-    """Returns caption, head and rows of the tables: overall, then by fault kind.
+    """Returns the tables: overall, then by fault kind.
 
     Args:
         by_model: label of the checkpoint -> its numbers; the first one's stand for the judges
@@ -51,7 +50,7 @@ def _overall(by_model: Mapping[str, Optimism]) -> Table:
     ]
     rate = true_rate(first.rollouts(None))
     caption = f'Optimism: {rate.count} rollouts, of which {rate.value:.0%} really succeed'
-    return caption, ['judged on', *columns], rows
+    return Table(caption=caption, head=['judged on', *columns], rows=rows)
 
 
 def _by_kind(name: str, found: Optimism) -> Table:
@@ -72,7 +71,8 @@ def _by_kind(name: str, found: Optimism) -> Table:
             ]
         )
     head = ['kind', 'n', 'true', 'AUROC/rule', 'false success', 'rule', 'abst', 'flips']
-    return f'{name}, by fault kind (* shows in the path of the arm)', head, rows
+    caption = f'{name}, by fault kind (* shows in the path of the arm)'
+    return Table(caption=caption, head=head, rows=rows)
 
 
 def _short(name: str) -> str:
@@ -82,7 +82,7 @@ def _short(name: str) -> str:
 
 def _cell(score: Score) -> str:
     if not isfinite(score.value):
-        return '–'
+        return DASH
     low, high = score.interval
     interval = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
     return f'{_number(score.value)}{interval} {score.count}'
@@ -91,7 +91,7 @@ def _cell(score: Score) -> str:
 def _number(value: float) -> str:
     """Two decimals without the zero in front, 0 or 1 without any; a dash where there is none."""
     if not isfinite(value):
-        return '–'
+        return DASH
     return {'0.00': '0', '-0.00': '0', '1.00': '1'}.get(
         f'{value:.2f}', f'{value:.2f}'.replace('0.', '.', 1)
     )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
+from markupsafe import Markup
+
+from mtv_world_ros.documents import DASH, render, Table
+from mtv_world_ros.evaluation.metrics.statistics import MIN_SCENES
 from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
-from mtv_world_ros.evaluation.report.html import document
-from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
-from mtv_world_ros.evaluation.report.tables import grid
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.ranking.jobs import THRESHOLD
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
@@ -37,24 +38,10 @@ _INTERVALS = (
 )
 
 
-class Grid(NamedTuple):
-    """A table.
-
-    Attributes:
-        caption: what it shows.
-        head: headings.
-        rows: cells.
-    """
-
-    caption: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-def grids(summary: Summary) -> list[Grid]:
+def tables(summary: Summary) -> list[Table]:
     """Returns the ranking's tables."""
     return [
-        *_optimism(summary),
+        *optimism_tables(summary.optimism),
         _agreement(summary),
         *(_rates(summary, task) for task in (None, *summary.tasks)),
         _powered(summary),
@@ -99,6 +86,11 @@ def _agreement_remark(summary: Summary) -> str:
     if found.num_policies == 2:
         return 'Of two policies r is 1 or -1 whatever they do: it says nothing here.'
     low = found.interval[0]
+    if not isfinite(low):
+        return (
+            f'r has no interval, so nothing follows from it: that takes at least {MIN_SCENES} '
+            'scenes, and more than one value of r among them.'
+        )
     if not low > 0:
         return (
             'The interval of r reaches zero: these episodes do not show that imagination ranks '
@@ -133,21 +125,17 @@ def _abstention_remark(summary: Summary) -> str:
 
 def _rate(rate: Rate) -> str:
     if not rate.count:
-        return f'– ({rate.num_abstained} abstained)' if rate.num_abstained else '–'
+        return f'{DASH} ({rate.num_abstained} abstained)' if rate.num_abstained else DASH
     text = f'{rate.value:.2f} {_interval(rate.interval)} of {rate.count}'
     return f'{text}, {rate.num_abstained} abstained' if rate.num_abstained else text
 
 
 def _interval(interval: tuple[float, float], digits: int = 2) -> str:
     low, high = interval
-    return f'[{low:.{digits}f}, {high:.{digits}f}]' if isfinite(low) else '[not known]'
+    return f'[{low:.{digits}f}, {high:.{digits}f}]' if isfinite(low) else '[n too small]'
 
 
-def _optimism(summary: Summary) -> list[Grid]:
-    return [Grid(*found) for found in optimism_tables(summary.optimism)]
-
-
-def _rates(summary: Summary, task: str | None) -> Grid:
+def _rates(summary: Summary, task: str | None) -> Table:
     rows = [
         [
             policy,
@@ -157,19 +145,20 @@ def _rates(summary: Summary, task: str | None) -> Grid:
         for policy in summary.policies
     ]
     head = ['policy', 'simulator', *JUDGES.values()]
-    return Grid(f'Success rates, {task or ALL_TASKS}', head, rows)
+    return Table(caption=f'Success rates, {task or ALL_TASKS}', head=head, rows=rows)
 
 
-def _agreement(summary: Summary) -> Grid:
+def _agreement(summary: Summary) -> Table:
     rows = []
     for label, task in {ALL_TASKS: None, **{name: name for name in summary.tasks}}.items():
         found = {judge: summary.agreement(judge, task) for judge in JUDGES}
         for judge, scores in found.items():
             rows.append([label, JUDGES[judge], *_scores(scores)])
-    return Grid(
-        'Agreement with the simulator, over the policies',
-        ['task', 'judged on', "Pearson's r", 'MMRV', 'policies'],
-        rows,
+    return Table(
+        caption='Agreement with the simulator, over the policies',
+        head=['task', 'judged on', "Pearson's r", 'MMRV', 'policies'],
+        rows=rows,
+        num_labels=2,
     )
 
 
@@ -181,7 +170,7 @@ def _scores(found: Mapping[str, Agreement]) -> list[str]:
     return [*cells, str(next(iter(found.values())).num_policies)]
 
 
-def _powered(summary: Summary) -> Grid:
+def _powered(summary: Summary) -> Table:
     rows = []
     for policy in summary.policies:
         found, true = summary.powered(policy), summary.true_rate(policy, None)
@@ -194,66 +183,64 @@ def _powered(summary: Summary) -> Grid:
                 f'{true.value:.2f} of {true.count}',
             ]
         )
-    return Grid(
-        f'Prediction-powered success rates: {summary.num_true} true episodes of each task, and '
-        'all imagined ones (the interval is for many true ones; an abstention counts as one half)',
-        ['policy', 'estimate', 'weight of imagination', 'true + imagined', 'all true ones'],
-        rows,
+    return Table(
+        caption=f'Prediction-powered success rates: {summary.num_true} true episodes of each '
+        'task, and all imagined ones (an abstention counts as one half)',
+        head=['policy', 'estimate', 'weight of imagination', 'true + imagined', 'all true ones'],
+        rows=rows,
     )
 
 
-def _confusion(summary: Summary) -> Grid:
+def _confusion(summary: Summary) -> Table:
     rows = []
     for judge, words in JUDGES.items():
         counts = summary.confusion(judge)
         failures = counts['success_failure'] + counts['failure_failure']
-        share = Rate(hits=counts['success_failure'], count=failures)
+        share = counts['success_failure'] / failures if failures else 0.0
+        interval = _interval(summary.false_success_interval(judge))
         rows.append(
             [
                 words,
                 *(str(count) for count in counts.values()),
                 str(summary.abstained(judge).hits),
-                f'{share.value:.2f} {_interval(share.interval)}' if failures else '–',
+                f'{share:.2f} {interval}' if failures else DASH,
             ]
         )
-    return Grid(
-        'Single rollouts: what was said, and what was true',
-        [
+    return Table(
+        caption='Single rollouts: what was said, and what was true',
+        head=[
             'judged on', 'success, true', 'success, false', 'failure, false', 'failure, true',
             'abstained', 'false-success rate',
         ],
-        rows,
+        rows=rows,
     )  # fmt: skip
 
 
-def _speed(summary: Summary) -> Grid:
+def _speed(summary: Summary) -> Table:
     rows = [
         [words, f'{value:.0f}' if 'hour' in words else f'{value:.3f}']
         for words, value in summary.speed().items()
     ]
-    return Grid('Speed of one process, wall time, means over the rollouts', ['', ''], rows)
+    caption = 'Speed of one process, wall time, means over the rollouts'
+    return Table(caption=caption, head=['', ''], rows=rows)
 
 
 def console(summary: Summary) -> str:
     """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
     tables = [
-        *_optimism(summary),
+        *optimism_tables(summary.optimism),
         _agreement(summary),
         _rates(summary, None),
         _powered(summary),
         _speed(summary),
     ]
-    parts = [f'{found.caption}\n\n{grid(found.head, found.rows)}' for found in tables]
+    parts = [f'{found.caption}\n\n{found.markdown()}' for found in tables]
     return '\n\n'.join([*parts, *remarks(summary)[2:]])
 
 
 def markdown(summary: Summary) -> str:
     """Returns the ranking as a page of Markdown."""
-    parts = [f'# {TITLE}', *remarks(summary)]
-    for found in grids(summary):
-        parts += [f'## {found.caption}', grid(found.head, found.rows)]
-    lines = [f'- {heading}: `{value}`' for heading, value in summary.provenance.items()]
-    return '\n\n'.join([*parts, '## How this was made', '\n'.join(lines)]) + '\n'
+    return render('ranking.md.j2', **_content(summary))
 
 
 def write_ranking(summary: Summary, out: Path) -> Path:
@@ -261,66 +248,53 @@ def write_ranking(summary: Summary, out: Path) -> Path:
     write_json(out / 'ranking.json', summary.as_json())
     write_whole(out / 'ranking.md', markdown(summary))
     path = out / 'ranking.html'
-    write_whole(path, document(TITLE, join([element('h1', TITLE), *_sections(summary)])))
-    return path
-
-
-def _sections(summary: Summary) -> list[Markup]:
     charts = [
-        _figure(summary, judge, task)
+        (f'{task or ALL_TASKS}: {JUDGES[judge]}', _chart(summary, judge, task))
         for task in (None, *summary.tasks)
         for judge in JUDGES
         if any(summary.judged_rate(p, task, judge).count for p in summary.policies)
     ]
-    made = [[heading, value] for heading, value in summary.provenance.items()]
-    return [
-        element('section', *(element('p', remark) for remark in remarks(summary))),
-        element(
-            'section',
-            element('h2', 'Imagined against true success'),
-            _key(summary),
-            element('div', *charts, class_='panels'),
-        ),
-        *(
-            element('section', element('h2', found.caption), table(found.head, found.rows))
-            for found in grids(summary)
-        ),
-        element(
-            'section',
-            element('h2', 'How this was made'),
-            table(['', ''], made, num_labels=2) if made else None,
-        ),
-    ]
+    policies = _points(summary, next(iter(JUDGES)), None)
+    write_whole(
+        path, render('ranking.html.j2', **_content(summary), charts=charts, policies=policies)
+    )
+    return path
 
 
-def _figure(summary: Summary, judge: str, task: str | None) -> Markup:
+def _content(summary: Summary) -> dict[str, Any]:
+    """What both pages hold."""
+    return {
+        'title': TITLE,
+        'remarks': remarks(summary),
+        'tables': tables(summary),
+        'made': summary.provenance,
+    }
+
+
+def _chart(summary: Summary, judge: str, task: str | None) -> Markup:
+    return scatter_chart(
+        f'{task or ALL_TASKS}: {JUDGES[judge]}',
+        _points(summary, judge, task),
+        'success rate in the simulator',
+        'judged success rate',
+    )
+
+
+def _points(summary: Summary, judge: str, task: str | None) -> list[Point]:
+    """Policies, numbered from the best one in the simulator on."""
     points = []
-    for number, policy in enumerate(summary.policies, 1):
+    for number, policy in enumerate(summary.policies):
         true = summary.true_rate(policy, task)
         judged = summary.judged_rate(policy, task, judge)
         points.append(
             Point(
-                label=str(number),
+                label=str(number + 1),
                 title=policy,
                 x=true.value,
                 y=judged.value,
                 x_interval=true.interval,
                 y_interval=judged.interval,
-                style=f'c{(number - 1) % _NUM_HUES}',
+                colour=f'c{number % _NUM_HUES}',
             )
         )
-    title = f'{task or ALL_TASKS}: {JUDGES[judge]}'
-    chart = scatter_chart(title, points, 'success rate in the simulator', 'judged success rate')
-    return element('figure', element('h3', title), chart)
-
-
-def _key(summary: Summary) -> Markup:
-    items = [
-        element(
-            'li',
-            element('span', str(number), class_=f'badge c{(number - 1) % _NUM_HUES}'),
-            policy,
-        )
-        for number, policy in enumerate(summary.policies, 1)
-    ]
-    return element('ul', *items, class_='key')
+    return points

@@ -19,7 +19,7 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
     PoweredMean,
     rates,
 )
-from mtv_world_ros.evaluation.metrics.statistics import Interval, wilson
+from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson, Interval, wilson
 from mtv_world_ros.ranking.jobs import Judged, Result
 from mtv_world_ros.ranking.optimism import Optimism
 
@@ -191,6 +191,19 @@ class Summary:
             if isfinite(said):
                 counts[f'{words[bool(said)]}_{words[result.final]}'] += 1
         return counts
+
+    def false_success_interval(self, judge: str) -> Interval:
+        """Returns the interval of the share of real failures that were called a success.
+
+        Policies that meet the same scene are a cluster.
+        """
+        scenes: dict[tuple[str, int], list[float]] = {}
+        for result in self.results:
+            said = judged_by(result, judge).success
+            if isfinite(said) and not result.final:
+                scenes.setdefault((result.task, result.index), []).append(said)
+        hits = [sum(said) for said in scenes.values()]
+        return clustered_wilson(np.array(hits), np.array([len(s) for s in scenes.values()]))
 
     def speed(self) -> dict[str, float]:
         """Returns episodes an hour of one process, and seconds an episode by stage."""

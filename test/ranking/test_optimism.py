@@ -68,13 +68,11 @@ def test_a_kind_is_measured_against_the_expert(optimism):
 
 
 def test_tables_fit_a_console(optimism):
-    from mtv_world_ros.evaluation.report.tables import grid
-
     both = {'/home/somebody/new': optimism, 'bundled': optimism}
     for by_model in ({'bundled': optimism}, both):
         tables = optimism_tables(by_model)
         assert len(tables) == 1 + len(by_model)
-        lines = '\n'.join(grid(head, rows) for _, head, rows in tables).splitlines()
+        lines = '\n'.join(table.markdown() for table in tables).splitlines()
         assert max(map(len, lines)) <= 100
     assert '.67 [.34 .88] 12' in '\n'.join(lines) and 'elsewhere *' in '\n'.join(lines)
     assert optimism_tables({}) == []

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from math import isfinite
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mtv_world_ros.documents import number, render, Table
 from mtv_world_ros.evaluation.calibration.fit import (
     AFTER,
     AFTER_KINDS,
@@ -18,8 +18,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
 )
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
-from mtv_world_ros.evaluation.report.markup import element, Markup
-from mtv_world_ros.files import share_path, write_json, write_whole
+from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.success.calibration import HorizonCurve
 
 _COLUMNS = {
@@ -39,8 +38,6 @@ _ROWS = {
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }
-
-
 _GROUP_COLUMNS = (
     'episodes', 'succeed', 'mean estimate', 'accuracy', 'false-success rate', 'abstained',
 )  # fmt: skip
@@ -59,32 +56,26 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
     """Returns scores before and after, by task, the weights, and the trusted horizon."""
     calibration = found.calibration
     scores = [
-        [words, *(_number(calibration.scores[name].get(key)) for key in _COLUMNS)]
+        [words, *(_text(calibration.scores[name].get(key)) for key in _COLUMNS)]
         for name, words in _ROWS.items()
         if name in calibration.scores
     ]
-    weights = [
-        [name, *(f'{value:.3f}' for value in row)]
-        for name, *row in zip(
-            calibration.features, calibration.weights, calibration.means, calibration.scales,
-            strict=True,
-        )
-    ]  # fmt: skip
-    parts = [
-        '# Calibration of the success estimate',
-        _summary(found),
-        _table(['', *_COLUMNS.values()], scores),
-        '## By task, each left out of the fit that judges it',
-        _table(['task', *_GROUP_COLUMNS], _group_rows(found, AFTER, lambda s: (s.task,))),
-        *_kinds(found),
-        '## Weights',
-        _table(['feature', 'logit per scale', 'mean', 'scale'], weights)
-        + f'\n\nBias {calibration.bias:.3f}.',
-    ]  # fmt: skip
-    if horizon is not None:
-        parts += ['## Trusted horizon', _horizon_text(horizon)]
-    parts += [f'- {key}: `{value}`' for key, value in calibration.made.items()]
-    return '\n\n'.join(parts) + '\n'
+    rows = zip(
+        calibration.features, calibration.weights, calibration.means, calibration.scales,
+        strict=True,
+    )  # fmt: skip
+    weights = [[name, *map(number, row)] for name, *row in rows]
+    return render(
+        'calibration.md.j2',
+        summary=_summary(found),
+        scores=Table(head=['', *_COLUMNS.values()], rows=scores),
+        tasks=_groups(found, AFTER, 'task', lambda sample: (sample.task,)),
+        kinds=_kinds(found),
+        weights=Table(head=['feature', 'logit per scale', 'mean', 'scale'], rows=weights),
+        bias=calibration.bias,
+        horizon='' if horizon is None else _horizon_text(horizon),
+        made=calibration.made,
+    )
 
 
 def _summary(found: Calibrated) -> str:
@@ -99,19 +90,15 @@ def _summary(found: Calibrated) -> str:
     )
 
 
-def _kinds(found: Calibrated) -> list[str]:
+def _kinds(found: Calibrated) -> Table | None:
     if AFTER_KINDS not in found.judgements:
-        return []
-    rows = _group_rows(found, AFTER_KINDS, lambda sample: sample.kinds or ('(no fault)',))
-    return [
-        '## By fault kind, each left out of the fit that judges it',
-        _table(['kind', *_GROUP_COLUMNS], rows),
-    ]
+        return None
+    return _groups(found, AFTER_KINDS, 'kind', lambda sample: sample.kinds or ('(no fault)',))
 
 
-def _group_rows(
-    found: Calibrated, name: str, groups: Callable[[Sample], tuple[str, ...]]
-) -> list[list[str]]:
+def _groups(
+    found: Calibrated, name: str, first: str, groups: Callable[[Sample], tuple[str, ...]]
+) -> Table:
     rows = []
     for group in sorted({group for sample in found.samples for group in groups(sample)}):
         pairs = zip(found.samples, found.judgements[name], strict=True)
@@ -122,13 +109,13 @@ def _group_rows(
                 group,
                 str(len(judged)),
                 str(sum(item.outcome == 'success' for item in judged)),
-                _number(numbers['estimated_success_rate']),
-                _number(numbers['accuracy']),
-                _number(numbers['false_success_rate']),
+                _text(numbers['estimated_success_rate']),
+                _text(numbers['accuracy']),
+                _text(numbers['false_success_rate']),
                 str(numbers['num_abstained']),
             ]
         )
-    return rows
+    return Table(head=[first, *_GROUP_COLUMNS], rows=rows)
 
 
 def _horizon_text(horizon: HorizonCurve) -> str:
@@ -139,27 +126,22 @@ def _horizon_text(horizon: HorizonCurve) -> str:
     return (
         f'Mean J of the objects that move, over {horizon.num_episodes} whole episodes; known up '
         f'to {len(horizon.values) * horizon.period_s:.1f} s. By the lower end of the 95 % '
-        'interval, J is at least\n\n' + _table(['J', 'up to'], rows)
+        'interval, J is at least\n\n'
+        + Table(head=['J', 'up to'], rows=rows).markdown(aligned=False)
     )
 
 
 def reliability_page(found: Calibrated) -> str:
     """Returns a page with two charts that needs no other file."""
-    figures = []
+    charts = []
     for name in (BEFORE, AFTER, AFTER_KINDS):
         if name not in found.judgements:
             continue
         title = f'Share of real successes against the estimate, {_ROWS[name]}'
         chart = reliability_chart(title, reliability_bins(found.judgements[name]), 'c0')
-        figures.append(element('figure', element('figcaption', _ROWS[name]), chart))
-    head = element(
-        'head',
-        element('meta', charset='utf-8'),
-        element('title', 'Reliability of the success estimate'),
-        element('style', Markup(share_path('resource', 'report', 'style.css').read_text('utf-8'))),
-    )
-    body = element('main', element('h1', 'Reliability of the success estimate'), *figures)
-    return f'<!DOCTYPE html>\n{element("html", head, element("body", body), lang="en")}\n'
+        charts.append((_ROWS[name], chart))
+    title = 'Reliability of the success estimate'
+    return render('reliability.html.j2', title=title, charts=charts)
 
 
 def _values(found: Calibrated) -> dict[str, Any]:
@@ -181,12 +163,5 @@ def _values(found: Calibrated) -> dict[str, Any]:
     }
 
 
-def _number(value: float | int | None) -> str:
-    if value is None or not isfinite(value):
-        return '–'
-    return str(value) if isinstance(value, int) else f'{value:.3f}'
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ['---'] * len(head), *rows]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+def _text(value: float | int | None) -> str:
+    return str(value) if isinstance(value, int) else number(value)

@@ -1,16 +1,48 @@
-"""Small charts as inline SVG; their colours are classes of the report's style sheet."""
+"""Charts as inline SVG; their colours are those of the page's style sheet, light or dark."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from math import cos, isfinite, pi, sin
+from html import escape
+from io import StringIO
+from math import isfinite
+import re
+from typing import Any
+
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+import numpy as np
 
 from mtv_world_ros.evaluation.metrics.success_agreement import Bin
-from mtv_world_ros.evaluation.report.markup import element, join, Markup
 
-_WIDTH = 440.0
+#: variables of the style sheet, each drawn in a colour that stands for it and then replaced
+_VARIABLES = ('ink', 'faint', 'rule', 'card', 'held', 'shuffled', *(f'c{k}' for k in range(6)))
+_COLOURS = {name: f'#0000{index + 16:02x}' for index, name in enumerate(_VARIABLES)}
+_STYLE: Any = {
+    'svg.fonttype': 'none',
+    'svg.hashsalt': 'mtv_world_ros',
+    'font.sans-serif': ['DejaVu Sans'],
+    'font.size': 9,
+    'text.color': _COLOURS['ink'],
+    'axes.edgecolor': _COLOURS['rule'],
+    'axes.labelcolor': _COLOURS['faint'],
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.axisbelow': True,
+    'grid.color': _COLOURS['rule'],
+    'grid.linewidth': 0.8,
+    'xtick.color': _COLOURS['faint'],
+    'ytick.color': _COLOURS['faint'],
+    'xtick.major.size': 0,
+    'ytick.major.size': 0,
+}
 _TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
+_WIDTH = 440
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,13 +53,15 @@ class Dot:
         label: on the left.
         value: in [0, 1].
         interval: (low, high).
-        style: class of the style sheet.
+        colour: variable of the style sheet.
+        is_filled: drawn full, not as a ring.
     """
 
     label: str
     value: float
     interval: tuple[float, float]
-    style: str
+    colour: str
+    is_filled: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,16 +69,18 @@ class Line:
     """Values over time, with a band around them where it is known.
 
     Attributes:
-        label: for those who cannot see it.
+        label: shown where the mouse is, and for those who cannot see it.
         values: in [0, 1], one per frame; NaN leaves a gap.
         band: (low, high) per frame; empty = none.
-        style: class of the style sheet.
+        colour: variable of the style sheet.
+        dashes: matplotlib's line style.
     """
 
     label: str
     values: Sequence[float]
     band: Sequence[tuple[float, float]] = ()
-    style: str
+    colour: str
+    dashes: str = '-'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,12 +89,12 @@ class Point:
 
     Attributes:
         label: short, beside the mark.
-        title: for those who point at it or cannot see it.
+        title: shown where the mouse is, and for those who cannot see it.
         x: in [0, 1].
         y: in [0, 1].
         x_interval: (low, high).
         y_interval: (low, high).
-        style: class of the style sheet.
+        colour: variable of the style sheet.
     """
 
     label: str
@@ -67,40 +103,40 @@ class Point:
     y: float
     x_interval: tuple[float, float]
     y_interval: tuple[float, float]
-    style: str
+    colour: str
 
 
 def dot_chart(title: str, dots: Sequence[Dot]) -> Markup:
     """Returns values in [0, 1] with their intervals, one below the other."""
-    left, right, top, row = 92.0, 142.0, 8.0, 28.0
-    height = top + row * len(dots) + 26
+    height = 26 * len(dots) + 30
+    with _axes(_WIDTH, height, left=92, right=142, top=4, bottom=26) as axes:
+        axes.set(xlim=(0, 1), ylim=(len(dots) - 0.5, -0.5), xticks=_TICKS)
+        axes.set_yticks(range(len(dots)), [dot.label for dot in dots])
+        axes.tick_params(axis='y', pad=88, labelcolor=_COLOURS['ink'])
+        for label in axes.get_yticklabels():
+            label.set_horizontalalignment('left')
+        axes.grid(axis='x')
+        axes.spines[['left', 'bottom']].set_visible(False)
+        for row, dot in enumerate(dots):
+            _draw_dot(axes, row, dot)
+        return _svg(axes, title, _WIDTH, height, {})
 
-    def x(value: float) -> float:
-        return left + min(max(value, 0.0), 1.0) * (_WIDTH - left - right)
 
-    bottom = height - 22
-    parts = [_line((x(t), top), (x(t), bottom), 'grid') for t in _TICKS]
-    parts += [_text(f'{t:g}', x(t), height - 6, 'tick', 'middle') for t in _TICKS]
-    for index, dot in enumerate(dots):
-        parts.append(_dot_row(dot, top + row * (index + 0.5), x))
-    return _svg(height, title, parts)
-
-
-def _dot_row(dot: Dot, y: float, x: Callable[[float], float]) -> Markup:
-    label = _text(dot.label, 0.0, y + 4, 'label')
-    if not isfinite(dot.value):
-        return join([label, _text('not measured', _WIDTH, y + 4, 'tick', 'end')])
-    low, high = dot.interval
-    text = f'{dot.value:.3f}'
-    interval = None
-    if isfinite(low) and isfinite(high):
-        text = f'{text} [{low:.3f}, {high:.3f}]'
-        ends = [
-            _line((x(at), y - 5), (x(at), y + 5), f'interval {dot.style}') for at in dot.interval
-        ]
-        interval = join([_line((x(low), y), (x(high), y), f'interval {dot.style}'), *ends])
-    mark = element('circle', cx=x(dot.value), cy=y, r=5.0, class_=f'mark {dot.style}')
-    return join([label, interval, mark, _text(text, _WIDTH, y + 4, 'value', 'end')])
+def _draw_dot(axes: Axes, row: int, dot: Dot) -> None:
+    text = 'not measured'
+    if isfinite(dot.value):
+        text, colour = f'{dot.value:.3f}', _COLOURS[dot.colour]
+        low, high = dot.interval
+        if isfinite(low) and isfinite(high):
+            text = f'{text} [{low:.3f}, {high:.3f}]'
+            axes.plot([low, high], [row, row], '|-', color=colour, markersize=7, lw=1.8)
+        fill = colour if dot.is_filled else _COLOURS['card']
+        axes.plot(
+            dot.value, row, 'o', color=colour, markerfacecolor=fill, clip_on=False,
+            gid=f'dot-{row}', markersize=7,
+        )  # fmt: skip
+    place = axes.get_yaxis_transform()
+    axes.text(1.45, row, text, transform=place, ha='right', va='center')
 
 
 def line_chart(
@@ -114,146 +150,126 @@ def line_chart(
         seconds: time of each frame [s].
         y_label: what the values are.
     """
-    left, top, bottom, height = 34.0, 22.0, 222.0, 262.0
-    longest = max(seconds, default=1.0)
-
-    def place(index: int, value: float) -> tuple[float, float]:
-        share = min(max(value, 0.0), 1.0)
-        x = left + (_WIDTH - left - 8) * seconds[index] / longest
-        return x, bottom - share * (bottom - top)
-
-    parts: list[Markup] = [_text(y_label, 0.0, 10.0, 'tick')]
-    for tick in _TICKS:
-        y = bottom - tick * (bottom - top)
-        parts += [
-            _line((left, y), (_WIDTH - 8, y), 'grid'),
-            _text(f'{tick:g}', 26, y + 4, 'tick', 'end'),
-        ]
-    for tick in _seconds_ticks(longest):
-        x = left + (_WIDTH - left - 8) * tick / longest
-        parts.append(_text(f'{tick:g}', x, bottom + 17, 'tick', 'middle'))
-    parts.append(_text('seconds imagined ahead', _WIDTH - 8, height - 6, 'tick', 'end'))
-    for line in lines:
-        parts += _drawn(line, place)
-    return _svg(height, title, parts)
+    height = 262
+    with _axes(_WIDTH, height, left=34, right=8, top=22, bottom=40) as axes:
+        axes.set(xlim=(0, max(seconds, default=1.0)), ylim=(0, 1), yticks=_TICKS)
+        axes.grid(axis='y')
+        axes.set_title(y_label, loc='left', fontsize=9, color=_COLOURS['faint'], x=-0.08, pad=9)
+        axes.set_xlabel('seconds imagined ahead', loc='right')
+        for index, line in enumerate(lines):
+            colour, times = _COLOURS[line.colour], seconds[: len(line.values)]
+            if len(line.band):
+                low, high = np.array(line.band, np.float64).T
+                axes.fill_between(times, low, high, color=colour, alpha=0.14, lw=0)
+            axes.plot(
+                times, line.values, line.dashes, color=colour, lw=1.9, clip_on=False,
+                gid=f'line-{index}', marker='o' if len(times) == 1 else '',
+            )  # fmt: skip
+        titles = {f'line-{index}': line.label for index, line in enumerate(lines)}
+        return _svg(axes, title, _WIDTH, height, titles)
 
 
-def _drawn(line: Line, place: Callable[[int, float], tuple[float, float]]) -> list[Markup]:
-    parts = []
-    known = [i for i, (low, high) in enumerate(line.band) if isfinite(low) and isfinite(high)]
-    if known:
-        around = [place(i, line.band[i][1]) for i in known]
-        around += [place(i, line.band[i][0]) for i in reversed(known)]
-        points = ' '.join(f'{x:.1f},{y:.1f}' for x, y in around)
-        parts.append(element('polygon', points=points, class_=f'band {line.style}'))
-    path, pen_is_down = [], False
-    for index, value in enumerate(line.values):
-        if isfinite(value):
-            x, y = place(index, value)
-            path.append(f'{"L" if pen_is_down else "M"}{x:.1f} {y:.1f}')
-        pen_is_down = isfinite(value)
-    title = element('title', line.label)
-    parts.append(element('path', title, d=''.join(path), class_=f'line {line.style}'))
-    return parts
-
-
-def _seconds_ticks(longest: float) -> list[float]:
-    steps = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0, 120.0)
-    step = next((s for s in steps if longest / s <= 7), 300.0)
-    return [step * k for k in range(int(longest / step + 1e-6) + 1)]
-
-
-def reliability_chart(title: str, bins: Sequence[Bin], style: str) -> Markup:
-    """Returns how often it came true against what was said; the diagonal is honest."""
-    left, top, size, height = 34.0, 22.0, 200.0, 276.0
-
-    def x(value: float) -> float:
-        return left + value * size
-
-    def y(value: float) -> float:
-        return top + (1 - value) * size
-
-    parts: list[Markup] = [_text('share that really succeeded', 0.0, 10.0, 'tick')]
-    for tick in _TICKS:
-        parts += [
-            _line((x(0), y(tick)), (x(1), y(tick)), 'grid'),
-            _text(f'{tick:g}', 26.0, y(tick) + 4, 'tick', 'end'),
-            _text(f'{tick:g}', x(tick), top + size + 17, 'tick', 'middle'),
-        ]
-    parts.append(_line((x(0), y(0)), (x(1), y(1)), 'honest'))
-    parts.append(_text('estimated probability of success', x(1), height - 6, 'tick', 'end'))
-    for found in bins:
-        low, high = found.interval
-        ends = (x(found.said), y(low)), (x(found.said), y(high))
-        parts.append(_line(*ends, f'interval {style}'))
-        at = (x(found.said), y(found.came_true))
-        parts.append(element('circle', cx=at[0], cy=at[1], r=5.0, class_=f'mark {style}'))
-        parts.append(_text(f'n={found.count}', x(found.middle), top + size + 31, 'tick', 'middle'))
-    return _svg(height, title, parts, width=left + size + 44)
+def reliability_chart(title: str, bins: Sequence[Bin], colour: str) -> Markup:
+    """Returns how often estimates came true; calibrated ones lie on the diagonal."""
+    width, height, drawn = 290, 300, _COLOURS[colour]
+    with _axes(width, height, left=40, right=10, top=22, bottom=60) as axes:
+        _square(axes, 'estimated probability of success', 'share that really succeeded')
+        axes.xaxis.labelpad = 20
+        for index, found in enumerate(bins):
+            axes.plot([found.said, found.said], found.interval, '_-', color=drawn, clip_on=False)
+            axes.plot(
+                found.said, found.came_true, 'o', color=drawn, clip_on=False, gid=f'bin-{index}'
+            )
+            place = axes.get_xaxis_transform()
+            axes.text(
+                found.middle, -0.14, f'n={found.count}', transform=place, ha='center',
+                color=_COLOURS['faint'], fontsize=8,
+            )  # fmt: skip
+        titles = {
+            f'bin-{index}': f'said {found.said:.2f}, came true {found.came_true:.2f}'
+            for index, found in enumerate(bins)
+        }
+        return _svg(axes, title, width, height, titles)
 
 
 def scatter_chart(title: str, points: Sequence[Point], x_label: str, y_label: str) -> Markup:
     """Returns values against values, both in [0, 1], with intervals; equal ones on the diagonal.
 
-    Marks at the same place lie on a small ring around it, so that none hides another.
+    Points at the same place are one mark with all their labels.
     """
-    left, top, size, height = 34.0, 22.0, 300.0, 366.0
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        return left + x * size, top + (1 - y) * size
-
-    parts: list[Markup] = [_text(y_label, 0.0, 10.0, 'tick')]
-    for tick in _TICKS:
-        parts += [
-            _line(place(0, tick), place(1, tick), 'grid'),
-            _line(place(tick, 0), place(tick, 1), 'grid'),
-            _text(f'{tick:g}', 26.0, place(0, tick)[1] + 4, 'tick', 'end'),
-            _text(f'{tick:g}', place(tick, 0)[0], top + size + 17, 'tick', 'middle'),
-        ]
-    parts.append(_line(place(0, 0), place(1, 1), 'honest'))
-    parts.append(_text(x_label, left + size, height - 6, 'tick', 'end'))
-    shown = [point for point in points if isfinite(point.x) and isfinite(point.y)]
-    for point in shown:
-        together = [p for p in shown if (p.x, p.y) == (point.x, point.y)]
-        angle = 2 * pi * together.index(point) / len(together)
-        radius = 0.0 if len(together) == 1 else 9.0
-        x, y = place(point.x, point.y)
-        shift = (radius * cos(angle), radius * sin(angle))
-        parts.append(_point(point, (x + shift[0], y + shift[1]), shift, place))
-    return _svg(height, title, parts, width=left + size + 44)
+    width, height = 380, 390
+    together: dict[tuple[float, float], list[Point]] = {}
+    for point in points:
+        if isfinite(point.x) and isfinite(point.y):
+            together.setdefault((point.x, point.y), []).append(point)
+    titles = {}
+    with _axes(width, height, left=40, right=24, top=22, bottom=44) as axes:
+        _square(axes, x_label, y_label)
+        for index, ((x, y), found) in enumerate(together.items()):
+            colour = _COLOURS[found[0].colour]
+            for point in found:
+                thin = {'color': _COLOURS[point.colour], 'lw': 0.9, 'alpha': 0.5}
+                axes.plot(point.x_interval, [y, y], **thin)
+                axes.plot([x, x], point.y_interval, **thin)
+            axes.plot(x, y, 'o', color=colour, clip_on=False, gid=f'point-{index}', markersize=6)
+            axes.annotate(
+                ', '.join(point.label for point in found), (x, y), (5, 5), annotation_clip=False,
+                textcoords='offset points', fontsize=8,
+            )  # fmt: skip
+            names = ', '.join(point.title for point in found)
+            titles[f'point-{index}'] = f'{names}: {x:.2f}, {y:.2f}'
+        return _svg(axes, title, width, height, titles)
 
 
-def _point(
-    point: Point,
-    at: tuple[float, float],
-    shift: tuple[float, float],
-    place: Callable[[float, float], tuple[float, float]],
-) -> Markup:
-    """A mark with its label, intervals through it."""
-    ends = [(place(value, point.y)[0] + shift[0], at[1]) for value in point.x_interval]
-    ends += [(at[0], place(point.x, value)[1] + shift[1]) for value in point.y_interval]
-    style = f'interval thin {point.style}'
-    return element(
-        'g',
-        element('title', f'{point.title}: {point.x:.2f}, {point.y:.2f}'),
-        _line(ends[0], ends[1], style),
-        _line(ends[2], ends[3], style),
-        element('circle', cx=at[0], cy=at[1], r=4.5, class_=f'mark {point.style}'),
-        _text(point.label, at[0] + 6, at[1] - 6, 'label'),
+def _square(axes: Axes, x_label: str, y_label: str) -> None:
+    """Both axes from 0 to 1, with the diagonal on which both are equal."""
+    axes.set(xlim=(0, 1), ylim=(0, 1), xticks=_TICKS, yticks=_TICKS)
+    axes.grid()
+    axes.plot([0, 1], [0, 1], ':', color=_COLOURS['faint'], lw=1.2)
+    axes.set_title(y_label, loc='left', fontsize=9, color=_COLOURS['faint'], x=-0.1, pad=9)
+    axes.set_xlabel(x_label, loc='right')
+
+
+@contextmanager
+def _axes(
+    width: int, height: int, *, left: int, right: int, top: int, bottom: int
+) -> Iterator[Axes]:
+    """Axes with margins in pixels, drawn in the page's style within the context."""
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(width / 72, height / 72))
+        FigureCanvasSVG(figure)
+        yield figure.add_axes(
+            (
+                left / width,
+                bottom / height,
+                1 - (left + right) / width,
+                1 - (top + bottom) / height,
+            )
+        )
+
+
+def _svg(axes: Axes, title: str, width: int, height: int, titles: Mapping[str, str]) -> Markup:
+    """The figure of the axes as an element that names what is at `titles`' ids."""
+    stream = StringIO()
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    metadata = dict.fromkeys(('Creator', 'Date', 'Format', 'Type'))
+    figure.savefig(stream, format='svg', transparent=True, metadata=metadata)
+    drawn = stream.getvalue()
+    body = drawn[drawn.index('>', drawn.index('<svg')) + 1 :]
+    body = re.sub(r'<metadata>.*?</metadata>|<style.*?</style>', '', body, flags=re.DOTALL)
+    body = body.replace('xlink:href', 'href').replace(
+        " font-family: 'DejaVu Sans', sans-serif;", ''
     )
-
-
-def _svg(height: float, title: str, parts: Sequence[Markup], width: float = _WIDTH) -> Markup:
-    box = f'0 0 {width:g} {height:g}'
-    return element(
-        'svg', element('title', title), *parts, viewBox=box, role='img', class_='chart',
-        style=f'max-width:{width * 1.2:.0f}px',
-    )  # fmt: skip
-
-
-def _text(text: str, x: float, y: float, style: str, anchor: str = 'start') -> Markup:
-    return element('text', text, x=x, y=y, class_=style, text_anchor=anchor)
-
-
-def _line(start: tuple[float, float], end: tuple[float, float], style: str) -> Markup:
-    return element('line', x1=start[0], y1=start[1], x2=end[0], y2=end[1], class_=style)
+    body = re.sub(r'\s*\n\s*', ' ', body)
+    for name, text in titles.items():
+        body = body.replace(f'<g id="{name}">', f'<g id="{name}"><title>{escape(text)}</title>', 1)
+    # ids would occur once a chart; those of clip paths and marks tell what they are
+    body = re.sub(r' id="([a-z]+)-\d+"', r' class="\1"', body)
+    body = re.sub(r' id="(?![pm][0-9a-f]{10}")[^"]*"', '', body)
+    for name, colour in _COLOURS.items():
+        body = body.replace(colour, f'var(--{name})')
+    return Markup(
+        f'<svg viewBox="0 0 {width} {height}" role="img" class="chart" '
+        f'style="max-width:{width * 1.2:.0f}px"><title>{escape(title)}</title>{body}'
+    )

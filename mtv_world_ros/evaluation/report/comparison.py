@@ -8,6 +8,7 @@ import io
 from pathlib import Path
 from typing import NamedTuple
 
+from mtv_world_ros.documents import Table
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
 from mtv_world_ros.evaluation.report import tables
 from mtv_world_ros.evaluation.report.summary import Group, SEEN, Summary
@@ -78,7 +79,7 @@ def method_table(summaries: Sequence[Summary]) -> str:
             cells += [tables.cell(found.get(name), 1) for name in ('fid', 'fvd')]
             cells += [tables.cell(found.get(name)) for name in ('j_union', 'j_moving')]
         body.append(cells)
-    return tables.grid(head, body)
+    return Table(head=head, rows=body).markdown()
 
 
 def task_tables(summaries: Sequence[Summary]) -> str:
@@ -96,7 +97,7 @@ def task_tables(summaries: Sequence[Summary]) -> str:
             [row.label, *(tables.cell(row.numbers(v, t).get('j_union')) for t, v in columns)]
             for row in rows
         ]
-        parts.append(tables.grid(head, body))
+        parts.append(Table(head=head, rows=body).markdown())
     return '\n\n'.join(parts)
 
 

@@ -1,15 +1,17 @@
-"""The report's headline and horizon, and how it writes numbers."""
+"""The page's headline and horizon: what is imagined against what knows nothing, as charts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isfinite, nan
-from typing import Any
+from math import nan
+from typing import Any, NamedTuple
 
+from markupsafe import Markup
+
+from mtv_world_ros.documents import DASH, number, Table, with_interval
 from mtv_world_ros.evaluation.metrics.horizon import curve
-from mtv_world_ros.evaluation.metrics.statistics import METHOD, MIN_EPISODES
+from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES
 from mtv_world_ros.evaluation.report.charts import Dot, dot_chart, Line, line_chart
-from mtv_world_ros.evaluation.report.markup import element, join, Markup, table
 from mtv_world_ros.evaluation.report.read_back import Evaluated
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
@@ -40,24 +42,35 @@ _FIELDS = {
     'j_frames': '',
 }
 _NUM_HUES = 6
+#: line styles: of matplotlib, and of the key's SVG
+_DASHES = {'': ('-', 'none'), 'held': (':', '2 4'), 'shuffled': ('--', '6 4')}
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Returns a number as text; a dash where there is none."""
-    return '–' if value is None or not isfinite(value) else f'{value:.{digits}f}'
+class Mark(NamedTuple):
+    """How the page calls one of several evaluations: A, B, ... Z, A2, ..., in its colour."""
+
+    letter: str
+    colour: str
 
 
-def with_interval(numbers: Mapping[str, Any], key: str) -> str:
+def mark(index: int, evaluations: Sequence[Evaluated]) -> Mark | None:
+    """Returns an evaluation's letter and colour; None where there is only one."""
+    return None if len(evaluations) == 1 else Mark(letter(index), hue(index))
+
+
+def letter(index: int) -> str:
+    """Returns the letter of an evaluation."""
+    return chr(ord('A') + index % 26) + (str(index // 26 + 1) if index >= 26 else '')
+
+
+def hue(index: int) -> str:
+    """Returns the variable of the style sheet that holds an evaluation's colour."""
+    return f'c{index % _NUM_HUES}'
+
+
+def cell(numbers: Mapping[str, Any], key: str) -> str:
     """Returns a number of metrics.json with its interval."""
-    low, high = interval(numbers, key)
-    text = number(numbers.get(key))
-    return f'{text} [{low:.3f}, {high:.3f}]' if isfinite(low) and text != '–' else text
-
-
-def stacked(numbers: Mapping[str, Any], key: str) -> str:
-    """Returns the same with the interval below the number."""
-    text, bracket, rest = with_interval(numbers, key).partition(' [')
-    return join([text, element('small', f'[{rest}')]) if bracket else text
+    return with_interval(numbers.get(key), interval(numbers, key))
 
 
 def interval(numbers: Mapping[str, Any], key: str) -> tuple[float, float]:
@@ -66,49 +79,27 @@ def interval(numbers: Mapping[str, Any], key: str) -> tuple[float, float]:
     return (nan, nan) if low is None or high is None else (low, high)
 
 
-def letter(index: int) -> str:
-    """Returns how the report calls an evaluation: A, B, ... Z, A2, ..."""
-    return chr(ord('A') + index % 26) + (str(index // 26 + 1) if index >= 26 else '')
-
-
-def hue(index: int) -> str:
-    """Returns the class of an evaluation's colour."""
-    return f'c{index % _NUM_HUES}'
-
-
-def badge(index: int, evaluations: Sequence[Evaluated]) -> Markup | None:
-    """Returns an evaluation's letter in its colour; None where there is only one."""
-    if len(evaluations) == 1:
-        return None
-    return element('span', letter(index), class_=f'badge {hue(index)}')
-
-
 def all_views(evaluations: Sequence[Evaluated]) -> list[str]:
     """Returns the names of all views, in the order in which they come first."""
     return list(dict.fromkeys(view for found in evaluations for view in found.views))
 
 
-def headline(evaluations: Sequence[Evaluated]) -> Markup:
-    """Returns J per view with intervals, against what knows nothing."""
+def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
+    """Returns J per view with intervals, and whether it beats what knows nothing."""
     keys, words = _keys(evaluations)
-    panels = [
-        element('figure', element('h3', f'View {view}'), _dots(evaluations, view, keys))
-        for view in all_views(evaluations)
-    ]
-    return element(
-        'section',
-        element('h2', 'Does it beat knowing nothing?'),
-        *(_verdict(index, evaluations) for index in range(len(evaluations))),
-        element(
-            'p',
-            f'Jaccard index J of the {words}, 1 = the masks agree in every pixel. Held: the '
-            "first frame stands still. Shuffled: imagined with another episode's actions. "
-            + ' '.join([*_meanings(evaluations), f'Whiskers: {METHOD}.']),
-            class_='faint',
-        ),
-        element('div', *panels, class_='panels'),
-        id='headline',
-    )
+    overall = [found.metrics['overall'] for found in evaluations]
+    return {
+        'words': words,
+        'verdicts': [
+            (mark(index, evaluations), _doubts(found)) for index, found in enumerate(evaluations)
+        ],
+        'meanings': [
+            text
+            for key, text in _MEANINGS.items()
+            if any(numbers.get(key) is not None for numbers in overall)
+        ],
+        'panels': [(v, _dots(evaluations, v, keys)) for v in all_views(evaluations)],
+    }
 
 
 def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:
@@ -117,35 +108,19 @@ def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:
     return (moving, 'objects that really move') if measured else (every, 'objects')
 
 
-def _meanings(evaluations: Sequence[Evaluated]) -> list[str]:
-    overall = [found.metrics['overall'] for found in evaluations]
+def _doubts(found: Evaluated) -> list[str]:
+    """What keeps the margins from being shown in every view."""
     return [
-        words
-        for key, words in _MEANINGS.items()
-        if any(numbers.get(key) is not None for numbers in overall)
-    ]
-
-
-def _verdict(index: int, evaluations: Sequence[Evaluated]) -> Markup:
-    doubts = [
         doubt
-        for view, numbers in evaluations[index].metrics['views'].items()
+        for view, numbers in found.metrics['views'].items()
         for key, words in _MARGINS.items()
         if (doubt := _doubt(numbers, key, f'{view}: margin over {words}'))
     ]
-    text = (
-        f'Not shown in every view ({"; ".join(doubts)}).'
-        if doubts
-        else 'Yes: in every view the intervals of the margins over the held frame and over '
-        'shuffled actions lie above 0.'
-    )
-    style = 'verdict doubt' if doubts else 'verdict'
-    return element('p', badge(index, evaluations), text, class_=style)
 
 
 def _doubt(numbers: Mapping[str, Any], key: str, words: str) -> str:
     """What keeps a margin from being shown; empty = nothing."""
-    if number(numbers.get(key)) == '–':
+    if number(numbers.get(key)) == DASH:
         return f'{words} not measured'
     count = numbers['num_episodes_with'][key]
     if count < MIN_EPISODES:
@@ -176,59 +151,55 @@ def _dot(
         label=f'{prefix}{word or "imagined"}',
         value=nan if numbers.get(key) is None else numbers[key],
         interval=interval(numbers, key),
-        style='held' if key in _MORE else _style(index, evaluations, word),
+        colour='held' if key in _MORE else _colour(index, evaluations, word),
+        is_filled=word != 'shuffled',
     )
 
 
-def horizon_section(evaluations: Sequence[Evaluated]) -> Markup | None:
+def horizon(evaluations: Sequence[Evaluated]) -> dict[str, Any] | None:
     """Returns J against how far ahead was imagined; None if no object moves anywhere."""
     panels = []
     for view in all_views(evaluations):
         lines = [line for i in range(len(evaluations)) for line in _lines(i, evaluations, view)]
         if lines:
             seconds = _seconds(evaluations, max(len(line.values) for line in lines))
-            chart = line_chart(
-                f'J against time, view {view}', lines, seconds, 'J of moving objects'
-            )
-            panels.append(element('figure', element('h3', f'View {view}'), chart))
+            title = f'J against time, view {view}'
+            panels.append((view, line_chart(title, lines, seconds, 'J of moving objects')))
     if not panels:
         return None
-    return element(
-        'section',
-        element('h2', 'J against horizon'),
-        element(
-            'p',
-            'Objects that really move. Bands: 95 % t intervals over episodes. Frames that fewer '
-            'than a third of the rollouts reach are left out.',
-            class_='faint',
-        ),
-        _key(evaluations),
-        element('div', *panels, class_='panels'),
-        _by_chunk(evaluations),
-        id='horizon',
-    )
+    return {'panels': panels, 'key': _key(evaluations), 'chunks': _by_chunk(evaluations)}
 
 
-def _by_chunk(evaluations: Sequence[Evaluated]) -> Markup | None:
+def _key(evaluations: Sequence[Evaluated]) -> list[tuple[str, str, str]]:
+    """What the lines mean: words, colour, dashes."""
+    return [
+        (_line_name(index, evaluations, word), _colour(index, evaluations, word), dashes)
+        for index in range(len(evaluations))
+        for word, (_, dashes) in _DASHES.items()
+    ]
+
+
+def _line_name(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
+    prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
+    return f'{prefix}{word or "imagined"}'
+
+
+def _by_chunk(evaluations: Sequence[Evaluated]) -> Table | None:
     """How J falls from chunk to chunk; None where no rollout has two."""
     rows = []
     for index, found in enumerate(evaluations):
         for view, numbers in {**found.metrics['views'], 'all': found.metrics['overall']}.items():
             values = numbers.get('j_moving_by_chunk') or []
-            cells = [
-                stacked({'j': value, 'intervals': {'j': around}}, 'j')
-                for value, around in zip(
-                    values, numbers['j_moving_by_chunk_interval'] if values else [], strict=True
-                )
-            ]
+            around = numbers['j_moving_by_chunk_interval'] if values else []
+            cells = list(map(with_interval, values, around))
             if cells:
                 rows.append([letter(index) if len(evaluations) > 1 else '', view, *cells])
     if not rows:
         return None
     longest = max(map(len, rows))
     head = ['', 'View', *(f'Chunk {k + 1}' for k in range(longest - 2))]
-    padded = [[*row, *['–'] * (longest - len(row))] for row in rows]
-    return table(head, padded, num_labels=2, caption='J of objects that move, by chunk')
+    padded = [[*row, *[DASH] * (longest - len(row))] for row in rows]
+    return Table(head=head, rows=padded, num_labels=2, caption='J of objects that move, by chunk')
 
 
 def _seconds(evaluations: Sequence[Evaluated], count: int) -> list[float]:
@@ -245,12 +216,19 @@ def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line
         drawn = curve(rows, view, field)
         if not drawn.values:
             continue
-        style = _style(index, evaluations, word)
-        label = f'{letter(index)} {word or "imagined"}'
+        label = _line_name(index, evaluations, word)
         values = _on_clock(drawn.values, clock)
         with_band = len(evaluations) == 1 or not word
         band = _on_clock(drawn.band, clock) if with_band else ()
-        lines.append(Line(label=label, values=values, band=band, style=style))
+        lines.append(
+            Line(
+                label=label,
+                values=values,
+                band=band,
+                colour=_colour(index, evaluations, word),
+                dashes=_DASHES[word][0],
+            )
+        )
     return lines
 
 
@@ -260,23 +238,7 @@ def _on_clock(values: Sequence[Any], clock: float) -> list[Any]:
     return [values[min(max(round((k + 1) / clock) - 1, 0), len(values) - 1)] for k in range(count)]
 
 
-def _style(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
-    if word == 'held':
-        return 'held'
-    if word == 'shuffled':
-        return 'alone shuffled' if len(evaluations) == 1 else f'{hue(index)} shuffled'
+def _colour(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
+    if word == 'held' or (word == 'shuffled' and len(evaluations) == 1):
+        return word
     return hue(index)
-
-
-def _key(evaluations: Sequence[Evaluated]) -> Markup:
-    """What the lines mean."""
-    items = []
-    for index in range(len(evaluations)):
-        prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
-        for word in ('', 'held', 'shuffled'):
-            stroke = element(
-                'line', x1=1, y1=6, x2=25, y2=6, class_=f'line {_style(index, evaluations, word)}'
-            )
-            drawn = element('svg', stroke, viewBox='0 0 26 12', aria_hidden='true')
-            items.append(element('li', drawn, f'{prefix}{word or "imagined"}'))
-    return element('ul', *items, class_='key')

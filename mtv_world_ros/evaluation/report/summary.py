@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.documents import Table
 from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, curve
 from mtv_world_ros.evaluation.metrics.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD, summarise
@@ -173,10 +174,11 @@ class Summary:
             return ''
         curves = {view: self.chunk_curve(view) for view in (*self.spec.views, None)}
         head = ['J of objects that move, chunk', *(view or 'all views' for view in curves)]
-        return tables.grid(head, [
+        rows = [
             [str(k + 1), *(tables.point(c.values, c.band, k) for c in curves.values())]
             for k in range(self.num_chunks)
-        ])  # fmt: skip
+        ]
+        return Table(head=head, rows=rows).markdown()
 
     def _numbers(self, group: Group) -> dict[str, Any]:
         return {

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 import csv
 import io
-import math
+from math import nan
 from typing import Any
 
+from mtv_world_ros.documents import DASH, Table, with_interval
 from mtv_world_ros.evaluation.metrics.scores import FRAME_FIELDS, ScoreRow
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
 
@@ -33,7 +34,7 @@ CONTROLS = {
     'j_copy_moving': 'first frame held (persistence)',
     'margin_of_shuffled': 'shuffled actions - persistence',
 }
-NOT_MEASURED = Estimate(value=math.nan, interval=(math.nan, math.nan), num_episodes=0)
+NOT_MEASURED = Estimate(value=nan, interval=(nan, nan), num_episodes=0)
 QUALITY = {'fid': 'FID', 'fvd': 'FVD', 'psnr': 'PSNR [dB]', 'ssim': 'SSIM', 'lpips': 'LPIPS'}
 
 
@@ -68,8 +69,8 @@ def rows_csv(rows: Iterable[tuple[str, str, ScoreRow]]) -> str:
 
 def markdown_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]], first: str) -> str:
     """Returns a table of (label, estimates) with 95 % intervals in brackets."""
-    head = [first, *COLUMNS.values()]
-    return grid(head, [[label, *(cell(found.get(k)) for k in COLUMNS)] for label, found in lines])
+    rows = [[label, *(cell(found.get(key)) for key in COLUMNS)] for label, found in lines]
+    return Table(head=[first, *COLUMNS.values()], rows=rows).markdown()
 
 
 def controls_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
@@ -78,47 +79,35 @@ def controls_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
     body = [
         [words, *(cell(found.get(key)) for _, found in lines)] for key, words in CONTROLS.items()
     ]
-    return grid(head, [row for row in body if set(row[1:]) != {cell(None)}])
+    rows = [row for row in body if set(row[1:]) != {DASH}]
+    return Table(head=head, rows=rows).markdown()
 
 
 def quality_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
     """Returns a table of pictures' quality by view; empty where nothing was measured."""
-    measured = [k for k in QUALITY if any(cell(found.get(k)) != cell(None) for _, found in lines)]
+    measured = [k for k in QUALITY if any(cell(found.get(k)) != DASH for _, found in lines)]
     if not measured:
         return ''
     body = [[view, *(cell(found.get(key)) for key in measured)] for view, found in lines]
-    return grid(['view', *(QUALITY[key] for key in measured)], body)
+    return Table(head=['view', *(QUALITY[key] for key in measured)], rows=body).markdown()
 
 
 def status_table(views: Mapping[str, Mapping[str, int]]) -> str:
     """Returns how often each status of an object in a stretch was met, by view."""
     words = sorted({word for counts in views.values() for word in counts})
     body = [[word, *(str(counts.get(word, 0)) for counts in views.values())] for word in words]
-    return grid(['objects by status', *views], body)
-
-
-def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Returns a Markdown table."""
-    widths = [max(len(row[i]) for row in [head, *body]) for i in range(len(head))]
-    rule = ['-' * width for width in widths]
-    return '\n'.join(
-        '| ' + ' | '.join(text.ljust(n) for text, n in zip(row, widths, strict=True)) + ' |'
-        for row in [head, rule, *body]
-    )
+    return Table(head=['objects by status', *views], rows=body).markdown()
 
 
 def point(values: Sequence[float], band: Sequence[tuple[float, float]], index: int) -> str:
     """Returns a value of a curve with its interval; a dash where the curve does not reach."""
     if index >= len(values):
-        return cell(None)
+        return DASH
     return cell(Estimate(value=values[index], interval=band[index], num_episodes=0))
 
 
 def cell(estimate: Estimate | None, digits: int = 3) -> str:
     """Returns a number with its interval; a dash where it was not measured."""
-    if estimate is None or not math.isfinite(estimate.value):
-        return '–'
-    low, high = estimate.interval
-    if not math.isfinite(low):
-        return f'{estimate.value:.{digits}f}'
-    return f'{estimate.value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]'
+    if estimate is None:
+        return DASH
+    return with_interval(estimate.value, estimate.interval, digits)

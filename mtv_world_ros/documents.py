@@ -1,0 +1,95 @@
+"""HTML pages and Markdown from the templates in `resource/report/`, and the tables in them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import isfinite
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from mtv_world_ros.files import share_path
+
+#: instead of a number that was not measured
+DASH = '–'
+#: suffix of templates whose values are escaped
+_HTML = '.html.j2'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table, for Markdown and HTML alike.
+
+    Attributes:
+        head: headings.
+        rows: cells, as many as headings.
+        caption: what it shows.
+        num_labels: columns on the left that hold text, not numbers.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    caption: str = ''
+    num_labels: int = 1
+
+    def markdown(self, *, aligned: bool = True) -> str:
+        """Returns the table without its caption.
+
+        Args:
+            aligned: columns as wide as their widest cell, for those who read it as text.
+        """
+        lines = [[str(cell) for cell in row] for row in (self.head, *self.rows)]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        if not aligned:
+            widths = [0] * len(widths)
+        lines.insert(1, ['-' * (width or 3) for width in widths])
+        return '\n'.join(
+            '| ' + ' | '.join(c.ljust(n) for c, n in zip(line, widths, strict=True)) + ' |'
+            for line in lines
+        )
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Returns a number as text; a dash where there is none."""
+    return DASH if value is None or not isfinite(value) else f'{value:.{digits}f}'
+
+
+def with_interval(
+    value: float | None, interval: Sequence[float | None] | None, digits: int = 3
+) -> str:
+    """Returns a number and its interval in brackets, as far as they are known."""
+    text = number(value, digits)
+    low, high = interval or (None, None)
+    if text == DASH or low is None or high is None or not isfinite(low):
+        return text
+    return f'{text} [{low:.{digits}f}, {high:.{digits}f}]'
+
+
+def render(template: str, **values: Any) -> str:
+    """Returns a template of `resource/report/` with its values; those of HTML are escaped."""
+    return _environment().get_template(template).render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    folder = share_path('resource', 'report')
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=lambda name: name is not None and name.endswith(_HTML),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters['number'] = number
+    environment.filters['data_uri'] = _data_uri
+    environment.globals['style'] = (folder / 'style.css').read_text(encoding='utf-8')
+    return environment
+
+
+def _data_uri(data: bytes, kind: str) -> str:
+    """Bytes of a media type as a `data:` address."""
+    return f'data:{kind};base64,{base64.b64encode(data).decode()}'
