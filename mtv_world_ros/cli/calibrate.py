@@ -31,8 +31,8 @@ _EPILOG = """\
 Every episode is imagined as a whole from its first frame with its own commands; the success
 estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
 success_calibration.json and horizon.json; DIR gets calibration.md, reliability.html and
-calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5. Running the same command again
-continues an interrupted run.
+calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5.
+Running the same command again continues an interrupted run.
 """
 
 

@@ -2,9 +2,9 @@
 
 Each of the student's n steps has to reach what the teacher reaches in m steps of its own. A step
 of training draws noise, follows the teacher down all n * m noise levels, and trains the student,
-at each of the n levels where it will be evaluated, to predict the straight flow to the next one. With every line
-learned, n Euler steps of the student end where n * m of the teacher do; sampler, schedule and the
-model's form stay what they are.
+at each of the n levels where it will be evaluated, to predict the straight flow to the next one.
+With every line learned, n Euler steps of the student end where n * m of the teacher do; sampler,
+schedule and the model's form stay what they are.
 
 Followed: PeRFlow (Yan et al. 2024, arXiv:2405.07510), which straightens a flow within windows; and
 FlowSteer (arXiv:2511.18834), which found that PeRFlow fell behind because its windows begin at

@@ -1,7 +1,7 @@
 """Training from self-generated start frames, so that long rollouts stay stable.
 
-A model that only ever sees recorded start frames meets its own errors first in a chain of
-chunks, and they add up. Here some clips start from the end of the model's own rollout of the preceding
+A model that only ever sees recorded start frames meets its own errors first in a chain of chunks,
+and they add up. Here some clips start from the end of the model's own rollout of the preceding
 chunks, generated as in serving and without gradient, while the target stays the recording: it
 learns to continue from its own pictures. So do Resampling Forcing (arXiv:2512.15702: self-made,
 detached history, flow matching towards the recording) and BAgger (arXiv:2512.12080); Self Forcing
