@@ -27,6 +27,7 @@ DISTRIBUTIONS = {
     'grpc': 'grpcio',
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',
+    'pydantic_core': 'pydantic',  # which requires it
     'yaml': 'PyYAML',
 }
 #: ROS packages, which package.xml and the `ros` extra bring
