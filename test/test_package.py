@@ -25,8 +25,10 @@ DISTRIBUTIONS = {
     'coal': 'pin',  # which requires it
     'cv2': 'opencv-python-headless',
     'grpc': 'grpcio',
+    'markupsafe': 'Jinja2',  # which requires it
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',
+    'pydantic_core': 'pydantic',  # which requires it
     'yaml': 'PyYAML',
 }
 #: ROS packages, which package.xml and the `ros` extra bring

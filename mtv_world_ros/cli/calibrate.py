@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from mtv_world_ros.success.calibration import HorizonCurve
 
 _EPILOG = """\
-Every episode is imagined as a whole from its first frame with its own commands; what the success
-estimate then sees is fitted to what really happened. The checkpoint gets success_calibration.json
-and horizon.json, DIR gets calibration.md, reliability.html and calibration.json. Half of the
-episodes should be failures: mtv-world collect --failures-of-ten 5. Running the same command again
-goes on where it was stopped.
+Every episode is imagined as a whole from its first frame with its own commands; the success
+estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
+success_calibration.json and horizon.json; DIR gets calibration.md, reliability.html and
+calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5.
+Running the same command again continues an interrupted run.
 """
 
 
@@ -52,12 +52,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, help='use only so many')
     parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
     add_seeds(parser)
-    parser.add_argument('--l2', type=float, default=1.0, help='pull towards the stated weights')
+    parser.add_argument(
+        '--l2', type=float, default=1.0, help='strength of the prior on the weights'
+    )
     parser.add_argument(
         '--no-store',
         dest='store',
         action='store_false',
-        help='write the report only; leave the checkpoint as it is',
+        help='write the report only; do not change the checkpoint',
     )
     add_dtype(parser)
     add_model_options(parser)

@@ -32,14 +32,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=float,
         default=0.0,
         metavar='SHARE',
-        help='share of the episodes whose cameras stand elsewhere; zero-shot views stay unseen',
+        help='share of the episodes with moved cameras; zero-shot views stay unseen',
     )
     parser.add_argument(
         '--failures-of-ten',
         type=int,
         default=2,
         metavar='N',
-        help='so many of ten episodes of a task miss their grasp; 5 for mtv-world calibrate',
+        help='how many of ten episodes of a task miss their grasp; 5 for mtv-world calibrate',
     )
     parser.add_argument(
         '--policies',
@@ -75,7 +75,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--width', type=int, default=384, help='of the images [px]')
     parser.add_argument('--height', type=int, default=288)
     parser.add_argument(
-        '--sheets', action='store_true', help='also a larger contact sheet of every task'
+        '--sheets', action='store_true', help='also write a larger contact sheet of every task'
     )
     parser.set_defaults(handler=_collect)
 

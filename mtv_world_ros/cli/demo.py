@@ -11,7 +11,7 @@ from mtv_world_ros.cli.options import add_checkpoint, add_model_options
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'demo', help='replay the bundled episode through the real node and score what it imagines'
+        'demo', help='replay the bundled episode through the ROS node and score its predictions'
     )
     parser.add_argument('--episode', type=Path, help='default: the bundled one')
     parser.add_argument('--out', type=Path, default=Path('out/demo'))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mtv_world_ros.cli.options import add_dtype
 
-#: laid over the preset: a student starts from a trained model and is near its end
+#: overrides of the preset: a student starts from a trained model, close to its goal
 _DEFAULTS = {
     'optimizer.learning_rate': 1e-4,
     'optimizer.warmup_steps': 50,
@@ -19,21 +19,25 @@ _DEFAULTS = {
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'distill', help='make a model that needs fewer denoising steps from a trained one'
+        'distill', help='distil a trained model into one that needs fewer denoising steps'
     )
     parser.add_argument('checkpoint', help="the teacher: a folder, or 'bundled'")
     parser.add_argument('dataset', type=Path)
     parser.add_argument('--out', type=Path, required=True, help='resumes what is there')
     parser.add_argument('--steps', type=int, default=4, help='denoising steps of the student')
     parser.add_argument(
-        '--teacher-steps', type=int, help='of the teacher; default: 8 times those of the student'
+        '--teacher-steps',
+        type=int,
+        help='denoising steps of the teacher; default: 8 times those of the student',
     )
-    parser.add_argument('--preset', default='small', help='optimizer, loss and disturbances')
+    parser.add_argument('--preset', default='small', help='optimizer, loss and augmentation')
     parser.add_argument(
         '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides',
         help='e.g. optimizer.steps=2000',
     )  # fmt: skip
-    parser.add_argument('--episodes', type=int, help='use only so many, spread over all')
+    parser.add_argument(
+        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
+    )
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: train where there is one"
     )

@@ -25,7 +25,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('episode', type=Path, nargs='?')
     parser.add_argument('--live', action='store_true', help='check the running ROS topics')
-    parser.add_argument('--seconds', type=float, default=10.0, help='with --live: record so long')
+    parser.add_argument(
+        '--seconds', type=float, default=10.0, help='with --live: how long to record'
+    )
     parser.add_argument('--views', help='comma-separated; default: all; needed with --live')
     parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _EPILOG = """\
 DIR gets metrics.json, rows.csv, tables.md, numbers.csv, paper_tables.md and report.html. Several
 checkpoints share the last three; the others of each are in DIR/NAME. Running the same command
-again goes on where it was stopped.
+again continues an interrupted run.
 """
 
 
@@ -51,7 +51,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
-    parser.add_argument('--episodes', type=int, help='use only the first so many')
+    parser.add_argument('--episodes', type=int, help='use only the first N episodes')
     parser.add_argument('--workers', type=int, default=1, help='processes that score episodes')
     parser.add_argument(
         '--actions',
@@ -70,7 +70,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--truth',
         choices=('segmenter', 'simulator'),
         default='segmenter',
-        help='whose masks of the recorded frames are the truth',
+        help='segmenter whose masks of the recorded frames count as ground truth',
     )
     parser.add_argument(
         '--quality', type=names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
@@ -81,7 +81,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--describer',
         type=Path,
         metavar='YAML',
-        help='what names the objects (see config/describer.yaml); default: the episodes do',
+        help='how objects are named (see config/describer.yaml); default: by the episodes',
     )
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_dtype(parser)

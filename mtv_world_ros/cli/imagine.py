@@ -11,7 +11,7 @@ from mtv_world_ros.cli.options import add_checkpoint, add_model_options, add_seg
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'imagine', help='let a policy live whole episodes in the world model, over ROS topics'
+        'imagine', help='run a policy for whole episodes in the world model, over ROS topics'
     )
     parser.add_argument(
         '--policy',

@@ -19,7 +19,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'import-weights',
-        help='make a checkpoint of public Wan 2.1 weights',
+        help='convert public Wan 2.1 weights into a checkpoint',
         description='Makes a checkpoint of Wan2.1-Fun-V1.1-Control: every tensor is loaded, new '
         'and zero, or an error.',
     )
@@ -32,7 +32,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
     )
     parser.add_argument('--guidance-scale', type=float, default=1.0, help='1 = none')
-    parser.add_argument('--negative-prompt', default='', help='what guidance leads away from')
+    parser.add_argument('--negative-prompt', default='', help='negative prompt of guidance')
     for part in _ELSEWHERE:
         option = '--' + part.replace('_', '-')
         parser.add_argument(option, type=Path, help='file or folder; default: in PATH')
@@ -42,7 +42,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
-    # public weights never saw a history: they take one once they are trained with it
+    # public weights were trained without history frames
     config = load_training_config(arguments.preset).replace(history=HistoryConfig())
     from mtv_world_ros.model.wan_import.import_weights import import_weights
 
@@ -67,7 +67,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
 
 
 def _line(report: PartReport) -> str:
-    """What became of a part's tensors, in words."""
+    """Summary of the tensors of a part, as text lines."""
     size = f'{report.loaded} tensors, {report.parameters / 1e6:.1f} M parameters'
     lines = [f'{report.part}: {size} ({", ".join(report.dtypes)}) from {report.source}']
     lines += [f'  new, zero: {name}' for name in report.new]

@@ -27,7 +27,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         '--steps',
         type=_num_steps,
         default=0,
-        help='denoising steps; 0 = those the checkpoint is made for, else 4',
+        help='denoising steps; 0 = as the checkpoint says, else 4',
     )
     parser.add_argument('--seed', type=int, default=0)
 
@@ -38,10 +38,10 @@ def add_serving(parser: argparse.ArgumentParser) -> None:
         '--serving',
         default='',
         metavar='"NAME=VALUE ..."',
-        help='what makes the model faster or smaller, e.g. "context_parallel=2"',
+        help='options that make the model faster or smaller, e.g. "context_parallel=2"',
     )
     parser.add_argument(
-        '--adapter', type=Path, help="LoRA folder or file, in place of the checkpoint's own"
+        '--adapter', type=Path, help="LoRA folder or file, instead of the checkpoint's own"
     )
 
 
@@ -114,13 +114,13 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
 
 
 def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns what the options say of a pipeline beside its checkpoint and threads."""
+    """Returns the options of a pipeline except checkpoint and threads."""
     given = vars(arguments)
     return {name: given[name] for name in _CHOICES if name in given}
 
 
 def provenance(arguments: argparse.Namespace) -> dict[str, str]:
-    """Returns the lines that go with a result of the running command, by heading."""
+    """Returns the provenance of a result (command, date, machine, versions), by heading."""
     return {
         'command': shlex.join(['mtv-world', *arguments.command_line]),
         'date': datetime.now().astimezone().isoformat(timespec='seconds'),

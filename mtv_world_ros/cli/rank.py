@@ -176,7 +176,7 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
 
 
 def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
-    """What rollouts depend on: those of other settings are run again."""
+    """Settings that rollouts depend on: with other settings they are run again."""
     from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.files import share_path
 

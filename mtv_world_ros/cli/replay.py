@@ -28,7 +28,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         allow_abbrev=False,
     )
     parser.add_argument('episode', type=Path)
-    parser.add_argument('--offline', action='store_true', help='no ROS, as fast as it goes')
+    parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
     add_checkpoint(parser)

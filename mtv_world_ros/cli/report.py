@@ -9,7 +9,7 @@ from pathlib import Path
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'report', help='write the HTML report of evaluations again, or of several in one'
+        'report', help='write the HTML report of one or several evaluations again'
     )
     parser.add_argument(
         'evaluations', type=Path, nargs='+', help="folders that 'mtv-world evaluate --out' wrote"

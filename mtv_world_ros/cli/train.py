@@ -28,7 +28,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         description='Several processes, GPUs or machines train together when a launcher starts '
         'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
         'accelerate launch --multi_gpu with the same -m. optimizer.batch_size is that of all of '
-        'them together: they see the same clips as one would.',
+        'all processes together: they see the same clips as one process would.',
     )
     parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
     parser.add_argument('--out', type=Path, help='resumes what is there')
@@ -46,15 +46,20 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
     )
     parser.add_argument(
-        '--dry-run', action='store_true', help='print what a step takes, and train nothing'
+        '--dry-run', action='store_true', help='print memory and arithmetic of a step, then exit'
     )
     parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
-    parser.add_argument('--episodes', type=int, help='use only so many, spread over all')
+    parser.add_argument(
+        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
+    )
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: train where there is one"
     )
     parser.add_argument(
-        '--cache', type=Path, metavar='DIR', help='what was read of episodes; runs may share it'
+        '--cache',
+        type=Path,
+        metavar='DIR',
+        help='keeps the decoded recordings; several runs may share it',
     )
     parser.add_argument(
         '--latent-cache',
@@ -67,7 +72,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
     parser.add_argument(
-        '--threads', type=int, default=0, help='CPU threads a process; 0 = its share of all cores'
+        '--threads',
+        type=int,
+        default=0,
+        help='CPU threads per process; 0 = its share of all cores',
     )
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
     parser.add_argument(
@@ -75,8 +83,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=int,
         default=0,
         metavar='N',
-        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log has '
-        'the share of time waited for them',
+        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
+        'says how long training waited for clips',
     )
     parser.add_argument(
         '--peak-tflops',
@@ -146,7 +154,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the options change of the preset; --set wins."""
+    """Overrides of the preset by options; --set has precedence."""
     from mtv_world_ros.errors import ConfigError
 
     overrides: dict[str, Any] = {}
@@ -163,7 +171,7 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def set_overrides(items: list[str]) -> dict[str, Any]:
-    """Returns what `--set SECTION.KEY=VALUE` options say.
+    """Returns the overrides of `--set SECTION.KEY=VALUE` options.
 
     Raises:
         ConfigError: one has no value.
@@ -224,7 +232,7 @@ def add_held_out(parser: argparse.ArgumentParser) -> None:
 def held_out(
     arguments: argparse.Namespace, trained_on: Sequence[Path], dtype: torch.dtype
 ) -> HeldOut | None:
-    """Returns what judges the training's checkpoints; None where it is off.
+    """Returns the scorer of held-out episodes; None if it is off.
 
     Raises:
         ConfigError: there are no held-out episodes, or they are trained on.
@@ -265,11 +273,11 @@ def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
 def make_judge(
     paths: Sequence[Path], out: Path, device: str, dtype: torch.dtype, base: str | None = None
 ) -> Judge:
-    """Returns what scores checkpoints as `mtv-world evaluate` does, J of moving objects first.
+    """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
     Args:
         paths: of the episodes.
-        out: gets a folder a step: `metrics.json` and an MP4 an episode.
+        out: gets a folder per step, with `metrics.json` and an MP4 per episode.
         device: where to imagine.
         dtype: of the model.
         base: checkpoint that adapters are used on.
@@ -290,7 +298,7 @@ def make_judge(
             adapter=checkpoint if is_adapter else None,
             device=device,
             dtype=str(dtype).removeprefix('torch.'),
-            num_threads=torch.get_num_threads(),  # the training's stay as they are
+            num_threads=torch.get_num_threads(),  # keep the training's threads
         )
         summary = evaluate(
             pipeline, paths, folder, actions=('true',), ceiling=False, show_progress=False

@@ -10,15 +10,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'train-motion',
-        help='train how objects move under commanded tools',
+        help='train the object motion network: how objects move under commanded tools',
         description='Trains the object motion network of a checkpoint: where objects go when '
         'grippers grasp, carry, push and drop them. It learns from recorded episodes: masks of '
         'the first frame, commands, and where the objects went (/object_poses, else the masks). '
         "Writes OUT/object_motion; OUT may be the checkpoint's folder.",
     )
-    parser.add_argument('dataset', type=Path, help='folder with episodes, also in folders in it')
+    parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
-    parser.add_argument('--init', type=Path, metavar='DIR', help='go on from DIR/object_motion')
+    parser.add_argument('--init', type=Path, metavar='DIR', help='start from DIR/object_motion')
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', default='low,high', help='comma-separated')
     parser.add_argument('--steps', type=int, default=4000)

@@ -1,4 +1,4 @@
-"""A recorded episode in memory: what the cameras saw, what the arms did, what was asked."""
+"""A recorded episode in memory: images, joint states, commands, instruction and outcome."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mtv_world_ros.errors import EpisodeError, nearest
 JOINT_STATES = '/joint_states'
 JOINT_TRAJECTORY = '/joint_trajectory'
 INSTRUCTION = '/instruction'
-#: where the objects are in the base frame, in the order of their names: of a simulator, of markers
+#: object poses in the base frame, in the order of the names (from a simulator or markers)
 OBJECT_POSES = '/object_poses'
-#: name of the MCAP metadata record that says what the episode shows
+#: name of the MCAP metadata record with task, outcome and objects
 METADATA_NAME = 'mtv_world'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
 
 
 def image_topic(view: str) -> str:
-    """Topic of the view's raw images; compressed ones are at `<it>/compressed`."""
+    """Topic of the view's raw images; compressed ones have the suffix `/compressed`."""
     return f'/{view}/image_raw'
 
 
@@ -62,9 +62,9 @@ class EpisodeInfo:
         path: its folder or file.
         task: name of the task; empty where not recorded.
         outcome: `success`, `failure` or `unknown`.
-        seed: seed it was made from, or None.
+        seed: seed of the simulated scene, or None.
         objects: names such as `red block`; masks number them from 1.
-        instruction: what the robot was told; empty where not recorded.
+        instruction: text for the policy; empty if not recorded.
         robot: name of the robot; empty where not recorded.
         metadata: further text by key.
     """
@@ -166,7 +166,7 @@ class JointStates:
 
 
 class ObjectPoses(NamedTuple):
-    """Where objects are over time.
+    """Object poses over time.
 
     Attributes:
         stamps_ns: (N,) int64, increasing.
@@ -190,9 +190,9 @@ class Episode:
         trajectories: (start stamp [ns], trajectory), by stamp.
         masks: object masks of the views that have them; None where there are none.
         instructions: (stamp [ns], text), by stamp.
-        object_poses: where the objects were; None where it was not recorded.
-        truncated: the record ends before its end.
-        warnings: what was found wrong and how it was dealt with, one line each; where
+        object_poses: None if not recorded.
+        truncated: the recording is cut off.
+        warnings: problems found and how they were handled, one line each; if
             `truncated`, the first says where the record was cut.
     """
 

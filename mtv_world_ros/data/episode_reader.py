@@ -67,7 +67,7 @@ def read_episode(
     """Reads an episode; frames are decoded later, when asked for.
 
     Times are the headers' stamps, or the log time where a header has none. Messages that are
-    damaged are left out, and every oddity is a line in the result's `warnings`.
+    damaged are skipped, and every problem is a line in the result's `warnings`.
 
     Args:
         path: rosbag2 folder, also one that was cut off, or .mcap file.
@@ -75,8 +75,8 @@ def read_episode(
         calibration: camera calibration; None = calibration.yaml in the folder.
         with_cameras: whether the cameras are needed.
         with_masks: whether to read object masks where there are any.
-        topics: topics that are not named as this package names them, by view or by
-            `joint_states`, `joint_trajectory`, `instruction`, e.g.
+        topics: topics that differ from the default names, by view or by `joint_states`,
+            `joint_trajectory`, `instruction`, `object_poses`, e.g.
             `{'low': '/camera_low/color/image_raw'}`.
 
     Raises:
@@ -89,7 +89,7 @@ def read_episode(
 
 
 def read_info(path: Path | str) -> EpisodeInfo:
-    """What an episode shows, without reading its images where metadata.yaml says it.
+    """Returns task, outcome and objects, from metadata.yaml where possible.
 
     Raises:
         EpisodeError: no bag, or its metadata cannot be used.
@@ -194,7 +194,7 @@ class _EpisodeReader:
         return Track(stamps, LazyFrames(topic, [message for _, message in ordered], decode))
 
     def _take(self, topic: str, msgtype: str) -> Stamped:
-        """Messages of a topic, as recorded; those of another type are refused."""
+        """Messages of a topic, in recorded order; those of another type are refused."""
         taken: Stamped = []
         for stamp, (kind, message) in self.received.get(topic, []):
             if kind == msgtype:
@@ -464,7 +464,7 @@ class LazyFrames:
 def in_order(
     topic: str, items: Iterable[tuple[int, Item]], warnings: list[str]
 ) -> list[tuple[int, Item]]:
-    """Sorts (stamp, item) by stamp and keeps the last of equal stamps; says so in `warnings`."""
+    """Sorts (stamp, item) by stamp, keeps the last of equal stamps; reports both in `warnings`."""
     given = list(items)
     stamps = [stamp for stamp, _ in given]
     late = sum(b < a for a, b in zip(stamps, stamps[1:], strict=False))

@@ -1,4 +1,4 @@
-"""Writes an episode as a rosbag2 MCAP folder, field by field."""
+"""Writes an episode as a rosbag2 MCAP folder."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from mtv_world_ros.geometry.calibration_file import save_calibration
 
 
 class EpisodeWriter(BagWriter):
-    """Records an episode: frames, joint states, commands, masks and what they show.
+    """Records an episode: frames, joint states, commands, masks and metadata.
 
     Log times equal the headers' stamps. Set `outcome` before the block ends.
 
@@ -133,12 +133,12 @@ class EpisodeWriter(BagWriter):
         self._write(JOINT_STATES, messages.JOINT_STATE, stamp_ns, message)
 
     def write_trajectory(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
-        """Records what the policy commands; the trajectory starts at `stamp_ns`."""
+        """Records a commanded trajectory that starts at `stamp_ns`."""
         message = messages.make_joint_trajectory(stamp_ns, trajectory)
         self._write(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
 
     def write_object_poses(self, stamp_ns: int, T_base_object: ArrayLike) -> None:
-        """Records where the objects are, (O, 4, 4) in the order of their names [m]."""
+        """Records object poses (O, 4, 4) in the order of their names [m]."""
         message = messages.make_pose_array(stamp_ns, 'base_link', T_base_object)
         self._write(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
 

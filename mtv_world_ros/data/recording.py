@@ -1,4 +1,4 @@
-"""Training windows: recorded frames and the commands they answer, on the model's clock.
+"""Recordings at the model's size, clips cut from them on the model's clock, and their cache.
 
 V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
 """
@@ -28,7 +28,7 @@ from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
 
-#: a frame stands for a wanted time if it is at most this share of the model's period away
+#: largest distance of a frame from the wanted time, as a share of the model's period
 MAX_FRAME_OFFSET = 0.3
 
 
@@ -50,7 +50,7 @@ class Recording:
         commands: what the policy commanded; times on the same clock.
         stamp_ns: stamp of the first frame.
         object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
-        warnings: what was wrong with it and how the reader dealt with that.
+        warnings: problems found and how the reader handled them.
     """
 
     path: Path
@@ -344,7 +344,7 @@ def commands_from(recording: Recording, start: int) -> JointTrajectory:
     )
 
 
-#: raised when what is stored, or how it is computed, changes
+#: to be increased when the stored data or their computation change
 _VERSION = 2
 
 
@@ -354,7 +354,7 @@ def cached_recording(
     """Returns `load_recording`'s result, from the cache where it is current.
 
     The key holds the bag's files (name, size, time), views, size, and robot: a changed episode
-    or setting misses the cache instead of using what is stale.
+    or setting misses the cache instead of using stale data.
     """
     stored = cache / f'{_key(path, spec, robot)}.npz'
     if stored.is_file():

@@ -49,7 +49,7 @@ def select(
         default: see `split`.
 
     Raises:
-        EpisodeError: the folder holds no episodes, or no one of the split.
+        EpisodeError: the folder holds no episodes, or none of the split.
         ConfigError: no such split, the card cannot be read, or siblings are not of one scene or
             not in one split.
     """

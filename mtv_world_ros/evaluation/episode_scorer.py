@@ -201,7 +201,7 @@ class EpisodeScorer:
         others |= self._ceilings(stretch, truth, found)
         views = self.pipeline.spec.views
         with found.timed('scoring'):
-            found.rows += score_rows(stretch, views, truth, predicted, others)
+            found.rows += score_rows(stretch, views, truth, predicted, others, masks)
         with found.timed('features'):
             found.quality.append((stretch.num_frames, self._quality(frames, real)))
         stored = stored_stretch(

@@ -1,4 +1,4 @@
-"""Calibration YAML files: one camera a view."""
+"""Calibration YAML files: one camera per view."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
 
 
 def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> None:
-    """Writes cameras so that `load_calibration` gives them back to the last bit."""
+    """Writes cameras; `load_calibration` reads back exactly the same values."""
     views = {
         view: {
             'width': camera.width,

@@ -20,7 +20,7 @@ from mtv_world_ros.geometry.transforms import inverse
 
 #: nearest depth that is projected [m]
 MIN_DEPTH_M = 0.01
-#: condition number from which rays count as parallel
+#: condition number from which on rays count as parallel
 _PARALLEL = 1e9
 
 
@@ -73,7 +73,7 @@ def scaled(camera: CameraModel, width: int, height: int) -> CameraModel:
     """Returns the camera for its image resized to another size.
 
     fx, fy, cx, cy scale with the size as in ROS' image_proc resize, shifted by the half pixel
-    that keeps pixel centres at integers. Scaling to the size it has changes nothing.
+    that keeps pixel centres at integers. Scaling to the same size changes nothing.
     """
     if (camera.width, camera.height) == (width, height):
         return camera
@@ -98,7 +98,7 @@ def with_camera_info(
         width: of the images that the CameraInfo is for [px].
         height: of the images [px].
         K: (3, 3) [px].
-        distortion_model: as in CameraInfo; any name goes if all coefficients are zero.
+        distortion_model: as in CameraInfo; ignored if all coefficients are zero.
         distortion: coefficients.
 
     Raises:

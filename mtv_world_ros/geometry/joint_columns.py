@@ -1,4 +1,4 @@
-"""How columns of a data set, or of a policy server's vectors, become the robot's joints."""
+"""Mapping of columns (of a data set or a policy server's vectors) to the robot's joints."""
 
 from __future__ import annotations
 
@@ -172,11 +172,11 @@ def to_columns(
 
     Args:
         positions: by joint name.
-        names: of the columns; empty where they have none, they are then as many as are used.
+        names: of the columns; if empty, there are as many columns as joints use.
         joints: without constants.
 
     Raises:
-        ConfigError: a column is not there, or nothing is put into one.
+        ConfigError: a column does not exist, or no joint fills it.
     """
     used = [joint for joint in joints if joint.column is not None]
     count = len(names) or 1 + max(

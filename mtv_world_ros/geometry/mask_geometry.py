@@ -1,4 +1,4 @@
-"""Where objects are in space, from their masks in views; how often one that swings turns back."""
+"""Positions and sizes of objects in space, from their masks in views; counting of reversals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Location:
     Attributes:
         point: (3,) in the base frame [m].
         residual_px: how far the views' rays miss each other.
-        sigma_m: what a centroid's error, or the residual if larger, amounts to at its depth [m].
+        sigma_m: position error that the centroid's error, or the larger residual, causes [m].
     """
 
     point: FloatArray
@@ -44,9 +44,9 @@ def centroids(masks: BoolArray) -> FloatArray:
 def locate(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
 ) -> Location | None:
-    """Triangulates one point from (V, 2) pixels; views of NaN do not count.
+    """Triangulates one point from (V, 2) pixels; views with NaN are ignored.
 
-    Returns None where fewer than two views see the point, or all along one ray.
+    Returns None if fewer than two views see the point, or all see it along one ray.
     """
     seen = [view for view in range(len(cameras)) if np.isfinite(pixels[view]).all()]
     if len(seen) < 2:
@@ -116,7 +116,7 @@ def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
 
 
 def count_reversals(angles: FloatArray, swing: float) -> FloatArray:
-    """Returns (T,) how often the angle has turned back by more than `swing` so far.
+    """Returns (T,) the number of reversals of the angle so far, each by more than `swing`.
 
     Args:
         angles: (T,) without jumps of whole turns [rad].

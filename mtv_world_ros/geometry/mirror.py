@@ -1,4 +1,4 @@
-"""Motions mirrored at a plane of the base: what the left arm did, the right arm does."""
+"""Motions mirrored at a plane of the base: the right arm does what the left one did."""
 
 from __future__ import annotations
 

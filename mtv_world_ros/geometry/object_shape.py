@@ -1,4 +1,4 @@
-"""What the first frame tells of an object's place and shape, from its masks in calibrated views.
+"""Positions and shape features of objects, from their masks in calibrated views.
 
 V views, O objects, H W pixels.
 """
@@ -13,19 +13,19 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import unproject
 
-#: numbers that describe an object in one view
+#: numbers that describe an object in a view
 NUM_FEATURES = 9
 #: directions in the plane along which widths are measured
 _ANGLES = np.arange(4) * np.pi / 4
 #: share of a mask's pixels left out at either end of a width
 _TAIL = 0.04
-#: pixels of a mask that are looked at, at most
+#: largest number of pixels of a mask that are used
 _MAX_PIXELS = 600
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectShapes:
-    """Where objects are and how large they look.
+    """Positions and apparent sizes of objects.
 
     Attributes:
         points: (O, 3) centres in the base frame [m]; NaN where fewer than two views see one.

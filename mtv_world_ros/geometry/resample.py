@@ -1,4 +1,4 @@
-"""Joint trajectories matched to the robot's joints and brought to another clock."""
+"""Joint trajectories matched to the robot's joints and resampled to another clock."""
 
 from __future__ import annotations
 

@@ -18,10 +18,10 @@ LIMIT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tool:
-    """Where an arm acts.
+    """Tool of an arm: its tool centre point and gripper.
 
     Attributes:
-        arm: name of the arm.
+        arm: its name.
         link: link that carries the tool.
         T_link_tool: (4, 4) pose of the tool centre point in the link [m].
         gripper_joint: joint that opens the gripper, or None.
@@ -64,7 +64,7 @@ class Mimic:
 
 
 class RobotModel:
-    """A robot of any number of arms. Immutable in use, so threads may share it.
+    """A robot with any number of arms. Nothing changes after construction: threads may share it.
 
     Args:
         name: of the robot.

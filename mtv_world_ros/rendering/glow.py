@@ -1,4 +1,4 @@
-"""Glowing trails of points: Gaussian stamps that fade with age, kept in a live box.
+"""Glowing trails of points: Gaussian stamps that fade with age.
 
 N points, H W pixels. A box is (top, bottom, left, right), bottom and right excluded.
 """
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import FloatArray
 
-#: a stamp ends where its Gaussian is below a grey level: exp(-3.4^2 / 2) < 1 / 255
+#: a stamp ends where its Gaussian falls below one grey level: exp(-3.4^2 / 2) < 1 / 255
 REACH_SIGMAS = 3.4
-#: a point is forgotten once it is this much fainter than when it was new (below a grey level)
+#: a point is dropped once it is this much fainter than when new (below one grey level)
 FAINTEST = 1 / 512
 #: pixels are limited to this before they become integers; far outside any image [px]
 _FAR_PX = 1e6
@@ -25,7 +25,7 @@ NO_BOX: Box = (0, 0, 0, 0)
 
 
 def union(a: Box, b: Box) -> Box:
-    """Returns the smallest box that holds both; an empty one does not count."""
+    """Returns the smallest box that contains both; an empty box is ignored."""
     if a[0] >= a[1] or a[2] >= a[3]:
         return b
     if b[0] >= b[1] or b[2] >= b[3]:
@@ -55,7 +55,7 @@ class Stamps:
     origins: list[tuple[int, int]]
 
     def draw(self, image: GlowArray, n: int, brightness: float) -> Box:
-        """Lays stamp n onto an (H, W) image, brightest wins; returns the box that it touched."""
+        """Draws stamp n onto an (H, W) image by maximum; returns the box that it changed."""
         top, bottom, left, right = self.boxes[n]
         if top >= bottom or left >= right:
             return NO_BOX
@@ -117,7 +117,7 @@ class Trail:
         self.box = NO_BOX
 
     def add(self, stamps: Stamps, ages_s: FloatArray, first: int, stop: int) -> None:
-        """Adds stamps first .. stop - 1, whose ages stand at the same places of `ages_s`."""
+        """Adds stamps first .. stop - 1, whose ages are `ages_s[first:stop]`."""
         brightness = 0.5 ** (ages_s[first:stop] / self._half_life_s)
         for n in np.flatnonzero(brightness >= FAINTEST):
             box = stamps.draw(self.image, first + int(n), float(brightness[n]))

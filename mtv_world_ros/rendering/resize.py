@@ -1,4 +1,4 @@
-"""Frames brought to another size, the same way in serving, training and evaluation."""
+"""Resizing of frames, the same in serving, training and evaluation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mtv_world_ros.data_types import ByteArray
 
 
 def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
-    """Returns (N, height, width, 3) frames, averaged over the area where they shrink."""
+    """Returns (N, height, width, 3) frames; shrinking averages over areas."""
     if frames.shape[1:3] == (height, width):
         return frames
     shrinks = height <= frames.shape[1] and width <= frames.shape[2]

@@ -35,15 +35,15 @@ from mtv_world_ros.rendering.glow import (
     Trail,
 )
 
-#: how much of a finger is drawn [m]
+#: drawn length of a finger [m]
 _FINGER_LENGTH_M = 0.03
 #: most trail points from one frame to the next
 _MOST_POINTS = 32
-#: a link is drawn in so many pieces, so that it bends with the lens and ends behind the camera
+#: pieces that a link is drawn in, to follow lens distortion and end at the camera plane
 _PIECES = 4
 #: fractional bits of pixel positions
 _SHIFT = 4
-#: pieces that end further than this many image sizes away are left out
+#: pieces that end further than this many image sizes away are not drawn
 _FARTHEST = 4.0
 
 _Length = Annotated[float, Field(gt=0), expected('positive and finite')]
@@ -102,7 +102,7 @@ _LINK_SHARE = 0.5
 #: points and lines nearer than this are drawn as large as at this depth [m]
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
-#: of an arm's two fingers
+#: colours of an arm's two fingers
 _FINGER_COLOURS = (_WHITE, np.array([1.0, 0.0, 1.0]))
 
 
@@ -295,7 +295,7 @@ def _stamps(
 
 
 class _Paint:
-    """Covers an image with one colour, as far as a glow says."""
+    """Blends one colour into an image, with a glow as alpha."""
 
     def __init__(self, colour: FloatArray) -> None:
         levels = np.arange(256)[:, None]
@@ -323,9 +323,9 @@ class ToolMotion:
         times: (N,) [s].
         points: (A, N, 3) in the base frame [m].
         closed: (A, T) 0 open .. 1 closed, at the frames.
-        shown_at: (T,) index of each frame's own point.
-        fingers: two of each arm: (2, T, 3) the ends of a line along the finger, at the frames [m];
-            NaN where it is not known how the fingers travel.
+        shown_at: (T,) index of the point at each frame.
+        fingers: two per arm: (2, T, 3) end points of a line along the finger, at the frames [m];
+            NaN if the travel of the fingers is unknown.
     """
 
     times: FloatArray
@@ -408,7 +408,7 @@ class ArmLinks:
             self._widths.append(width_m * focal / np.maximum(depths, _NEAREST_SIZE_M))
 
     def draw(self, image: ByteArray, arm: int, frame: int, colour: FloatArray) -> None:
-        """Draws one arm onto an (H, W, 3) image; what is behind the camera is left out.
+        """Draws one arm onto an (H, W, 3) image; pieces behind the camera are not drawn.
 
         Args:
             image: drawn upon.
@@ -426,7 +426,7 @@ class ArmLinks:
 
 
 def _in_pieces(points: FloatArray) -> FloatArray:
-    """Points (N, T, 3) with those between them: (_PIECES * (N - 1) + 1, T, 3)."""
+    """Points (N, T, 3) with interpolated ones between them: (_PIECES * (N - 1) + 1, T, 3)."""
     shares = np.arange(_PIECES)[None, :, None, None] / _PIECES
     between = points[:-1, None] * (1 - shares) + points[1:, None] * shares
     return np.concatenate([between.reshape(-1, *points.shape[1:]), points[-1:]])

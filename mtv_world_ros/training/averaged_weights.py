@@ -1,4 +1,4 @@
-"""The trained weights: float32 for the optimizer, their averages, and the copy that computes."""
+"""Trained weights: float32 master weights, their moving averages, and the working copy."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTra
 
 
 class Weights:
-    """A transformer in the number format of forward and backward, and what is trained of it.
+    """A transformer in the number format of forward and backward, with its trained parameters.
 
-    Parameters without `requires_grad` stay as they are and take no further memory.
+    Parameters without `requires_grad` stay unchanged and take no further memory.
 
     Args:
-        transformer: becomes `worker`.
-        device: where all of it goes.
+        transformer: becomes `worker`, the working copy.
+        device: of all weights.
         dtype: of forward and backward.
         ema_decay: of the averaged weights.
     """
@@ -50,23 +50,23 @@ class Weights:
 
     @torch.no_grad()
     def load(self, weights: dict[str, Tensor]) -> None:
-        """Takes float32 weights, by name; the computing copy follows."""
+        """Loads float32 weights by name, also into the working copy."""
         for name, master in self.master.items():
             master.copy_(weights[name])
         self.share()
 
     @torch.no_grad()
     def share(self) -> None:
-        """Gives the computing copy the float32 weights."""
+        """Copies the float32 weights into the working copy."""
         for worker, master in self._pairs:
             worker.copy_(master)
 
     @torch.no_grad()
     def collect(self) -> None:
-        """Adds the computing copy's gradients to those in float32, and drops them."""
+        """Adds the working copy's gradients to those in float32, and clears them."""
         for worker, master in self._pairs:
             if master.grad is None:
-                # zeros where nothing came: all processes must add up the same tensors
+                # zeros if there is no gradient: all processes must sum the same tensors
                 master.grad = torch.zeros_like(master)
             if worker.grad is not None:
                 master.grad += worker.grad
@@ -74,7 +74,7 @@ class Weights:
 
     @contextmanager
     def lent(self) -> Iterator[MultiViewWanTransformer]:
-        """Lends the computing copy with averaged weights, which are those that will serve."""
+        """Yields the working copy with the averaged weights, which are those that will serve."""
         with torch.no_grad():
             for (worker, _), average in zip(self._pairs, self.ema.shadow_params, strict=True):
                 worker.copy_(average)

@@ -1,4 +1,4 @@
-"""The checkpoint that a training builds on: a transformer to adapt, and encoders as they are."""
+"""The base checkpoint of a training: a transformer to adapt, and frozen encoders."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Base:
         folder: where it lies.
         checkpoint: its parts; the transformer has a new adapter where the preset trains one.
         encoders: on the device.
-        digest: tells its transformer's weights from others.
+        digest: identifies its transformer's weights.
     """
 
     folder: Path
@@ -55,7 +55,7 @@ def load_base(
 ) -> Base:
     """Loads a checkpoint and adds a new adapter where the preset trains one.
 
-    umT5 is loaded to encode the prompt, and freed again.
+    umT5 is loaded to encode the prompt, then freed.
 
     Args:
         config: the preset.
@@ -108,7 +108,7 @@ def _check_transformer(
 
 
 def _check_card(config: TrainingConfig, card: Mapping[str, Any], folder: Path) -> None:
-    """An adapter is served under its base's card, so it has to be trained under it too."""
+    """An adapter is served with its base's card, so it has to be trained with it."""
     mine = config.card({})
     theirs = {**card, 'rendering': TrajectoryVideoConfig(**card['rendering']).model_dump()}
     for name in (*SHARED_KEYS, 'rendering', 'history'):
@@ -122,7 +122,7 @@ def _check_card(config: TrainingConfig, card: Mapping[str, Any], folder: Path) -
 
 
 def _digest(transformer: MultiViewWanTransformer) -> str:
-    """Of the first numbers of every tensor, in a number format that all others round to."""
+    """Digest of the first numbers of every tensor, in the coarsest number format."""
     digest = hashlib.sha256()
     for name, tensor in transformer.state_dict().items():
         first = tensor.flatten()[:64].to('cpu', torch.bfloat16).view(torch.int16)
@@ -131,5 +131,5 @@ def _digest(transformer: MultiViewWanTransformer) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it: tuples are lists."""
+    """Returns the value as JSON stores it: tuples become lists."""
     return json.loads(json.dumps(value))

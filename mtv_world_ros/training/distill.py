@@ -1,10 +1,10 @@
 """`mtv-world distill`: a student that samples in a few steps what its teacher does in many.
 
-The student's n steps each have to lead where the teacher gets in m steps of its own. A training
-step draws noise, follows the teacher down all n * m noise levels, and asks of the student, at each
-of the n levels where it will be evaluated, for the straight flow to the next one. With every line
-learned, n Euler steps of the student end where n * m of the teacher do; sampler, schedule and the
-model's form stay what they are.
+Each of the student's n steps has to reach what the teacher reaches in m steps of its own. A step
+of training draws noise, follows the teacher down all n * m noise levels, and trains the student,
+at each of the n levels where it will be evaluated, to predict the straight flow to the next one.
+With every line learned, n Euler steps of the student end where n * m of the teacher do; sampler,
+schedule and the model's form stay what they are.
 
 Followed: PeRFlow (Yan et al. 2024, arXiv:2405.07510), which straightens a flow within windows; and
 FlowSteer (arXiv:2511.18834), which found that PeRFlow fell behind because its windows begin at
@@ -56,11 +56,11 @@ _SETTINGS = 'distillation.json'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistillConfig:
-    """How far the student's steps reach.
+    """Numbers of denoising steps.
 
     Attributes:
-        num_steps: denoising steps that the student is made for.
-        teacher_steps: of the teacher, a multiple of them.
+        num_steps: the student's.
+        teacher_steps: the teacher's, a multiple of `num_steps`.
     """
 
     num_steps: int = 4
@@ -77,16 +77,16 @@ class DistillConfig:
 
     @property
     def substeps(self) -> int:
-        """Steps of the teacher for each of the student's."""
+        """Teacher steps per student step."""
         return self.teacher_steps // self.num_steps
 
 
 class DistillTrainer(Trainer):
-    """Trains a student, which begins as its teacher.
+    """Trains a student that starts from its teacher's weights.
 
     Args:
-        teacher: to distil; guided where its card has a guidance scale.
-        distill: how far the student's steps reach.
+        teacher: to distil; guided if its card has a guidance scale.
+        distill: numbers of steps.
         options: those of `Trainer`.
     """
 
@@ -117,7 +117,7 @@ class DistillTrainer(Trainer):
         )
 
     def _text(self, key: str) -> Tensor | None:
-        """Tokens of a text of the card, in models with text."""
+        """Tokens of a text in the card; None in models without text."""
         encoder = self.parts.text_encoder
         if encoder is None:
             return None
@@ -132,7 +132,7 @@ class DistillTrainer(Trainer):
         self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
 
     def loss(self, batch: Batch) -> Loss:
-        """The loss of all the student's steps along one path of the teacher a clip."""
+        """The loss of all student steps along one path of the teacher per clip."""
         encoded = encode_batch(self.encoders, batch, self.config.objective, self.device)
         condition = encoded.conditioning.in_dtype(self.weights.worker.dtype)
         draws = Draws(self.seed, batch.step, batch.numbers)
@@ -194,7 +194,7 @@ class DistillTrainer(Trainer):
             'num_inference_steps': self.distill.num_steps,
             'trained_on': trained_on,
         }
-        card.pop('guidance_scale', None)  # the student has learned it
+        card.pop('guidance_scale', None)  # the student has learned guidance
         student = replace(
             self.parts,
             transformer=self.weights.averaged(),
@@ -209,15 +209,15 @@ def distill(
     checkpoint: Path, dataset: Any, out: Path, config: TrainingConfig, settings: DistillConfig,
     **options: Any,
 ) -> Path:  # fmt: skip
-    """Distils a checkpoint, resuming from `out` where it was left; returns the student's folder.
+    """Distils a checkpoint, resuming what `out` holds; returns the student's folder.
 
     Args:
         checkpoint: the teacher.
-        dataset: episodes; their start frames and actions count, their later frames only weigh
-            the pixels.
+        dataset: episodes; start frames and actions are inputs, later frames only give pixel
+            weights.
         out: see `train`.
-        config: optimizer, objective and disturbances; all else is the teacher's.
-        settings: how far the student's steps reach.
+        config: its optimizer, objective and augmentation are used; the rest is the teacher's.
+        settings: numbers of steps.
         options: of `train`.
 
     Raises:
@@ -287,7 +287,7 @@ Flow = Callable[[Tensor, Tensor], Tensor]
 
 
 def straight_scheduler(scheduler: Scheduler) -> FlowMatchEulerDiscreteScheduler:
-    """Returns the schedule of Euler steps with another one's shift; lines need no more."""
+    """Returns the Euler schedule with another one's shift; straight lines need no more."""
     config = scheduler.config
     shift = config['shift'] if 'shift' in config else config['flow_shift']
     return build_scheduler({'shift': shift})  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""What a training step of a preset takes, and how fast a machine could do it at best."""
+"""Memory and arithmetic of a training step, and its time at a machine's peak."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ _IMAGE_TOKENS = 257
 _GIB = 2**30
 #: rows and columns of the matrices that are multiplied
 _SIZE = {'cpu': 1024, 'cuda': 8192}
-#: products between two waits for the device: on a GPU waiting takes a share of one
+#: products between two synchronisations, so that waiting for a GPU hardly counts
 _TOGETHER = {'cpu': 1, 'cuda': 10}
 _REPEATS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCost:
-    """What a step takes of the transformer; encoding the videos comes on top.
+    """Cost of a step of the transformer; encoding the videos comes on top.
 
     Attributes:
         parameters: numbers in the transformer.
-        trainable: of them trained.
+        trainable: number of those that are trained.
         forward_flop: floating-point operations of a forward pass of one batch.
         step_flop: of forward and backward.
         weight_bytes: weights in the number format of forward and backward, and in float32 what is
             trained of them.
         training_bytes: averaged weights, gradients and Adam's moments of what is trained.
-        activation_bytes: what the forward pass keeps for the backward pass.
+        activation_bytes: kept by the forward pass for the backward pass.
     """
 
     parameters: int
@@ -61,7 +61,7 @@ class StepCost:
         return self.weight_bytes + self.training_bytes + self.activation_bytes
 
     def lines(self) -> list[str]:
-        """Returns the table of it, a line a row."""
+        """Returns the table as lines."""
         share = 100 * self.trainable / self.parameters
         return [
             f'parameters          {self.parameters / 1e6:12.2f} M',
@@ -78,13 +78,13 @@ class StepCost:
 def step_cost(
     config: TrainingConfig, *, action_dim: int, dtype: torch.dtype, fake: bool = True
 ) -> StepCost:
-    """Runs one step on shapes alone and counts.
+    """Runs one step on shapes only and counts operations and bytes.
 
     Args:
         config: the preset.
         action_dim: numbers an action, where the control does not draw them.
         dtype: of forward and backward.
-        fake: shapes alone; False computes the step, on the CPU.
+        fake: shapes only; False computes the step on the CPU.
     """
     arguments = dict(config.transformer)
     if config.video.control != TRAJECTORY_VIDEO:
@@ -130,7 +130,7 @@ def _attention() -> dict[Any, Any]:
 
 
 def _fill(module: nn.Module, dtype: torch.dtype) -> None:
-    """Puts zeros of a number format in the place of weights, which `meta` ones lack."""
+    """Replaces `meta` weights by zeros in a number format."""
     for part in module.modules():
         for name, parameter in list(part.named_parameters(recurse=False)):
             trained = parameter.requires_grad
@@ -204,7 +204,7 @@ def _action_inputs(
     control, num_frames = config.video.control, config.video.num_frames
     values = {}
     if control == FAST_TOKENS:
-        # as many as there are numbers: more than byte-pair encoding leaves
+        # one token per number: an upper bound, byte-pair encoding leaves fewer
         values['actions'] = zeros(num_frames * action_dim, kind=torch.int64)
     elif control != TRAJECTORY_VIDEO:
         values['actions'] = zeros(1 + num_frames, action_dim)
@@ -226,9 +226,9 @@ def _latent_size(config: TrainingConfig) -> tuple[int, int, int, int]:
 
 
 def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
-    """Returns operations a second of the fastest of some products of large matrices.
+    """Returns the highest rate [operations/s] of several products of large matrices.
 
-    On a CPU with the threads that torch has now; what else runs there at the time lowers it.
+    On a CPU with torch's current number of threads; other running processes lower it.
     """
     size = _SIZE.get(device.type, _SIZE['cuda'])
     together = _TOGETHER.get(device.type, _TOGETHER['cuda'])

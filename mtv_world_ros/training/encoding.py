@@ -1,4 +1,4 @@
-"""Clips as the transformer sees them: latents, tokens, and how much each latent weighs.
+"""Clips encoded for the transformer: latents, tokens, and weights of the latents.
 
 Shape letters: B batch, V views, C latent channels, F latent frames, h w latent size, N tokens.
 """
@@ -29,14 +29,14 @@ from mtv_world_ros.training.objective import Draws, latent_weights, pixel_weight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Encoders:
-    """What is not trained: pixels and words in, latents and tokens out.
+    """The frozen encoders: pixels to latents, text and images to tokens.
 
     Attributes:
         autoencoder: on the device that trains.
         text: (1, 512, text_dim) umT5 tokens of the prompt that all clips share, in models with
             text; the paper has one for all tasks.
         image: CLIP, in models with text.
-        history: what the model takes of what came before a chunk.
+        history: settings of the history frames.
     """
 
     autoencoder: Autoencoder
@@ -50,9 +50,9 @@ class EncodedBatch:
     """Clips in latents.
 
     Attributes:
-        clean: (B, V, C, F, h, w) what denoising shall give.
-        conditioning: what it is denoised under.
-        weights: in the shape of `clean`, at least 1: how much each latent counts.
+        clean: (B, V, C, F, h, w) targets of denoising.
+        conditioning: inputs of denoising.
+        weights: of each latent in the loss, at least 1; the shape of `clean`.
         step, numbers: see `Batch`.
     """
 
@@ -63,7 +63,7 @@ class EncodedBatch:
     numbers: Sequence[int] = ()
 
     def parts(self, count: int) -> Iterator[EncodedBatch]:
-        """Yields its clips in so many batches, as even as can be."""
+        """Yields its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
             chosen = slice(size * index // count, size * (index + 1) // count)
@@ -92,7 +92,7 @@ def encode_batch(
 
 
 def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> Conditioning:
-    """Returns what the clips of a batch are denoised under."""
+    """Returns the conditioning of a batch."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
     if batch.actions is None:
         assert batch.trajectory is not None
@@ -111,7 +111,7 @@ def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> C
 def _with_past(
     encoders: Encoders, latents: Conditioning, batch: Batch, device: torch.device
 ) -> Conditioning:
-    """Adds what the clips are shown of what came before them, in models that take that."""
+    """Adds anchor and history, in models that take them."""
     settings = encoders.history
     if settings.anchored:
         assert batch.anchor is not None
@@ -133,10 +133,10 @@ def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor
 def drop_conditions(
     conditioning: Conditioning, augment: AugmentConfig, draws: Draws
 ) -> Conditioning:
-    """Takes the control, the start image or its CLIP tokens from some samples, each by chance.
+    """Drops control, start image or its CLIP tokens in random samples, each independently.
 
-    What is dropped is zero. VideoX-Fun does so to one sample in ten; guidance away from a
-    condition needs a model that has seen none.
+    Dropped inputs are zero. VideoX-Fun drops one in ten samples; classifier-free guidance needs
+    a model trained without its condition.
     """
     dropped = {
         ('control', 'start_control'): augment.control_dropout,

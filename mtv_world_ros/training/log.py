@@ -1,4 +1,4 @@
-"""What a training reports: a progress bar, `log.jsonl` and TensorBoard."""
+"""Log of a training: a progress bar, `log.jsonl` and TensorBoard."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from tqdm import tqdm
 
 from mtv_world_ros.training.trainer import StepReport
 
-#: steps a row of the log stands for
+#: steps per row of the log
 _EVERY = 10
 
 
 class TrainingLog:
-    """Writes what steps did; a resumed one goes on where the saved state ends.
+    """Writes the log; a resumed training continues it after the saved state.
 
     Args:
         folder: gets `log.jsonl` and `tensorboard/`.
-        step: that the training starts from; what was logged after it is made again.
+        step: that the training starts from; later rows are dropped.
         total: steps of the training.
-        active: False writes nothing, for processes but the main one.
-        ideal_seconds: of a step whose model arithmetic runs at the machine's peak; None = unknown.
+        active: False writes nothing, for all processes except the main one.
+        ideal_seconds: of a step at the machine's peak arithmetic rate; None = unknown.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class TrainingLog:
             self._board.close()
 
     def add(self, report: StepReport) -> None:
-        """Counts a step; every tenth one, and the last, is written."""
+        """Counts a step; writes every tenth and the last one."""
         self._bar.update()
         self._steps += 1
         self._seconds += report.seconds

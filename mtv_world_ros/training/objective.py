@@ -1,4 +1,4 @@
-"""The training loss: flow matching, weighted towards what moves.
+"""The training loss: flow matching with higher weights on objects and changing pixels.
 
 Shape letters: B batch, V views, C latent channels, T frames, H W pixels, h w latent size.
 """
@@ -17,7 +17,7 @@ from mtv_world_ros.training.config import ObjectiveConfig
 
 
 class Draws:
-    """Numbers for the clips of a batch; a clip's depend on seed, step and its number alone.
+    """Random numbers per clip of a batch; they depend only on seed, step and clip number.
 
     Args:
         seed: of the run.
@@ -26,7 +26,7 @@ class Draws:
     """
 
     def __init__(self, seed: int, step: int, numbers: Sequence[int]) -> None:
-        # 1: apart from the numbers that cut and disturb the same clip, see `clips/batches.py`
+        # 1: independent of the numbers that cut and disturb the same clip, see `clips/batches.py`
         seeds = [np.random.SeedSequence((seed, step, number, 1)) for number in numbers]
         self._generators = [
             torch.Generator().manual_seed(int(s.generate_state(1, np.uint64)[0] >> 1))
@@ -49,8 +49,8 @@ CHANGE_THRESHOLD = 24
 class Loss(NamedTuple):
     """A sum of weighted errors and the sum of its weights; their ratio is the loss.
 
-    Both are sums over clips, so that a batch may be split among processes and in accumulated
-    parts: the sums of the parts have the ratio, and the gradients, of the whole.
+    Both are sums over clips, so that a batch may be split among processes and accumulated parts:
+    the sums over the parts give the same ratio and gradients as the whole batch.
     """
 
     total: Tensor
@@ -118,7 +118,7 @@ def add_noise(clean: Tensor, noise: Tensor, sigmas: Tensor) -> Tensor:
 
 
 def sigma_weights(sigmas: Tensor, config: ObjectiveConfig) -> Tensor:
-    """Returns how much samples count by their noise level, in the shape of `sigmas`.
+    """Returns weights of samples by their noise level, in the shape of `sigmas`.
 
     `middle` is DiffSynth-Studio's weighting: `exp(-2 ((t - 500) / 1000)^2)` for t = 1000 sigma,
     less its least value, with a mean of 1 over the 1000 steps of the shifted schedule.
@@ -150,8 +150,8 @@ def sample_loss(
         predicted: (B, V, C, T, h, w).
         clean: the same shape.
         weights: the same shape, positive.
-        delta: where the Huber loss turns from square to linear; None = the squared error.
-        by_sample: (B,) how much each sample counts; None = all alike.
+        delta: error from which on the Huber loss is linear; None = the squared error.
+        by_sample: (B,) weights of samples; None = equal.
     """
     predicted, clean = predicted.float(), clean.float()
     if delta is None:

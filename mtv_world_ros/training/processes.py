@@ -1,4 +1,4 @@
-"""The processes that train one model together: one, or as many as the launcher started."""
+"""Data-parallel training: one process, or as many as the launcher started."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 
-#: how long processes wait for the main one: it reads, encodes and judges alone; NCCL's 10 minutes
-#: end a training meanwhile
+#: how long processes wait for the main one, which alone reads, encodes and scores: NCCL's default
+#: of 10 minutes would end the training
 _PATIENCE = timedelta(days=1)
-#: numbers that are summed over the processes in one go
+#: numbers that are summed over the processes in one call
 _BUCKET = 2**24
 
 
 @contextmanager
 def memory_errors_named(device: torch.device) -> Iterator[None]:
-    """Says what to set where a training does not fit its device.
+    """Turns an out-of-memory error into one that says what to set.
 
     Raises:
         TrainingError: in place of torch's error.
@@ -39,7 +39,7 @@ def memory_errors_named(device: torch.device) -> Iterator[None]:
 
 
 class Processes:
-    """Which part of the work is this process's, and sums over all of them.
+    """This process's share of the work, and sums over all processes.
 
     Started with `torchrun` or `accelerate launch` there are several, on one machine or many;
     otherwise there is one. Each holds the whole model and trains a share of every step's clips.
@@ -50,7 +50,7 @@ class Processes:
 
     def __init__(self, device: str) -> None:
         chosen = torch.device(device)
-        # accelerate would choose the number of threads anew
+        # accelerate would change the number of threads
         os.environ.setdefault('OMP_NUM_THREADS', str(torch.get_num_threads()))
         self._state = PartialState(cpu=chosen.type == 'cpu', timeout=_PATIENCE)
         self.number: int = self._state.process_index
@@ -64,7 +64,7 @@ class Processes:
         return self.number == 0
 
     def share(self, count: int) -> range:
-        """Returns this process's part of `count` clips, as even as can be."""
+        """Returns this process's part of `count` clips; parts have nearly equal sizes."""
         return range(count * self.number // self.count, count * (self.number + 1) // self.count)
 
     def summed(self, tensor: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ class Processes:
             ) from error
 
     def sum_into(self, tensors: Sequence[Tensor]) -> None:
-        """Puts the sums over the processes in place of the tensors, all of one number format."""
+        """Replaces tensors, all of one number format, by their sums over the processes."""
         if self.count == 1:
             return
         for bucket in _buckets(tensors):
@@ -95,7 +95,7 @@ class Processes:
 
     @contextmanager
     def main_first(self) -> Iterator[None]:
-        """Lets the main process through the block before the others, which find what it left."""
+        """Runs the block in the main process first; the others then use its results."""
         with self._state.main_process_first():
             yield
 

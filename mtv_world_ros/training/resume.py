@@ -1,4 +1,4 @@
-"""The state of a training on disk: everything that a resumed run needs, whole or not at all."""
+"""The saved state of a training: everything that a resumed run needs, written atomically."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _TENSORS, _CARD = 'state.safetensors', 'state.json'
 
 
 class DiskError(TrainingError):
-    """Files cannot be read or written; what was saved before is whole."""
+    """Files cannot be read or written; the previous state is intact."""
 
 
 @contextmanager
 def disk_errors_named(folder: Path) -> Iterator[None]:
-    """Tells a full disk, or a folder that may not be written, from a fault of the program.
+    """Turns errors of the file system, such as a full disk, into `DiskError`.
 
     Raises:
         DiskError: in place of the error.
@@ -46,10 +46,10 @@ def disk_errors_named(folder: Path) -> Iterator[None]:
 def save_state(
     folder: Path, weights: Weights, optimizer: torch.optim.Optimizer, card: Mapping[str, Any]
 ) -> None:
-    """Writes the state into `folder/state`, which is the old or the new one at any moment.
+    """Replaces the state in `folder/state` atomically.
 
     Raises:
-        DiskError: it could not be written; the old one stays.
+        DiskError: it could not be written; the old state stays.
     """
     tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
     tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
@@ -73,7 +73,7 @@ def save_state(
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
-    """Returns what is known of the saved state, None where there is none."""
+    """Returns the metadata of the saved state; None if there is none."""
     _recover(folder / STATE)
     file = folder / STATE / _CARD
     return json.loads(file.read_text()) if file.is_file() else None
@@ -107,7 +107,7 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
 
 
 def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer) -> None:
-    """Puts the saved state's numbers in place.
+    """Loads the tensors of the saved state.
 
     Raises:
         TrainingError: it is damaged, or of another model.

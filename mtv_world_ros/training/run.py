@@ -47,7 +47,7 @@ def find_episodes(dataset: Path) -> list[Path]:
 
 
 def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
-    """Returns so many of them, evenly spread: sorted by name, the first ones are of one task."""
+    """Returns `count` of them, spread evenly: the first ones by name are all of one task."""
     if count is None or count >= len(paths):
         return list(paths)
     return [paths[index * len(paths) // count] for index in range(count)]
@@ -99,7 +99,7 @@ def train(
     data_workers: int = 0,
     latent_cache: Path | None = None,
 ) -> Path:
-    """Trains, resuming from `out` where it was left, and returns the folder of the result.
+    """Trains, resuming what `out` holds, and returns the folder of the result.
 
     That is a checkpoint, or an adapter for the checkpoint `initial` where the preset trains one.
 
@@ -116,14 +116,14 @@ def train(
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward.
         save_every: steps between saved states.
-        num_episodes: use only so many, spread evenly over all.
-        initial: checkpoint whose weights a new run starts from; a resumed one has its own. What
-            trains an adapter, or has text, takes its other parts too, also when resumed.
+        num_episodes: use this many episodes, spread evenly over the data set.
+        initial: checkpoint whose weights a new run starts from; a resumed run has its own. For an
+            adapter or a model with text, its other parts are used too, also when resumed.
         cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
-        make_trainer: what trains, with the arguments of `Trainer`.
-        held_out: judges checkpoints now and then, and keeps the best.
-        peak_flops: operations a second that a process's device can do at best, 0 = measure them;
-            the log then has the share that the model's arithmetic makes of them. None = not.
+        make_trainer: makes the trainer, with the arguments of `Trainer`.
+        held_out: scores checkpoints on held-out episodes and keeps the best.
+        peak_flops: peak rate of a process's device [operations/s], for the utilisation in the log;
+            0 = measure it, None = log no utilisation.
         data_workers: processes that prepare clips; 0 = a thread of this one.
         latent_cache: keeps what the encoders make of the clips; None = encode in every step.
 
@@ -152,7 +152,7 @@ def train(
         numbers=processes.share(config.optimizer.batch_size),
     )
     base = None
-    if make_trainer is Trainer and needs_base(config):  # another one brings its own
+    if make_trainer is Trainer and needs_base(config):  # another trainer brings its own
         base = load_base(config, initial, processes.device, dtype, seed=seed)
     if latent_cache is not None:
         with processes.main_first():
@@ -204,7 +204,7 @@ def train(
 
 
 def _steps_of(result: Path) -> int | None:
-    """Steps that a checkpoint or adapter was trained for; None where there is none."""
+    """Steps that a checkpoint or adapter was trained for; None if there is none."""
     card = result / CARD
     return json.loads(card.read_text())['trained_on']['steps'] if card.is_file() else None
 
@@ -236,7 +236,7 @@ def _loop(
 
 
 def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
-    """Refuses an episode that no clip can be cut from.
+    """Refuses an episode too short for a clip.
 
     Raises:
         EpisodeError: it is too short, or frames are missing everywhere.
@@ -249,7 +249,7 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
 
 
 def counted(skipped: Mapping[str, str]) -> list[str]:
-    """Returns a line a reason, without the paths in it, the most frequent first.
+    """Returns a line for each reason, without paths, the most frequent first.
 
     Args:
         skipped: reasons by the episode's path.
@@ -276,10 +276,10 @@ _BEST = 'best.json'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """What held-out episodes say of a checkpoint.
+    """Score of a checkpoint on held-out episodes.
 
     Attributes:
-        score: the higher the better; NaN = it says nothing.
+        score: the higher the better; NaN = undefined.
         numbers: by name, for the log.
     """
 
@@ -287,16 +287,16 @@ class Judged:
     numbers: Mapping[str, float]
 
 
-#: judges the checkpoint in a folder, after so many steps; evaluation is none of training's matter
+#: scores the checkpoint in a folder at a step; injected, since training does not import evaluation
 Judge = Callable[[Path, int], Judged]
 
 
 class HeldOut:
-    """Has a training's checkpoint judged now and then.
+    """Scores checkpoints at regular steps during a training.
 
     Args:
         judge: scores it.
-        every: steps between two times; the last step is one, too.
+        every: steps between two scores; the last step is scored, too.
 
     Raises:
         ConfigError: `every` is not positive.
@@ -308,9 +308,9 @@ class HeldOut:
         self._judge, self._every = judge, every
 
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
-        """Judges the averaged weights if it is time; the best go to `checkpoint-best/`.
+        """Scores the averaged weights if due; the best go to `checkpoint-best/`.
 
-        Or to `adapter-best/`, where an adapter is trained.
+        An adapter goes to `adapter-best/`.
         """
         if step % self._every and step != trainer.config.optimizer.steps:
             return

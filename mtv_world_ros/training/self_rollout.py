@@ -1,10 +1,10 @@
-"""Start frames of the model's own making, so that long rollouts hold.
+"""Training from self-generated start frames, so that long rollouts stay stable.
 
 A model that only ever sees recorded start frames meets its own errors first in a chain of chunks,
-and they add up. Here some clips start where the model's own rollout of the chunks before ended,
-made as serving makes it, without gradient, while the target stays the recording: it learns to
-carry on from its own pictures. So do Resampling Forcing (arXiv:2512.15702: self-made, detached
-history, flow matching towards the recording) and BAgger (arXiv:2512.12080); Self Forcing
+and they add up. Here some clips start from the end of the model's own rollout of the preceding
+chunks, generated as in serving and without gradient, while the target stays the recording: it
+learns to continue from its own pictures. So do Resampling Forcing (arXiv:2512.15702: self-made,
+detached history, flow matching towards the recording) and BAgger (arXiv:2512.12080); Self Forcing
 (arXiv:2506.08009) and PersistWorld (arXiv:2603.25685) roll out likewise and judge the result
 otherwise, by a critic and by rewards.
 
@@ -40,7 +40,7 @@ class SelfRollout:
         controls: makes trajectory videos or actions of what was imagined.
         encoders: on the device that trains.
         scheduler: noise levels and step rule of serving.
-        num_inference_steps: denoising steps a chunk.
+        num_inference_steps: denoising steps per chunk.
         seed: of the noise.
         device: where the model is.
     """
@@ -64,7 +64,7 @@ class SelfRollout:
         Args:
             batch: clips.
             step: of the training; the noise depends on it.
-            transformer: imagines; best with averaged weights, which are those that will serve.
+            transformer: imagines; best with averaged weights, which are those that are served.
         """
         leads = {i: lead for i, lead in enumerate(batch.leads) if lead is not None}
         if not leads:
@@ -157,14 +157,14 @@ class SelfRollout:
         trajectory = None if batch.trajectory is None else batch.trajectory.clone()
         history = None if batch.history is None else batch.history.clone()
         for row, (index, lead) in enumerate(leads.items()):
-            # the rollout was made in true colours, which segmenters know
+            # the rollout was made in true colours, which segmenters expect
             start_frame[index] = made.start_frame[row][..., list(lead.colours)]
             if history is not None and made.history is not None:
                 history[index] = made.history[row][..., list(lead.colours)]
             if trajectory is not None and made.trajectory is not None:
                 trajectory[index] = made.trajectory[row]
         # encoded actions do not depend on pictures
-        # nor do anchors on what was imagined: a rollout begins with a recorded frame
+        # nor do anchors on imagined ones: a rollout begins with a recorded frame
         return replace(batch, start_frame=start_frame, trajectory=trajectory, history=history)
 
 

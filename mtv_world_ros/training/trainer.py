@@ -53,16 +53,16 @@ _WINDOW = 50
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepReport:
-    """What a step did.
+    """Report of a step.
 
     Attributes:
         step: its number, from 1.
         loss: over all clips of the step, of all processes.
         average: of the recent losses.
-        learning_rate: that it was made with.
-        grad_norm: before it was shortened.
-        seconds: that it took, waiting included.
-        waited: seconds of it without the next batch.
+        learning_rate: of the step.
+        grad_norm: before clipping.
+        seconds: duration, waiting included.
+        waited: seconds of it spent waiting for the batch.
     """
 
     step: int
@@ -86,7 +86,7 @@ class Trainer:
     """Trains the transformer of a preset.
 
     Every process computes the clips of `clips`, a share of each step's; errors, weights and
-    float32 gradients are summed over the processes, so that all of them make the same step.
+    float32 gradients are summed over the processes, so that all make the same step.
 
     Args:
         config: the preset.
@@ -94,13 +94,13 @@ class Trainer:
         seed: of weights, noise and batches.
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
-        trained_on: what stands in the checkpoint's card.
+        trained_on: entry of the checkpoint's card.
         actions: how positions become actions, where the preset's control does not draw them.
         processes: that train together; None: those that the launcher started.
-        base: checkpoint that is trained on top of; None: all weights start anew.
+        base: checkpoint to train on top of; None: all weights are new.
 
     Raises:
-        TrainingError: fewer clips a step than processes times accumulated parts.
+        TrainingError: fewer clips per step than processes times accumulated parts.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Trainer:
         return self.processes.share(settings.batch_size)
 
     def start_from(self, folder: Path) -> None:
-        """Takes the weights of a checkpoint of the same architecture; the optimizer starts anew.
+        """Loads the weights of a checkpoint of the same architecture; the optimizer state is new.
 
         Raises:
             CheckpointError: the folder holds no checkpoint.
@@ -180,12 +180,12 @@ class Trainer:
         save_every: int,
         on_save: Callable[[int], None],
     ) -> Iterator[StepReport]:
-        """Trains to `config.optimizer.steps`, yielding a report a step.
+        """Trains to `config.optimizer.steps`, yielding a report for each step.
 
         Args:
             source: makes the clips of `clips`.
             save_every: steps between saved states.
-            on_save: called with the step after each, in the main process alone.
+            on_save: called with the step after each save, in the main process only.
 
         Raises:
             TrainingError: the loss is not finite, the device is out of memory, a state cannot be
@@ -270,12 +270,12 @@ class Trainer:
         )
 
     def save_state(self) -> None:
-        """Writes everything a resumed run needs, whole or not at all."""
+        """Writes everything a resumed run needs, atomically."""
         card = {'step': self.step, 'recent': list(self._recent), **self._identity()}
         save_state(self.folder, self.weights, self.optimizer, card)
 
     def _identity(self) -> dict[str, Any]:
-        """What must be the same in a resumed run."""
+        """Values that must be the same in a resumed run."""
         return {
             'seed': self.seed,
             'control': self.config.video.control,
@@ -299,7 +299,7 @@ class Trainer:
 
     @property
     def result(self) -> Path:
-        """Where the averaged weights go: as a checkpoint, or as an adapter for the base."""
+        """Folder of the result: a checkpoint, or an adapter for the base."""
         return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
@@ -317,7 +317,7 @@ class Trainer:
 def export_adapter(
     folder: Path, weights: Weights, card: Mapping[str, Any], base: Base | None
 ) -> None:
-    """Writes the averaged adapter in float32, with what is trained beside it and its card."""
+    """Writes the averaged adapter in float32, with the weights trained beside it and its card."""
     save_adapter(weights.worker, folder, weights=weights.averages(), card=_with_text(card, base))
 
 

@@ -19,9 +19,9 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     'bgra8': (4, cv2.COLOR_BGRA2RGB),
     'mono8': (1, cv2.COLOR_GRAY2RGB),
 }
-#: how a JPEG and a PNG start and end; decoders fill what is missing of a cut one with grey
+#: signatures at start and end of JPEG and PNG; decoders fill the rest of a cut file with grey
 _SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', b'\x89PNG': b'IEND'}
-#: some cameras pad their files
+#: largest padding after the end: some cameras pad their files
 _MAX_PADDING = 4096
 
 

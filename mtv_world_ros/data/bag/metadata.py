@@ -29,7 +29,7 @@ class Qos:
     depth: int = 10
 
 
-#: of topics whose last message later subscribers must get
+#: profile of latched topics: later subscribers get the last message
 LATCHED = Qos(durability='transient_local', depth=1)
 
 

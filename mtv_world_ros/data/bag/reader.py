@@ -1,4 +1,4 @@
-"""Reads the raw messages of rosbag2 MCAP bags, also of bags that were cut off."""
+"""Reads the raw messages of rosbag2 MCAP bags, including bags that were cut off."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class BagMessage(NamedTuple):
 
 
 class _Cut(Exception):
-    """The record ends before its end, or is damaged from here on."""
+    """The recording is cut off or damaged from here on."""
 
 
 class BagReader:
@@ -55,7 +55,7 @@ class BagReader:
 
     Attributes:
         truncated: why the record ends early; empty where it does not. Known after a pass.
-        problems: other things found wrong, one line each.
+        problems: other problems found, one line each.
         metadata: MCAP metadata records by name. Complete after a pass.
         custom_data: `custom_data` of metadata.yaml.
 
@@ -80,7 +80,7 @@ class BagReader:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yields the messages of `topics` (default: all) in the order they were recorded.
 
-        Messages that are not in CDR are left out and named in `problems`.
+        Messages that are not in CDR are skipped and named in `problems`.
 
         Raises:
             EpisodeError: a file is not MCAP or uses an unknown compression.
@@ -226,7 +226,7 @@ def iter_messages(
     Args:
         path: rosbag2 folder or .mcap file.
         topics: topics to yield; None = all.
-        problems: gets a line for each thing found wrong, a cut included.
+        problems: receives a line for each problem found, including a cut.
 
     Raises:
         EpisodeError: there is no such bag; or the bag is cut off and `problems` is None, once

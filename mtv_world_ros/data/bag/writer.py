@@ -24,7 +24,7 @@ from mtv_world_ros.data.bag.metadata import (
 )
 from mtv_world_ros.errors import EpisodeError
 
-#: a cut file loses little more than the chunk it was cut in
+#: small chunks: a cut file loses little more than its last chunk
 CHUNK_BYTES = 256 * 1024
 
 
@@ -56,11 +56,11 @@ class BagWriter:
 
     @property
     def folder(self) -> Path:
-        """Where files may be put that shall go with the bag (hidden until `close()`)."""
+        """Folder for files that go with the bag (hidden until `close()`)."""
         return self._folder
 
     def declare(self, topic: str, msgtype: str, qos: Qos | None = None) -> None:
-        """Adds a topic, with the profile `ros2 bag play` shall offer it with.
+        """Adds a topic, with the QoS profile that `ros2 bag play` will offer.
 
         Topics that are not declared get a reliable profile of depth 10 at their first message.
 
@@ -127,7 +127,7 @@ class BagWriter:
                 self._drop()
 
     def abort(self) -> None:
-        """Drops the record; nothing stays. Does nothing after `close()`."""
+        """Deletes the unfinished recording. Does nothing after `close()`."""
         with self._lock:
             self._drop()
 

@@ -51,6 +51,7 @@ class ScoreRow:
         j_frames: (T,) J per frame.
         j_copy_frames: the same of the first frame held.
         j_shuffled_frames: the same with the actions of another episode; empty = not imagined.
+        moving_imagined: whether it moves in the predicted frames, by the same rule.
     """
 
     stretch: int
@@ -70,6 +71,7 @@ class ScoreRow:
     j_frames: tuple[float, ...]
     j_copy_frames: tuple[float, ...]
     j_shuffled_frames: tuple[float, ...]
+    moving_imagined: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values, None for NaN."""
@@ -179,6 +181,7 @@ def score_rows(
     truth: Truth,
     predicted: ObjectScores,
     others: Mapping[str, ObjectScores],
+    masks: ObjectMasks | None = None,
 ) -> list[ScoreRow]:
     """Returns a row per view and object, and one per view for the union of objects.
 
@@ -188,7 +191,10 @@ def score_rows(
         truth: what it is scored against.
         predicted: scores of the prediction.
         others: scores by name, of `OTHERS`; those that are missing were not measured.
+        masks: in the predicted frames; they tell what is imagined to move.
     """
+    first = truth.first.masks[:, :, 0]
+    imagined = np.zeros_like(truth.moving) if masks is None else moves(masks.masks, first)
     scores = {**others, 'copy': persistence_scores(truth.first.masks[:, :, 0], truth.masks)}
     rows = []
     for v, view in enumerate(views):
@@ -206,6 +212,7 @@ def score_rows(
                     j_frames=_frames(predicted, v, o),
                     j_copy_frames=_frames(scores['copy'], v, o),
                     j_shuffled_frames=_frames(scores.get('shuffled'), v, o),
+                    moving_imagined=bool(imagined[v, o]),
                     **_values(scores, lambda found, v=v, o=o: found.objects[v, o]),
                 )
             )
@@ -256,6 +263,7 @@ MEANS = {
     'j_union': ('j', 'union'),
     'j_copy_union': ('j_copy', 'union'),
     'j_moving': ('j', 'moving'),
+    'j_moving_either': ('j', 'moving_either'),
     'j_copy_moving': ('j_copy', 'moving'),
     'j_shuffled_moving': ('j_shuffled', 'moving'),
     'j_zero_moving': ('j_zero', 'moving'),
@@ -287,6 +295,7 @@ def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float
         'object': [row for row in kept if row.name],
         'union': [row for row in kept if not row.name],
         'moving': [row for row in kept if row.name and row.moving],
+        'moving_either': [row for row in kept if row.name and (row.moving or row.moving_imagined)],
     }
     means = {name: _mean(chosen[which], field) for name, (field, which) in MEANS.items()}
     for name, (minuend, subtrahend) in MARGINS.items():

@@ -17,6 +17,7 @@ COLUMNS = {
     'j_object_mean': 'J objects',
     'j_union': 'J union',
     'j_moving': 'J moving',
+    'j_moving_either': 'J moving in truth or imagination',
     'j_copy_moving': 'persistence',
     'j_shuffled_moving': 'shuffled actions',
     'margin_moving': 'margin over persistence',

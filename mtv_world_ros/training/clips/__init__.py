@@ -1,1 +1,1 @@
-"""Training clips: what is cut from recordings, and its batches."""
+"""Training clips: cutting them from recordings, and batches of them."""

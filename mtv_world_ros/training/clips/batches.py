@@ -45,7 +45,7 @@ class Batch:
 
     Attributes:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
-        start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model is shown it.
+        start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         actions: what `ActionEncoding` gives, where they are not drawn.
@@ -53,8 +53,8 @@ class Batch:
             history; see `past.py`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
         history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
-        leads: B of them, what comes before the clips that are to start from the model's own
-            prediction, None for the others; empty = none is.
+        leads: B entries: the preceding chunks of clips that start from the model's own
+            prediction, None for other clips; empty = no such clip.
         step: of the training, from 0.
         numbers: of its clips within the step's whole batch, which processes and accumulation
             split; each clip's noise depends on its own.
@@ -73,7 +73,7 @@ class Batch:
     numbers: Sequence[int] = ()
 
     def parts(self, count: int) -> Iterator[Batch]:
-        """Yields its clips in so many batches, as even as can be."""
+        """Yields its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
             chosen = slice(size * index // count, size * (index + 1) // count)
@@ -95,11 +95,11 @@ class _Sample(NamedTuple):
 
 
 class BatchSource:
-    """Cuts, draws and disturbs clips; one batch is prepared while the last one trains.
+    """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
 
     Args:
         recordings: where clips come from.
-        config: views and times of clips, how they are drawn and disturbed, how many a step.
+        config: views and times of clips, how they are drawn and disturbed, clips per step.
         robot: of the recordings.
         segmenter: finds the objects of the first frames.
         seed: of choice and disturbances.
@@ -219,7 +219,7 @@ class BatchSource:
     def _past(
         self, recording: Recording, start: int, lead: Lead | None, rng: np.random.Generator
     ) -> Past | None:
-        """What the clip is shown of what came before it, in models that take that."""
+        """Anchor and history of the clip, in models that take them."""
         if not self._history.on:  # nothing is drawn: runs without history keep their clips
             return None
         if lead is None:
@@ -229,7 +229,7 @@ class BatchSource:
         return draw_past(history, self._history, rng)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
-        """An episode and the starts of its clips; failed ones as often as they are asked for."""
+        """Draws an episode with the starts of its clips; failed ones with the configured share."""
         share = self._augment.failure_share
         pool = self._starts
         if share is not None and self._failed and rng.random() < share:
@@ -238,7 +238,7 @@ class BatchSource:
 
 
 def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
-    """Returns fields of a batch: what its clips are shown of what came before them."""
+    """Returns fields of a batch: anchors and histories of its clips."""
     known = [past for past in given if past is not None]
     if not known:
         return {}
@@ -250,7 +250,7 @@ def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
 
 
 def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
-    """Those of the starts that are at least a stride [s] apart."""
+    """Starts that are at least a stride [s] apart."""
     kept: list[int] = []
     for start in starts:
         if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
@@ -259,7 +259,7 @@ def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.nda
 
 
 def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
-    """Zero ids in place of missing ones, where another clip has some; they weigh the same."""
+    """Zero ids in place of missing ones, if another clip has some."""
     known = next((part for part in ids if part is not None), None)
     if known is None:
         return list(ids)
@@ -267,7 +267,7 @@ def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
 
 
 def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:
-    """All of a batch as one tensor; None where some clip has none."""
+    """Stacked tensor of a batch; None if a clip has none."""
     found = [part for part in parts if part is not None]
     return torch.from_numpy(np.stack(found)) if len(found) == len(parts) else None
 
@@ -288,7 +288,7 @@ _make_clip: MakeClip | None = None
 
 
 class ClipWorkers:
-    """Makes clips in processes of its own.
+    """Makes clips in worker processes, forked so that they share the recordings.
 
     Args:
         make_clip: its results are sent between processes; it must not use a GPU.
@@ -333,7 +333,7 @@ def _begin(make_clip: MakeClip, parent: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """Ends this process when the training was killed, which cannot end it any more."""
+    """Ends this worker when the training process was killed."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

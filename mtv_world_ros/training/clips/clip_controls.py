@@ -1,4 +1,4 @@
-"""How a clip's actions are told: drawn as a trajectory video, or encoded as numbers."""
+"""Control input of a clip: its actions as a trajectory video, or encoded as numbers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlMaker:
-    """Makes what the model is told of a clip's actions, as serving does.
+    """Makes the control input of a clip, as serving does.
 
     Attributes:
         robot: of the episodes.
@@ -48,8 +48,8 @@ class ControlMaker:
         Args:
             clip: one chunk; its cameras, times and positions count.
             names: of the objects.
-            start_frame: (V, H, W, 3) uint8 RGB, what the chunk starts from; the objects are
-                looked for in it.
+            start_frame: (V, H, W, 3) uint8 RGB, first frame of the chunk; objects are
+                searched in it.
         """
         if self.actions is not None:
             return None, self.actions.encode(self.robot, clip.positions)

@@ -1,4 +1,4 @@
-"""Statistics and tokens of actions, learned from the clips that a model is trained on."""
+"""Statistics and tokens of actions, fitted to the training clips."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, STATISTICS, TRAJECTORY_VIDEO
 from mtv_world_ros.training.config import TrainingConfig
 
-#: clips that are looked at, spread evenly over all
+#: number of clips used, spread evenly
 _MOST_CLIPS = 4096
 
 
 def fit_actions(
     control: str, recordings: Sequence[Recording], spec: WorldModelSpec, robot: RobotModel
 ) -> ActionEncoding:
-    """Returns what a control that does not draw the actions learns from the clips.
+    """Returns the action encoding of a control that does not draw them, fitted to the clips.
 
     Raises:
         TrainingError: no episode is long enough for a clip.
@@ -48,9 +48,9 @@ def kept_actions(
     *,
     initial: Path | None = None,
 ) -> ActionEncoding | None:
-    """Returns what a run in this folder learned before, or learns it, and keeps it there.
+    """Returns the action encoding stored in the folder, or fits and stores it.
 
-    A new run that starts from the weights of a checkpoint takes over what they were trained with.
+    A new run that starts from the weights of a checkpoint takes over its encoding.
 
     Raises:
         CheckpointError: the folder holds that of another control.

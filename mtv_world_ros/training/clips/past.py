@@ -1,9 +1,9 @@
-"""What a clip is shown of what came before it, drawn as serving will show it.
+"""Anchor and history frames of a training clip, drawn with the distribution of serving.
 
-A clip is taken as if a rollout had begun some frames before it: that frame is the anchor, and the
-frames since are the history, as many as there are up to N. So the first chunk of a rollout (none),
-the chunks soon after it (few, the oldest repeated) and all later ones come in training as they do
-in serving, and no number of frames is served that was not trained.
+A clip is treated as if a rollout had begun some frames before it: that frame is the anchor, and
+the frames since then, at most N, are the history. So the first chunk of a rollout (no history),
+the chunks soon after it (few frames, the oldest repeated) and all later ones occur in training as
+in serving, and every history length that is served was trained.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mtv_world_ros.training.config import HistoryConfig, SelfRolloutConfig
 
 
 class Past(NamedTuple):
-    """What of a clip's past the model is shown.
+    """Anchor and history of a clip.
 
     Attributes:
         anchor: (V, H, W, 3) uint8 RGB first frame of the rollout.
@@ -39,7 +39,7 @@ def history_before(
     config: HistoryConfig,
     rng: np.random.Generator,
 ) -> History:
-    """Returns that of a rollout which began some frames before recorded frame `start`."""
+    """Returns the past of a rollout that began some frames before recorded frame `start`."""
     begins = rng.random() < config.first_share
     longest = int((recording.times[start] - recording.times[0]) * spec.fps + 1e-3)
     if begins or not longest:
@@ -47,21 +47,21 @@ def history_before(
     age = int(rng.integers(1, longest + 1))
     first = frame_before(recording, start, age / spec.fps)
     shown = None if first is None else frame_indices(recording, first, spec, age)
-    if shown is None:  # a gap: no rollout leads over it
+    if shown is None:  # a gap: no rollout can cross it
         return History.begin(recording.frames[:, start])
     kept = shown[max(age - config.num_frames, 0) : age]
     return History(anchor=recording.frames[:, shown[0]], frames=recording.frames[:, kept])
 
 
 def history_of_lead(lead: Lead, config: HistoryConfig) -> History:
-    """Returns that of a rollout which begins where the lead does; its frames are recorded ones."""
+    """Returns the past of a rollout that begins with the lead; its frames are recorded ones."""
     shown = lead.clip.frames[:, : lead.num_chunks * lead.num_frames]
     kept = max(shown.shape[1] - config.num_frames, 0)
     return History(anchor=shown[:, 0], frames=shown[:, kept:])
 
 
 def draw_past(history: History, config: HistoryConfig, rng: np.random.Generator) -> Past:
-    """Returns what a clip is shown of its history, with a noise level drawn for it."""
+    """Returns the history of a clip, with a noise level drawn for it."""
     known = history.frames.shape[1] > 0 and rng.random() >= config.dropout
     sigma = float(rng.uniform(0.0, config.max_noise)) if known else 1.0
     return Past(history.anchor, history.filled(config.num_frames), sigma)
@@ -75,7 +75,7 @@ class Lead:
         clip: (num_chunks + 1) * T frames behind its first one.
         num_chunks: chunks to imagine.
         names: of the objects.
-        colours: order of the colour channels that the clip is shown in.
+        colours: order of the colour channels of the clip.
     """
 
     clip: Clip
@@ -97,10 +97,10 @@ def lead_before(
     step: int,
     rng: np.random.Generator,
 ) -> Lead | None:
-    """Returns what comes before the clip at recorded frame `start`, if it is to have a rollout.
+    """Returns the lead of the clip at recorded frame `start`, if it is to start from a rollout.
 
-    Where the episode is not long enough before it, the rollout is shorter; None where it has no
-    room at all, and with the probability that the configuration says. The clip that is trained on
+    If the episode is too short before it, the rollout is shorter; None if there is no room at
+    all, and with the configured probability. The clip that is trained on
     then starts at the recorded frame next to `start`, on the rollout's clock.
     """
     # no draws while it is off, so that such runs keep their batches
@@ -117,7 +117,7 @@ def lead_before(
 
 
 def frame_before(recording: Recording, start: int, seconds: float) -> int | None:
-    """Returns the recorded frame nearest to so long before another; None = before the first."""
+    """Returns the recorded frame nearest to a time before another; None = before the first."""
     wanted = recording.times[start] - seconds
     if wanted < recording.times[0] - 1e-6:
         return None

@@ -1,1 +1,1 @@
-"""Encoded clips, kept on disk."""
+"""Encoded training clips on disk."""

@@ -35,18 +35,18 @@ from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.processes import Processes
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
-#: raised when what is stored, or how it is computed, changes
+#: to be increased when the stored data or their computation change
 _VERSION = 1
-#: what pixels weigh more for, in the order of a cache's `shares`
+#: kinds of pixels with extra weight, in the order of a cache's `shares`
 WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
 _NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
-#: stale clips that are named
+#: stale clips that a note names
 _MOST_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CachedClip:
-    """A clip that a cache holds or shall hold.
+    """A clip that a cache holds or will hold.
 
     Attributes:
         recording: its episode.
@@ -60,7 +60,7 @@ class CachedClip:
 
     @property
     def label(self) -> str:
-        """What it is called, whatever its content."""
+        """Its name, independent of its content."""
         return f'{self.recording.path.name} from frame {self.start}'
 
 
@@ -73,7 +73,7 @@ def settings_of(
         config: the preset.
         base: checkpoint whose encoders are used.
         robot: its kinematics place what trajectory videos show.
-        segmenter: name of what finds the objects.
+        segmenter: its name.
         dtype: of the encoders and of what is kept.
     """
     video = config.video.model_dump()
@@ -125,7 +125,7 @@ def read_clip(
 ) -> Batch:
     """Returns a clip as it was recorded, as a batch of one.
 
-    What it is shown of what came before it is drawn once, by its start.
+    Its anchor and history are drawn once, by its start.
     """
     cut = cut_clip(clip.recording, clip.start, spec)
     names = cut.objects or objects_from_instruction(clip.recording.instruction)
@@ -152,7 +152,7 @@ def read_clip(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Build:
-    """How far filling a cache has come: clips encoded, seconds since the first, bytes of one."""
+    """Progress of filling a cache: clips encoded, seconds since the first, bytes per clip."""
 
     num_encoded: int
     seconds: float
@@ -172,11 +172,11 @@ def fill(
     device: torch.device,
     dtype: torch.dtype,
 ) -> Iterator[Build]:
-    """Encodes the clips that a cache lacks, and yields after each.
+    """Encodes the missing clips of a cache, and yields after each.
 
     Args:
         cache: of the settings that all of the other arguments follow from.
-        clips: all that training takes.
+        clips: all clips of the training.
         read: gives a clip, undisturbed, as a batch of one.
         encoders: on the device.
         device: where to encode.
@@ -226,7 +226,7 @@ def _encode(
 
 
 def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
-    """(B, 3, V, F, h, w) uint8: how much of a latent changes, shows an object, or loses one."""
+    """(B, 3, V, F, h, w) uint8 shares of each latent that change, show an object, or lose one."""
     parts = []
     for name in WEIGHTS:
         one = _NO_WEIGHTS.replace(**{name: 1.0})
@@ -245,7 +245,7 @@ def cached(
     dtype: torch.dtype,
     processes: Processes,
 ) -> CachedSource:
-    """Encodes what the cache lacks, says what it did, and returns batches from the cache.
+    """Encodes missing clips, reports what it did, and returns batches from the cache.
 
     Args:
         source: of the same clips, not cached; it is closed.
@@ -300,7 +300,7 @@ def cached(
 
 
 def _check(config: TrainingConfig) -> None:
-    """Raises ConfigError where latents that are kept are not what training would see."""
+    """Raises ConfigError if cached latents would differ from those of uncached training."""
     if config.autoencoder.get('_class_name', 'SpaceToDepthAutoencoder') != 'AutoencoderKLWan':
         raise ConfigError(
             "--latent-cache is for presets with Wan's autoencoder; this one's only rearranges "
@@ -322,7 +322,7 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _changed(cache: LatentCache, clips: list[CachedClip]) -> list[str]:
-    """A note on clips whose episodes are no longer what was encoded."""
+    """A note on cached clips whose episodes have changed since."""
     stale = cache.changed({clip.key: clip.label for clip in clips})
     if not stale:
         return []
@@ -336,7 +336,7 @@ class CachedSource:
     Args:
         cache: has all clips.
         clips: of the training.
-        objective: how much pixels weigh.
+        objective: pixel weights.
         text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
         batch_size: clips of a step, over all processes.
         seed: of the order.
@@ -400,7 +400,7 @@ class CachedSource:
         )
 
     def close(self) -> None:
-        """Nothing to end; sources have it."""
+        """Does nothing: other sources have processes to end."""
 
     def _clip(self, step: int, number: int) -> CachedClip:
         epoch, place = divmod(step * self._batch_size + number, len(self._clips))

@@ -1,4 +1,4 @@
-"""What encoders made of training clips, kept on disk and used only while it is current."""
+"""Encoded training clips on disk, used only while their settings and episodes are unchanged."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 
-#: tensors are gathered up to so many bytes before they are written
+#: bytes of tensors that are gathered before they are written
 SHARD_BYTES = 256 * 2**20
 SETTINGS = 'settings.json'
 _STEM = 'latents'
@@ -40,7 +40,7 @@ class LatentCache:
 
     Attributes:
         folder: of these settings.
-        notes: what in `root` is not used, and why.
+        notes: caches in `root` that are not used, and why.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LatentCache:
         )
 
     def add(self, key: str, label: str, tensors: Mapping[str, Tensor]) -> None:
-        """Takes the tensors of a clip; they are on disk after its shard is full, or `flush`.
+        """Adds the tensors of a clip; they are on disk once its shard is full, or after `flush`.
 
         Raises:
             TrainingError: the disk is full, or the folder cannot be written.
@@ -100,7 +100,7 @@ class LatentCache:
             self.flush()
 
     def flush(self) -> None:
-        """Writes what waits.
+        """Writes the clips that wait.
 
         Raises:
             TrainingError: the disk is full, or the folder cannot be written.
@@ -143,7 +143,7 @@ class LatentCache:
 
 
 def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
-    """What the caches beside it were made with that is different now."""
+    """Settings in which the neighbouring caches differ."""
     notes = []
     for file in sorted(root.glob(f'*/{SETTINGS}')):
         try:

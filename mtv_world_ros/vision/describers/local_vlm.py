@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
+
+from mtv_world_ros.config import Count, expected, Schema
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.vision.describers.vlm import Answer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalVlmConfig:
-    """Which model, and where it runs.
+class LocalVlmConfig(Schema):
+    """Which model, and where it runs."""
 
-    Attributes:
-        model: folder, or name on the Hugging Face Hub (`Qwen/Qwen3-VL-4B-Instruct`).
-        device: `cpu`, `cuda`, ...
-        dtype: `auto` (the weights' own), `float32`, `bfloat16` or `float16`.
-        max_new_tokens: longest answer.
-    """
-
-    model: str
-    device: str = 'cpu'
-    dtype: str = 'auto'
-    max_new_tokens: int = 1024
+    model: str = Field(
+        description='folder, or name on the Hugging Face Hub (`Qwen/Qwen3-VL-4B-Instruct`)'
+    )
+    device: str = Field(default='cpu', description='`cpu`, `cuda`, ...')
+    dtype: str = Field(
+        default='auto',
+        description="`auto` (the weights' own), `float32`, `bfloat16` or `float16`",
+    )
+    max_new_tokens: Annotated[Count, expected('a positive whole number')] = Field(
+        default=1024, description='longest answer'
+    )
 
 
 class LocalVlm:

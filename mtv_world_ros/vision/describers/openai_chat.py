@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime, UTC
 from email.utils import parsedate_to_datetime
 import json
 from math import isfinite
 import os
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from pydantic import Field
 
+from mtv_world_ros.config import expected, Positive, Schema
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError
 from mtv_world_ros.vision.describers.vlm import Answer, ANSWER_SCHEMA, excerpt
@@ -34,27 +35,31 @@ _REFUSED_FORMAT = (400, 422)
 _MAX_ANSWER_BYTES = 4_000_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OpenAIConfig:
-    """Which server and model, and how patient to be.
+_Seconds = Annotated[Positive, expected('a positive number')]
 
-    Attributes:
-        model: name as the server knows it.
-        base_url: up to the version: Ollama has `http://localhost:11434/v1`, Ark
-            `https://ark.cn-beijing.volces.com/api/v3`.
-        key_variable: environment variable that holds the API key; empty = none is needed.
-        timeout_s: longest wait for one answer [s].
-        retry_budget_s: no new attempt starts later than this after the first [s].
-        first_wait_s: wait before the second attempt [s]; doubles after each. What the server
-            asks for in Retry-After goes first.
-    """
 
-    model: str
-    base_url: str = 'https://api.openai.com/v1'
-    key_variable: str = 'OPENAI_API_KEY'
-    timeout_s: float = 60.0
-    retry_budget_s: float = 120.0
-    first_wait_s: float = 1.0
+class OpenAIConfig(Schema):
+    """Which server and model, and how patient to be."""
+
+    model: str = Field(description='name as the server knows it')
+    base_url: str = Field(
+        default='https://api.openai.com/v1',
+        description='up to the version: Ollama has `http://localhost:11434/v1`, Ark '
+        '`https://ark.cn-beijing.volces.com/api/v3`',
+    )
+    key_variable: str = Field(
+        default='OPENAI_API_KEY',
+        description='environment variable that holds the API key; empty = none is needed',
+    )
+    timeout_s: _Seconds = Field(default=60.0, description='longest wait for one answer [s]')
+    retry_budget_s: _Seconds = Field(
+        default=120.0, description='no new attempt starts later than this after the first [s]'
+    )
+    first_wait_s: _Seconds = Field(
+        default=1.0,
+        description='wait before the second attempt [s]; doubles after each. What the server '
+        'asks for in Retry-After goes first',
+    )
 
 
 class OpenAIChat:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,16 @@ def test_still_objects_count_for_the_mean_but_not_for_the_moving_ones():
     means = episode_means([row(0.4, 0.2), row(1.0, 1.0, moving=False)], None)
     assert means['j_object_mean'] == 0.7
     assert means['j_moving'] == 0.4 and means['j_copy_moving'] == 0.2
+
+
+def test_what_is_imagined_to_move_joins_what_really_moves():
+    grasped = replace(row(0.1, 1.0, moving=False), moving_imagined=True)
+    means = episode_means([row(0.5, 0.2), grasped, row(1.0, 1.0, moving=False)], None)
+    assert means['j_moving'] == 0.5 and means['j_moving_either'] == pytest.approx(0.3)
+    assert ScoreRow.from_json(grasped.as_json()).moving_imagined
+    older = grasped.as_json()
+    del older['moving_imagined']
+    assert not ScoreRow.from_json(older).moving_imagined
 
 
 def test_unscored_rows_leave_the_baseline_too():

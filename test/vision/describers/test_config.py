@@ -11,7 +11,7 @@ import yaml
 from mtv_world_ros.assembly import assemble_describer
 from mtv_world_ros.errors import ConfigError, DescriptionError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.vision.describers.config import describer_config, load_describer_config
+from mtv_world_ros.vision.describers.config import DescriberConfig, load_describer_config
 from mtv_world_ros.vision.describers.describer import InstructionDescriber
 from mtv_world_ros.vision.describers.object_list import load_object_list
 from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
@@ -41,7 +41,7 @@ def test_the_file_that_is_shipped_is_valid_with_each_of_its_variants():
     paragraphs = shipped.read_text().split('\n\n')[1:]
     for kind, paragraph in zip(('list', 'openai', 'local'), paragraphs, strict=False):
         lines = [line.removeprefix('# ') for line in paragraph.splitlines()]
-        config = describer_config(yaml.safe_load('\n'.join(lines)))
+        config = DescriberConfig(**yaml.safe_load('\n'.join(lines)))
         assert config.kind == kind
         assert getattr(config, kind)
 
