@@ -113,8 +113,9 @@ def _train(arguments: argparse.Namespace) -> int:
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
-    paths = select(arguments.dataset, arguments.split, default='train').paths
     # importing torch takes seconds: what is often mistyped is checked before
+    if not arguments.dataset.is_dir():
+        select(arguments.dataset)  # says that it holds no episodes
     import torch
 
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
@@ -124,6 +125,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.run import train
 
     dtype = choose_dtype(arguments.dtype, arguments.device)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(1, len(os.sched_getaffinity(0)) // processes)
     torch.set_num_threads(arguments.threads or cores)
