@@ -101,7 +101,8 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
         (tmp_path / 'my_robot.urdf').write_text(URDF)
         load_robot(file)
     elif 'kind' in values:
-        load_policy_config(file)
+        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual.yaml')
+        load_policy_config(file, robot)
     elif 'views' in values:
         load_calibration(file)
     else:
