@@ -247,7 +247,7 @@ def _loads_a_pickle(call: ast.Call) -> bool:
 
 
 #: a reader that looks up no names but those of actions: LeRobot's servers answer with pickles
-RESTRICTED_READERS = {'mtv_world_ros/policies/lerobot_messages.py: pickle.Unpickler'}
+RESTRICTED_READERS = {'mtv_world_ros/policies/lerobot_client.py: pickle.Unpickler'}
 
 
 def test_no_pickle_is_loaded():

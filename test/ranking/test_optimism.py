@@ -68,7 +68,7 @@ def test_a_kind_is_measured_against_the_expert(optimism):
 
 
 def test_tables_fit_a_console(optimism):
-    both = {'/home/somebody/new': optimism, 'bundled': optimism}
+    both = {'/data/somebody/new': optimism, 'bundled': optimism}
     for by_model in ({'bundled': optimism}, both):
         tables = optimism_tables(by_model)
         assert len(tables) == 1 + len(by_model)
