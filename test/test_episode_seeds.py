@@ -8,7 +8,7 @@ import pytest
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
+from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import SEED_STEP

@@ -16,7 +16,7 @@ from mtv_world_ros.errors import (
     RolloutPreempted,
     TrajectoryError,
 )
-from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
+from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate

@@ -325,7 +325,7 @@ def show(rollout: StoredRollout, path: Path) -> None:
     """Writes an MP4: recorded, trajectory video and imagined side by side, views below."""
     import numpy as np
 
-    from mtv_world_ros.evaluation.video_file import encode_video
+    from mtv_world_ros.evaluation.video import encode_video
 
     columns = [rollout.real, rollout.trajectory, rollout.imagined]
     rows = np.concatenate(columns, axis=3)  # (V, T, H, 3 * W, 3)

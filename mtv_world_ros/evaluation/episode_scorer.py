@@ -24,7 +24,7 @@ from mtv_world_ros.evaluation.metrics.scores import (
     true_masks,
     Truth,
 )
-from mtv_world_ros.evaluation.references import with_actions
+from mtv_world_ros.evaluation.references import Reconstruct, with_actions
 from mtv_world_ros.evaluation.results import (
     EpisodeResult,
     join,
@@ -39,7 +39,6 @@ from mtv_world_ros.evaluation.rollouts import (
     Stretch,
     stretches,
 )
-from mtv_world_ros.evaluation.round_trip import Reconstruct
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction

@@ -27,9 +27,9 @@ from mtv_world_ros.evaluation.metrics.frechet.store import (
 )
 from mtv_world_ros.evaluation.metrics.image_quality import image_quality
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.evaluation.references import round_trip
 from mtv_world_ros.evaluation.report.summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.evaluation.round_trip import round_trip
 from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
 from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.parallel import score_all

@@ -20,8 +20,7 @@ from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMas
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation.metrics.scores import episode_means, QUALITY, ScoreRow
 from mtv_world_ros.evaluation.rollouts import Stretch
-from mtv_world_ros.evaluation.video import compare
-from mtv_world_ros.evaluation.video_file import decode_video, encode_video
+from mtv_world_ros.evaluation.video import compare, decode_video, encode_video
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtv_world_ros.evaluation.round_trip import round_trip
+from mtv_world_ros.evaluation.references import round_trip
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 

@@ -4,8 +4,8 @@ import pytest
 
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.evaluation.evaluate import evaluate, make_jobs, Parallel
+from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import plain
 
 QUIET = {'show_progress': False}

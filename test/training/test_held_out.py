@@ -10,7 +10,7 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.video_file import decode_video
+from mtv_world_ros.evaluation.video import decode_video
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.training.config import TrainingConfig

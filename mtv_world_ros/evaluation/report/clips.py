@@ -9,8 +9,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.evaluation.results import StoredRollout
-from mtv_world_ros.evaluation.video import Comparison, contact_sheet, side_by_side
-from mtv_world_ros.evaluation.video_file import encode_video
+from mtv_world_ros.evaluation.video import Comparison, contact_sheet, encode_video, side_by_side
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: of objects, one after the other: bright ones that few real things have

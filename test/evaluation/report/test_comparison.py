@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mtv_world_ros.evaluation.baselines import PersistenceWorldModel
 from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.evaluation.report.comparison import (
     lines,
     method_table,
