@@ -51,7 +51,10 @@ class ObjectMotion:
 class TrackedObjects(Protocol):
     """Objects on their way; what one chunk hands to the next."""
 
-    step_s: float
+    @property
+    def step_s(self) -> float:
+        """Time between the joint positions that `advance` takes [s]."""
+        ...
 
     def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
         """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.

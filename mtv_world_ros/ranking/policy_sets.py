@@ -22,6 +22,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-slow-0.25',
         'expert-stop-0.5',
         'expert-retry-0.03',
+        'expert-wander-0.02',
+        'expert-fumble-0.4',
     ),
     'calibrate': (
         'expert',

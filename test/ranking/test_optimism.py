@@ -107,7 +107,9 @@ def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_pat
         'stack_blocks_two_00000_expert-high-0.03': False,
         'stack_blocks_two_00000_expert-late-0.6': True,
     }
-    real, imagined = read_last_frames(tmp_path / 'stack_blocks_two_00000_expert-high-0.03.png')
+    kept = read_last_frames(tmp_path / 'stack_blocks_two_00000_expert-high-0.03.png')
+    assert kept is not None
+    real, imagined = kept
     np.testing.assert_array_equal(real, np.concatenate(list(left), axis=1))
     np.testing.assert_array_equal(imagined, np.concatenate(list(placed), axis=1))
 

@@ -244,6 +244,7 @@ def _union_row(
         name='',
         status='ok' if np.isfinite(j) else 'no object is scored',
         moving=False,
+        moving_imagined=False,
         j=float(j),
         j_visible=np.nan,
         j_frames=(),

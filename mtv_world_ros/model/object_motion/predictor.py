@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import json
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -82,8 +81,10 @@ class TrackedObjects:
     tools: FloatArray | None = None
     openings: FloatArray | None = None
 
-    #: between the joint positions that `advance` takes [s]
-    step_s: ClassVar[float] = STEP_S
+    @property
+    def step_s(self) -> float:
+        """Time between the joint positions that `advance` takes [s]."""
+        return STEP_S
 
     def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
         """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
@@ -97,7 +98,7 @@ class TrackedObjects:
         opened = openings[0] if self.openings is None else self.openings
         tools = np.concatenate([before[None], tools])
         openings = np.concatenate([opened[None], openings])
-        known = np.isfinite(self.reference).all(-1)
+        known = np.asarray(np.isfinite(self.reference).all(-1))
         scene = Scene(
             points=_tensor(np.where(known[:, None], self.reference, 0.0)),
             features=_tensor(self.features),

@@ -247,7 +247,8 @@ def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
         EpisodeError: it holds no poses, or its seed draws a scene of other objects.
     """
     info = episode.info
-    if episode.object_poses is None or info.seed is None:
+    states = episode.joint_states
+    if episode.object_poses is None or info.seed is None or states is None:
         raise EpisodeError(
             f"'{info.path}' has no object poses with a seed; only simulated ones do"
         )
@@ -259,13 +260,13 @@ def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
             f"'{info.path}' shows {list(info.objects)}, but its seed draws {list(names)}"
         )
     stamps, poses = episode.object_poses
-    rows = np.searchsorted(episode.joint_states.stamps_ns, stamps)
+    rows = np.searchsorted(states.stamps_ns, stamps)
     roles = [item.role for item in scene.objects]
     return TruePoses(
         positions={role: poses[:, i, :3, 3] for i, role in enumerate(roles)},
         rotations={role: poses[:, i, :3, :3] for i, role in enumerate(roles)},
         sizes={item.role: item.size for item in scene.objects},
-        openings=robot.gripper_openings(episode.joint_states.positions[rows]),
+        openings=robot.gripper_openings(states.positions[rows]),
         goals=task.goals(scene.goals),
     )
 

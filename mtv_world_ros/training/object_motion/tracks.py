@@ -66,7 +66,7 @@ def object_tracks(path: Path, robot: RobotModel, views: Sequence[str]) -> Object
     columns = [states.joint_names.index(name) for name in robot.joint_names]
     commands = stitch(matched, origin)
     count = int(_last_ns(episode, masks, origin) / 1e9 / STEP_S + 1e-6)
-    times = np.arange(count + 1) * STEP_S
+    times = np.arange(count + 1, dtype=np.float64) * STEP_S
     positions = resample(commands, states.positions[0][columns], times)
     cameras = [episode.cameras[view] for view in views]
     poses = np.stack([camera_poses(camera, robot, positions) for camera in cameras])
@@ -76,7 +76,7 @@ def object_tracks(path: Path, robot: RobotModel, views: Sequence[str]) -> Object
         raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
     points, rotations, known = _moved(episode, masks, start, cameras, poses, origin + times * 1e9)
     return ObjectTracks(
-        features=object_shapes(first, start, cameras, poses[:, 0]).features,
+        features=object_shapes(first, start, cameras, list(poses[:, 0])).features,
         tools=robot.tool_poses(positions).transpose(1, 0, 2, 3),
         openings=robot.gripper_openings(positions).T,
         points=np.nan_to_num(points),
@@ -114,7 +114,7 @@ def _moved(
             for track in masks.values()
         ]
         points[step] = _located(_ids_to_masks(frames, len(start)), cameras, poses[:, step])
-    known = np.isfinite(points).all(-1)
+    known = np.asarray(np.isfinite(points).all(-1))
     turns = np.broadcast_to(np.eye(3), (num, len(start), 3, 3))
     return np.where(known[..., None], points, start), np.array(turns), known
 
