@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 import shutil
@@ -163,8 +164,10 @@ def video(num_frames: int, seed: int = 0) -> Tensor:
 
 @torch.inference_mode()
 def test_latents_are_normalised_and_undone(autoencoder: WanAutoencoder) -> None:
+    # in float64: undoing what was done is exact there, on every processor
+    autoencoder = copy.deepcopy(autoencoder).double()
     vae: AutoencoderKLWan = autoencoder.vae
-    clip = torch.randn(1, 3, 5, 32, 32)
+    clip = torch.randn(1, 3, 5, 32, 32, dtype=torch.float64)
     raw = vae.encode(clip).latent_dist.mean
     latents = autoencoder.encode(clip)
     for channel in (0, 15):
