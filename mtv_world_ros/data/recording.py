@@ -24,7 +24,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
 
@@ -181,19 +181,11 @@ def load_recording(
     )
 
 
-def _nearest(have_ns: np.ndarray, want_ns: np.ndarray) -> np.ndarray:
-    """Index of the nearest of `have_ns` (sorted) for each of `want_ns`."""
-    right = np.clip(np.searchsorted(have_ns, want_ns), 1, max(len(have_ns) - 1, 1))
-    right = np.minimum(right, len(have_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(want_ns - have_ns[left] <= have_ns[right] - want_ns, left, right)
-
-
 def _on_clock(episode: Episode, view: str, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray:
     own_stamps, frames = episode.images[view]
     if len(own_stamps) == 0:
         raise EpisodeError(f"episode '{episode.info.path}' has no frames of view '{view}'")
-    index = _nearest(np.asarray(own_stamps), stamps)
+    index = nearest_rows(np.asarray(own_stamps), stamps)
     return resize_frames(np.asarray(frames), spec.width, spec.height)[index]
 
 
@@ -204,7 +196,7 @@ def _object_ids(episode: Episode, stamps: np.ndarray, spec: WorldModelSpec) -> B
     for view in spec.views:
         own_stamps, ids = episode.masks[view]
         small = resize_labels(np.asarray(ids), spec.width, spec.height)
-        rows.append(small[_nearest(np.asarray(own_stamps), stamps)])
+        rows.append(small[nearest_rows(np.asarray(own_stamps), stamps)])
     return np.stack(rows)
 
 
@@ -213,7 +205,7 @@ def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
     found = episode.object_poses
     if found is None or len(found.stamps_ns) == 0:
         return None
-    return found.T_base_object[_nearest(found.stamps_ns, stamps)]
+    return found.T_base_object[nearest_rows(found.stamps_ns, stamps)]
 
 
 def _measured(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
@@ -241,7 +233,7 @@ def frame_indices(
     """
     count = spec.num_frames if num_frames is None else num_frames
     wanted = recording.times[start] + np.arange(count + 1) / spec.fps
-    index = _nearest(recording.times, wanted)
+    index = nearest_rows(recording.times, wanted)
     offset = np.abs(recording.times[index] - wanted)
     return index if (offset <= MAX_FRAME_OFFSET / spec.fps).all() else None
 

@@ -65,6 +65,15 @@ def locate(
     return Location(point=point, residual_px=float(residual), sigma_m=float(np.mean(metres)))
 
 
+def locate_all(
+    cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
+) -> FloatArray:
+    """Returns the (O, 3) points of (V, O, 2) pixels [m]; NaN if fewer than two views see one."""
+    found = [locate(cameras, T_base_camera, pixels[:, item]) for item in range(pixels.shape[1])]
+    points = [np.full(3, np.nan) if one is None else one.point for one in found]
+    return np.array(points).reshape(-1, 3)
+
+
 def block_size(
     cameras: Sequence[CameraModel],
     T_base_camera: Sequence[FloatArray],

@@ -1,4 +1,4 @@
-"""Positions and shape features of objects, from their masks in calibrated views.
+"""Shape features of objects, from their masks in calibrated views.
 
 V views, O objects, H W pixels.
 """
@@ -6,7 +6,6 @@ V views, O objects, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,29 +22,17 @@ _TAIL = 0.04
 _MAX_PIXELS = 600
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ObjectShapes:
-    """Positions and apparent sizes of objects.
-
-    Attributes:
-        points: (O, 3) centres in the base frame [m]; NaN where fewer than two views see one.
-        features: (O, V, `NUM_FEATURES`) widths of the mask in the horizontal plane through the
-            centre, along x, the diagonal, y and the other diagonal; its lowest and highest point
-            in the vertical plane that faces the camera, from the centre [m]; unit vector to the
-            camera. Zeros where the view does not see it.
-    """
-
-    points: FloatArray
-    features: FloatArray
-
-
 def object_shapes(
     masks: BoolArray,
     points: FloatArray,
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
-) -> ObjectShapes:
-    """Returns the shapes of objects whose centres are known.
+) -> FloatArray:
+    """Returns the (O, V, `NUM_FEATURES`) apparent shapes of objects whose centres are known.
+
+    They are widths of the mask in the horizontal plane through the centre, along x, the diagonal,
+    y and the other diagonal; its lowest and highest point in the vertical plane that faces the
+    camera, from the centre [m]; unit vector to the camera. Zeros where the view does not see it.
 
     Args:
         masks: (V, O, H, W) of one frame.
@@ -59,7 +46,7 @@ def object_shapes(
         for item in range(num_objects):
             if np.isfinite(points[item]).all() and masks[view, item].any():
                 features[item, view] = _features(masks[view, item], points[item], camera, pose)
-    return ObjectShapes(points=np.asarray(points, float), features=features)
+    return features
 
 
 def _features(

@@ -106,3 +106,11 @@ def resample(
         + s**2 * (3 - 2 * s) * values[right]
         + s * (1 - s) * ((1 - s) * slopes[left] - s * slopes[right]) * width
     )
+
+
+def nearest_rows(have: np.ndarray, want: np.ndarray) -> np.ndarray:
+    """Returns the index of the nearest of `have` (increasing) for each of `want`."""
+    right = np.clip(np.searchsorted(have, want), 1, max(len(have) - 1, 1))
+    right = np.minimum(right, len(have) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(want - have[left] <= have[right] - want, left, right)

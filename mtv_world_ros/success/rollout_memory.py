@@ -11,7 +11,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.mask_geometry import centroids, locate
+from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.robot import RobotModel
 
 #: frames whose places are kept; the start is kept whatever follows
@@ -269,12 +269,7 @@ def _points(footage: Footage, frame: int) -> FloatArray:
     pixels = np.where(
         footage.known(frame)[..., None], centroids(footage.frame_masks(frame)), np.nan
     )
-    points = np.full((pixels.shape[1], 3), np.nan)
-    for item in range(pixels.shape[1]):
-        found = locate(footage.cameras, tuple(footage.poses[:, frame]), pixels[:, item])
-        if found is not None:
-            points[item] = found.point
-    return points
+    return locate_all(footage.cameras, tuple(footage.poses[:, frame]), pixels)
 
 
 def _leans(masks: BoolArray, known: BoolArray) -> FloatArray:

@@ -39,11 +39,11 @@ def test_widths_are_those_of_the_footprint():
     centre = np.array([0.02, -0.03, 0.1])
     mask = mask_of_a_rectangle(camera, pose, centre, 0.08, 0.04)
     shapes = object_shapes(mask[None, None], centre[None], [camera], [pose])
-    widths = shapes.features[0, 0, :4]
+    widths = shapes[0, 0, :4]
     np.testing.assert_allclose(widths[[0, 2]], [0.92 * 0.08, 0.92 * 0.04], atol=0.004)
     assert widths[2] < widths[1] <= 0.12 / np.sqrt(2)
     np.testing.assert_allclose(widths[1], widths[3], atol=0.003)
-    np.testing.assert_allclose(shapes.features[0, 0, 6:], [-0.0222, 0.0333, 0.9992], atol=1e-3)
+    np.testing.assert_allclose(shapes[0, 0, 6:], [-0.0222, 0.0333, 0.9992], atol=1e-3)
 
 
 def test_what_is_not_known_has_no_features():
@@ -52,4 +52,4 @@ def test_what_is_not_known_has_no_features():
     masks[0, 1, 90:110, 90:110] = True
     points = np.array([[0.0, 0.0, 0.0], [np.nan] * 3])
     shapes = object_shapes(masks, points, [camera], [pose])
-    assert shapes.features.shape == (2, 1, NUM_FEATURES) and not shapes.features.any()
+    assert shapes.shape == (2, 1, NUM_FEATURES) and not shapes.any()

@@ -16,7 +16,7 @@ from torch import Tensor
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import write_json
-from mtv_world_ros.geometry.mask_geometry import centroids, locate
+from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
 from mtv_world_ros.geometry.robot import RobotModel
@@ -51,13 +51,8 @@ class ObjectMotionPredictor:
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
-        pixels = centroids(masks)
-        points = np.full((masks.shape[1], 3), np.nan)
-        for item in range(masks.shape[1]):
-            found = locate(cameras, poses, pixels[:, item])
-            if found is not None:
-                points[item] = found.point
-        features = object_shapes(masks, points, cameras, poses).features
+        points = locate_all(cameras, poses, centroids(masks))
+        features = object_shapes(masks, points, cameras, poses)
         return TrackedObjects(model=self, reference=points, features=features)
 
 

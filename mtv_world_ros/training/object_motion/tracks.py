@@ -17,9 +17,9 @@ from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.mask_geometry import centroids, locate
+from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_shape import object_shapes
-from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.network import STEP_S
 
@@ -71,12 +71,12 @@ def object_tracks(path: Path, robot: RobotModel, views: Sequence[str]) -> Object
     cameras = [episode.cameras[view] for view in views]
     poses = np.stack([camera_poses(camera, robot, positions) for camera in cameras])
     first = _ids_to_masks([masks[view].frames[0] for view in views], len(episode.info.objects))
-    start = _located(first, cameras, poses[:, 0])
+    start = locate_all(cameras, list(poses[:, 0]), centroids(first))
     if not np.isfinite(start).any():
         raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
     points, rotations, known = _moved(episode, masks, start, cameras, poses, origin + times * 1e9)
     return ObjectTracks(
-        features=object_shapes(first, start, cameras, list(poses[:, 0])).features,
+        features=object_shapes(first, start, cameras, list(poses[:, 0])),
         tools=robot.tool_poses(positions).transpose(1, 0, 2, 3),
         openings=robot.gripper_openings(positions).T,
         points=np.nan_to_num(points),
@@ -102,7 +102,7 @@ def _moved(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     found, num = episode.object_poses, len(wanted_ns)
     if found is not None:
-        rows = _nearest(found.stamps_ns, wanted_ns)
+        rows = nearest_rows(found.stamps_ns, wanted_ns)
         T = found.T_base_object[rows]
         points = start + T[..., :3, 3] - found.T_base_object[0, :, :3, 3]
         turns = T[..., :3, :3] @ np.swapaxes(found.T_base_object[0, :, :3, :3], -1, -2)
@@ -110,34 +110,15 @@ def _moved(
     points = np.full((num, *start.shape), np.nan)
     for step in range(num):
         frames = [
-            track.frames[int(_nearest(track.stamps_ns, wanted_ns[step : step + 1])[0])]
+            track.frames[int(nearest_rows(track.stamps_ns, wanted_ns[step : step + 1])[0])]
             for track in masks.values()
         ]
-        points[step] = _located(_ids_to_masks(frames, len(start)), cameras, poses[:, step])
+        seen = _ids_to_masks(frames, len(start))
+        points[step] = locate_all(cameras, list(poses[:, step]), centroids(seen))
     known = np.asarray(np.isfinite(points).all(-1))
     turns = np.broadcast_to(np.eye(3), (num, len(start), 3, 3))
     return np.where(known[..., None], points, start), np.array(turns), known
 
 
-def _located(
-    masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray] | FloatArray
-) -> FloatArray:
-    """(O, 3) centres, NaN where not known, of masks (V, O, H, W)."""
-    pixels = centroids(masks)
-    points = np.full((masks.shape[1], 3), np.nan)
-    for item in range(len(points)):
-        found = locate(cameras, list(poses), pixels[:, item])
-        if found is not None:
-            points[item] = found.point
-    return points
-
-
 def _ids_to_masks(ids: Sequence[np.ndarray], num_objects: int) -> BoolArray:
     return np.stack([np.stack(ids) == number + 1 for number in range(num_objects)], axis=1)
-
-
-def _nearest(have: np.ndarray, want: np.ndarray) -> np.ndarray:
-    right = np.clip(np.searchsorted(have, want), 1, max(len(have) - 1, 1))
-    right = np.minimum(right, len(have) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(want - have[left] <= have[right] - want, left, right)
