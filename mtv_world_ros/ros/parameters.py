@@ -1,11 +1,14 @@
-"""The node's parameters: one table with defaults, ranges and what they mean."""
+"""Parameters of a node: the fields of a schema say default, range, choices and meaning, once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
 from functools import partial
+from textwrap import wrap
+from typing import Annotated, Any, get_args, get_origin, Literal
 
+from pydantic import AfterValidator, Field
+from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -15,205 +18,150 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+import yaml
 
+from mtv_world_ros.config import ListOf, Model, Schema
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
+from mtv_world_ros.vision.segmenters.choose import SegmenterName
 
-MODES = ('observe', 'imagine')
-STAMP_MODES = ('target', 'source')
-PACES = ('realtime', 'burst')
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One parameter: `bounds` or `choices` limit it, `read_only` = set at start-up only."""
-
-    name: str
-    default: object
-    description: str
-    bounds: tuple[float, float] | None = None
-    choices: tuple[str, ...] = ()
-    read_only: bool = False
-
-    def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` shows."""
-        described = ParameterDescriptor(description=self.description, read_only=self.read_only)
-        if self.choices:
-            described.additional_constraints = f'one of: {", ".join(self.choices)}'
-        if self.bounds is not None:
-            low, high = self.bounds
-            if isinstance(self.default, int):
-                described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-            else:
-                span = FloatingPointRange(from_value=float(low), to_value=float(high))
-                described.floating_point_range = [span]
-        return described
-
-    def check(self, value: object) -> str:
-        """Returns why the value is refused, or an empty text."""
-        if self.choices and value not in self.choices:
-            hint = nearest(str(value), self.choices)
-            return f"{self.name} is '{value}'{hint}; it must be one of {', '.join(self.choices)}"
-        if self.bounds is None:
-            return ''
-        low, high = self.bounds
-        if not low <= value <= high:  # type: ignore[operator]
-            return f'{self.name} is {value}; it must be in [{low:g}, {high:g}]'
-        return ''
+Span = tuple[float, float]
+Mode = Literal['observe', 'imagine']
+#: a list of texts; empty ones are left out
+Names = Annotated[ListOf[str], AfterValidator(lambda names: tuple(filter(None, names)))]
 
 
-_at_start = partial(Entry, read_only=True)
-_AGE = (0.001, 3600.0)
-#: `Settings` has a field for every row
-TABLE: tuple[Entry, ...] = (
-    _at_start('checkpoint', 'bundled', "Checkpoint folder; 'bundled' ships with the package."),
-    _at_start('robot_file', '', "Robot YAML or a bundled robot's name; empty = the checkpoint's."),
-    _at_start('device', 'cpu', 'Device of the model: cpu, cuda, cuda:1.'),
-    _at_start(
-        'num_threads', 0, 'CPU threads of the model; 0 = all cores but one.', bounds=(0, 1024)
-    ),
-    _at_start(
-        'serving', '', "What makes the model faster or smaller, e.g. 'compile=true'; see README."
-    ),
-    _at_start(
-        'task', '', 'Task to judge: name or YAML file; empty = the one the instruction matches.'
-    ),
-    _at_start(
-        'segmenter',
+def parameter(default: Any, text: str, within: Span | None = None) -> Any:
+    """Returns the field of a parameter that can be set at any time.
+
+    Args:
+        default: its default.
+        text: its meaning, in Markdown.
+        within: least and greatest value.
+    """
+    low, high = within or (None, None)
+    return Field(default, description=text, ge=low, le=high)
+
+
+def at_start(default: Any, text: str, within: Span | None = None) -> Any:
+    """Returns the field of a parameter that is read-only while the node runs."""
+    low, high = within or (None, None)
+    return Field(default, description=text, ge=low, le=high, json_schema_extra={'read_only': True})
+
+
+_SECONDS = (0.001, 86400.0)
+
+
+class NodeSettings(Schema):
+    """Parameters of every node that observes."""
+
+    checkpoint: str = at_start('bundled', "Checkpoint folder; 'bundled' ships with the package.")
+    robot_file: str = at_start(
+        '', "Robot YAML or a bundled robot's name; empty = the checkpoint's."
+    )
+    compressed_input: bool = at_start(
+        False, 'Subscribe to `<camera>/image_raw/compressed` (JPEG or PNG).'
+    )
+    calibration_file: str = parameter(
+        '',
+        "YAML with every view's pose; empty = `config/cameras/<robot>.yaml` of the package. Read "
+        'again when an episode begins (`~/reset`, `~/start`).',
+    )
+    max_image_age_s: float = parameter(0.5, 'Older images are no observation [s].', _SECONDS)
+    max_joint_state_age_s: float = parameter(
+        0.5, 'Older joint states are no observation [s].', _SECONDS
+    )
+    max_view_skew_s: float = parameter(
+        0.05, 'Images of views further apart are no observation [s].', _SECONDS
+    )
+
+
+class Settings(NodeSettings):
+    """Parameters of the node `world_model`."""
+
+    device: str = at_start('cpu', 'Device of the model: cpu, cuda, cuda:1.')
+    num_threads: int = at_start(0, 'CPU threads of the model; 0 = all cores but one.', (0, 1024))
+    serving: str = at_start(
+        '', 'What makes the model faster or smaller, e.g. `compile=true`; see docs/serving.md.'
+    )
+    task: str = at_start(
+        '', 'Task to judge: name or YAML file; empty = the one the instruction matches.'
+    )
+    segmenter: SegmenterName = at_start(
         'auto',
         'What finds the objects; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
-        choices=SEGMENTERS,
-    ),
-    _at_start(
-        'compressed_input', False, 'Subscribe to <camera>/image_raw/compressed (JPEG or PNG).'
-    ),
-    _at_start('mode', 'observe', 'Mode at start; ~/imagine changes it.', choices=MODES),
-    _at_start('diagnostics_period_s', 1.0, 'Period of /diagnostics [s].', bounds=(0.05, 60.0)),
-    Entry(
-        'calibration_file',
-        '',
-        "YAML with every view's pose; empty = config/cameras/<robot>.yaml of the package. It is "
-        'read again at ~/reset.',
-    ),
-    Entry(
-        'adapter',
+    )
+    mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
+    diagnostics_period_s: float = at_start(1.0, 'Period of /diagnostics [s].', (0.05, 60.0))
+    adapter: str = parameter(
         '',
         "LoRA adapter, taken between rollouts: folder or file; empty = the checkpoint's, none = "
         'without.',
-    ),
-    Entry('instruction', '', 'What the robot is told until the topic `instruction` says so.'),
-    Entry(
-        'objects',
-        [''],
-        'Names of the objects, e.g. red block; [""] = the ones the instruction names.',
-    ),
-    Entry('seed', 0, 'Seed of the noise; chunk k uses seed + k.', bounds=(0, 2**31 - 1)),
-    Entry(
-        'num_seeds',
+    )
+    instruction: str = parameter(
+        '', 'What the robot is told until the topic `instruction` says so.'
+    )
+    objects: Names = parameter(
+        (), "Names of the objects, e.g. red block; `['']` = the ones the instruction names."
+    )
+    seed: int = parameter(0, 'Seed of the noise; chunk k uses seed + k.', (0, 2**31 - 1))
+    num_seeds: int = parameter(
         1,
         'Rollouts of a plan whose mean the success estimate is; each takes as long as one.',
-        bounds=(1, 64),
-    ),
-    Entry(
-        'trusted_jaccard',
-        0.7,
-        'Reports say up to which time J is expected to be at least this.',
-        bounds=(0.0, 1.0),
-    ),
-    Entry(
-        'num_inference_steps',
-        0,
-        'Denoising steps a chunk; 0 = those the checkpoint is made for, else 4.',
-        bounds=(0, 1000),
-    ),
-    Entry('max_image_age_s', 0.5, 'Older images reject a trajectory [s].', bounds=_AGE),
-    Entry(
-        'max_joint_state_age_s', 0.5, 'Older joint states reject a trajectory [s].', bounds=_AGE
-    ),
-    Entry('max_view_skew_s', 0.05, 'Views further apart reject a trajectory [s].', bounds=_AGE),
-    Entry(
-        'max_trajectory_age_s',
+        (1, 64),
+    )
+    trusted_jaccard: float = parameter(
+        0.7, 'Reports say up to which time J is expected to be at least this.', (0.0, 1.0)
+    )
+    num_inference_steps: int = parameter(
+        0, 'Denoising steps a chunk; 0 = those the checkpoint is made for, else 4.', (0, 1000)
+    )
+    max_trajectory_age_s: float = parameter(
         1.0,
         'Trajectories stamped longer before their observation are rejected [s].',
-        bounds=_AGE,
-    ),
-    Entry(
-        'max_horizon_s',
+        (0.001, 3600.0),
+    )
+    max_horizon_s: float = parameter(
         60.0,
         'Trajectories that end later after their observation are rejected [s].',
-        bounds=_AGE,
-    ),
-    Entry(
-        'limit_tolerance',
-        1e-3,
-        'Joints may exceed their limits by this [rad or m].',
-        bounds=(0.0, 0.1),
-    ),
-    Entry(
-        'stamp_mode',
-        'target',
-        'Stamp of predictions: the predicted time, or the observation they come from.',
-        choices=STAMP_MODES,
-    ),
-    Entry(
-        'pace',
-        'realtime',
-        "How frames go out: at the model's frame rate, or each chunk at once.",
-        choices=PACES,
-    ),
-    Entry('publish_compressed', True, 'Offer predictions as JPEG too (made when subscribed).'),
-    Entry('jpeg_quality', 90, 'Quality of those.', bounds=(1, 100)),
-    Entry('publish_trajectory_video', True, 'Publish the control video (when subscribed).'),
-    Entry('publish_masks', True, 'Publish the object masks (when subscribed).'),
-)
+        (0.001, 3600.0),
+    )
+    limit_tolerance: float = parameter(
+        1e-3, 'Joints may exceed their limits by this [rad or m].', (0.0, 0.1)
+    )
+    stamp_mode: Literal['target', 'source'] = parameter(
+        'target', 'Stamp of predictions: the predicted time, or the observation they come from.'
+    )
+    pace: Literal['realtime', 'burst'] = parameter(
+        'realtime', "How frames go out: at the model's frame rate, or each chunk at once."
+    )
+    publish_compressed: bool = parameter(
+        True, 'Offer predictions as JPEG too (made when subscribed).'
+    )
+    jpeg_quality: int = parameter(90, 'Quality of those.', (1, 100))
+    publish_trajectory_video: bool = parameter(
+        True, 'Publish the control video (when subscribed).'
+    )
+    publish_masks: bool = parameter(True, 'Publish the object masks (when subscribed).')
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Values of the parameters in `TABLE`, by the same names."""
-
-    checkpoint: str
-    robot_file: str
-    device: str
-    num_threads: int
-    serving: str
-    task: str
-    segmenter: str
-    compressed_input: bool
-    mode: str
-    diagnostics_period_s: float
-    calibration_file: str
-    adapter: str
-    instruction: str
-    objects: tuple[str, ...]
-    seed: int
-    num_seeds: int
-    trusted_jaccard: float
-    num_inference_steps: int
-    max_image_age_s: float
-    max_joint_state_age_s: float
-    max_view_skew_s: float
-    max_trajectory_age_s: float
-    max_horizon_s: float
-    limit_tolerance: float
-    stamp_mode: str
-    pace: str
-    publish_compressed: bool
-    jpeg_quality: int
-    publish_trajectory_video: bool
-    publish_masks: bool
+def help_text(name: str, kind: type[Schema]) -> str:
+    """Returns what a node prints on `--help`."""
+    lines = [f'usage: {name} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE]]', '']
+    for parameter_name, field in kind.model_fields.items():
+        lines += [f'  {parameter_name}  {shown_default(field)}  {valid_values(field)}'.rstrip()]
+        lines += [f'      {line}' for line in wrap(field.description or '', 90)]
+    return '\n'.join(lines)
 
 
-def declare(node: Node, table: Sequence[Entry] = TABLE) -> None:
-    """Declares the table on the node and keeps later changes to what the table allows.
+def declare(node: Node, kind: type[Schema]) -> None:
+    """Declares the fields on the node; later changes are held to their ranges and choices.
 
     Raises:
         ConfigError: a value given at start-up is refused.
     """
-    for entry in table:
-        _declare(node, entry)
-    by_name = {entry.name: entry for entry in table}
-    node.add_on_set_parameters_callback(partial(_check, by_name))
+    for name, field in kind.model_fields.items():
+        _declare(node, name, field)
+    node.add_on_set_parameters_callback(partial(_check, kind))
 
 
 def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
@@ -225,36 +173,93 @@ def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
     topics = {}
     for view in views:
         text = f"Topic prefix of view '{view}': <it>/image_raw and <it>/camera_info."
-        topics[view] = _declare(node, _at_start(f'camera_topics.{view}', view, text))
+        topics[view] = str(_declare(node, f'camera_topics.{view}', at_start(view, text)))
     return topics
 
 
-def read(node: Node) -> Settings:
-    """The present values."""
-    values = {field.name: node.get_parameter(field.name).value for field in fields(Settings)}
-    values['objects'] = tuple(name for name in values['objects'] or () if name)
-    return Settings(**values)  # type: ignore[arg-type]
+def read(node: Node, kind: type[Model]) -> Model:
+    """Returns the present values."""
+    return kind(**{name: node.get_parameter(name).value for name in kind.model_fields})
 
 
-def _declare(node: Node, entry: Entry) -> str:
+def shown_default(field: FieldInfo) -> str:
+    """Returns the default as YAML, or `empty`."""
+    if field.default in ('', ()):
+        return 'empty'
+    return yaml.safe_dump(field.default).split('\n')[0]
+
+
+def valid_values(field: FieldInfo) -> str:
+    """Returns range or choices as text, empty if any value of the type is valid."""
+    limits = span(field)
+    return '{:.10g} … {:.10g}'.format(*limits) if limits else ', '.join(choices(field))
+
+
+def choices(field: FieldInfo) -> tuple[str, ...]:
+    """Returns the only valid values; empty = any of the type."""
+    kind = field.annotation
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+def span(field: FieldInfo) -> Span | None:
+    """Returns least and greatest value."""
+    limits = {
+        key: getattr(item, key)
+        for item in field.metadata
+        for key in ('ge', 'le')
+        if hasattr(item, key)
+    }
+    return (limits['ge'], limits['le']) if limits else None
+
+
+def is_read_only(field: FieldInfo) -> bool:
+    """Tells whether the parameter is read only when the node starts."""
+    return bool(field.json_schema_extra)
+
+
+def descriptor(field: FieldInfo) -> ParameterDescriptor:
+    """Returns what `ros2 param describe` shows."""
+    described = ParameterDescriptor(description=field.description, read_only=is_read_only(field))
+    if choices(field):
+        described.additional_constraints = f'one of: {", ".join(choices(field))}'
+    limits = span(field)
+    if limits and isinstance(field.default, int):
+        low, high = map(int, limits)
+        described.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    elif limits:
+        low, high = map(float, limits)
+        described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    return described
+
+
+def _declare(node: Node, name: str, field: FieldInfo) -> object:
+    default = [''] if field.default == () else field.default  # ROS has no empty list
     try:
-        value = node.declare_parameter(entry.name, entry.default, entry.descriptor()).value
+        value = node.declare_parameter(name, default, descriptor(field)).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        span = '' if entry.bounds is None else ' in [{:g}, {:g}]'.format(*entry.bounds)
-        kind = type(entry.default).__name__
-        raise ConfigError(
-            f"parameter '{entry.name}' must be of type {kind}{span}: {error}"
-        ) from error
-    refused = entry.check(value)
+        limits = span(field)
+        within = ' in [{:g}, {:g}]'.format(*limits) if limits else ''
+        kind = type(default).__name__
+        raise ConfigError(f"parameter '{name}' must be of type {kind}{within}: {error}") from error
+    refused = _refusal(name, field, value)
     if refused:
         raise ConfigError(f'parameter {refused}')
-    return str(value)
+    return value
 
 
-def _check(by_name: Mapping[str, Entry], parameters: list[Parameter]) -> SetParametersResult:
-    for parameter in parameters:
-        entry = by_name.get(parameter.name)
-        refused = entry.check(parameter.value) if entry else ''
+def _refusal(name: str, field: FieldInfo, value: object) -> str:
+    """Returns why a choice is refused, or an empty text; ROS checks types and ranges."""
+    valid = choices(field)
+    if not valid or value in valid:
+        return ''
+    hint = nearest(str(value), valid)
+    return f"{name} is '{value}'{hint}; it must be one of {', '.join(valid)}"
+
+
+def _check(kind: type[Schema], parameters: list[Parameter]) -> SetParametersResult:
+    for one in parameters:
+        field = kind.model_fields.get(one.name)
+        refused = _refusal(one.name, field, one.value) if field else ''
         if refused:
             return SetParametersResult(successful=False, reason=refused)
     return SetParametersResult(successful=True)

@@ -62,6 +62,7 @@ def run(
     *,
     spin: Callable[[AnyNode], None] = spin_forever,
     signals: SignalHandlerOptions = SignalHandlerOptions.ALL,
+    help_text: str = '',
 ) -> int:
     """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
 
@@ -70,10 +71,14 @@ def run(
         args: command line with the program's name; default: the process' own.
         spin: what the node does.
         signals: which signals end it; NO = it has its own handlers.
+        help_text: printed instead if the command line has `--help`.
 
     Returns:
         The exit status: 1 after a user error, whose text goes to stderr, else 0.
     """
+    if help_text and '--help' in (sys.argv if args is None else args):
+        sys.stdout.write(f'{help_text}\n')
+        return 0
     end_with_parent()
     interrupt = _Interrupt()
     signal.signal(signal.SIGINT, interrupt)

@@ -2,53 +2,62 @@
 
 import ast
 import json
+import runpy
 from xml.etree import ElementTree
 
 import pytest
 import yaml
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.ros.parameters import Settings, TABLE
+from mtv_world_ros.ros.parameters import descriptor, Settings
+from mtv_world_ros.ros.policy.parameters import PolicySettings
 
 
 def test_parameter_file_holds_every_parameter_with_its_default():
     held = yaml.safe_load(share_path('config', 'node.yaml').read_text())['/**']['ros__parameters']
-    assert held == {entry.name: entry.default for entry in TABLE}
-    assert list(Settings.__dataclass_fields__) == [entry.name for entry in TABLE]
+    assert sorted(held) == sorted(Settings.model_fields)
+    assert Settings(**held) == Settings() and held['objects'] == ['']
 
 
-def test_every_parameter_says_what_it_means_and_where_it_ends():
-    for entry in TABLE:
-        assert entry.description.endswith('.')
-        assert entry.check(entry.default) == ''
-        is_number = isinstance(entry.default, (int, float)) and not isinstance(entry.default, bool)
-        assert is_number == (entry.bounds is not None), entry.name
-        described = entry.descriptor()
-        assert is_number == bool(described.integer_range or described.floating_point_range)
+@pytest.mark.parametrize('kind', [Settings, PolicySettings])
+def test_every_parameter_says_what_it_means_and_where_it_ends(kind):
+    for name, field in kind.model_fields.items():
+        assert field.description.endswith('.')
+        is_number = isinstance(field.default, (int, float)) and not isinstance(field.default, bool)
+        described = descriptor(field)
+        assert is_number == bool(described.integer_range or described.floating_point_range), name
+        for limits in [*described.integer_range, *described.floating_point_range]:
+            assert limits.from_value <= field.default <= limits.to_value
+        if described.additional_constraints:
+            assert field.default in described.additional_constraints
+    assert kind() == kind(**{name: field.default for name, field in kind.model_fields.items()})
 
 
-def test_the_page_lists_every_parameter_with_its_default_and_what_is_valid():
-    page = share_path('docs', 'parameters.md').read_text()
-    for entry in TABLE:
-        row = next((r for r in page.splitlines() if r.startswith(f'| `{entry.name}`')), None)
-        assert row, f'{entry.name} is not in docs/parameters.md'
+@pytest.mark.parametrize(
+    ('name', 'kind'), [('parameters.md', Settings), ('policies.md', PolicySettings)]
+)
+def test_a_page_lists_every_parameter_with_its_default_and_what_is_valid(name, kind):
+    page = share_path('docs', name).read_text()
+    for parameter, field in kind.model_fields.items():
+        row = next((r for r in page.splitlines() if r.startswith(f'| `{parameter}`')), None)
+        assert row, f'{parameter} is not in docs/{name}'
         default, valid = (cell.strip() for cell in row.split('|')[2:4])
-        assert default.strip('`') == _shown(entry.default), entry.name
-        assert valid == _valid(entry), entry.name
+        value = '' if field.default == () else field.default
+        assert ('' if default == 'empty' else yaml.safe_load(default)) == value, parameter
+        assert valid == _valid(descriptor(field)), parameter
 
 
-def _valid(entry):
-    if entry.choices:
-        return ', '.join(f'`{choice}`' for choice in entry.choices)
-    return '' if entry.bounds is None else '{:.10g} … {:.10g}'.format(*entry.bounds)
+def test_the_tables_of_parameters_are_those_of_the_settings():
+    tables = runpy.run_path(str(share_path('docs', 'parameter_tables.py')))
+    for name in tables['PAGES']:
+        page = share_path('docs', name).read_text(encoding='utf-8')
+        assert tables['filled'](page) == page, 'run: python docs/parameter_tables.py'
 
 
-def _shown(value):
-    if value in ('', ['']):
-        return 'empty'
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'{value:g}' if isinstance(value, float) else str(value)
+def _valid(described):
+    for limits in [*described.integer_range, *described.floating_point_range]:
+        return f'{limits.from_value:.10g} … {limits.to_value:.10g}'
+    return described.additional_constraints.removeprefix('one of: ')
 
 
 def _panels(layout):
@@ -81,7 +90,7 @@ def test_launch_arguments_name_parameters_that_exist(name):
     tree = ast.parse(share_path('launch', name).read_text())
     functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
     assert 'generate_launch_description' in functions
-    known = {entry.name for entry in TABLE} | {'use_sim_time'}
+    known = set(Settings.model_fields) | {'use_sim_time'}
     for node in tree.body:
         if isinstance(node, ast.Assign) and node.targets[0].id == 'PARAMETERS':
             assert {key.value for key in node.value.keys} <= known

@@ -19,18 +19,17 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from mtv_world_ros.assembly import PolicyMaker
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
-from mtv_world_ros.ros.parameters import declare
-from mtv_world_ros.ros.policy import parameters
 from mtv_world_ros.ros.policy.loading import load_named_policy, load_named_robot
 from mtv_world_ros.ros.policy.loop import PolicyLoop
 from mtv_world_ros.ros.policy.parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor
 from mtv_world_ros.ros.policy.predicted_frames import PredictedFrames
 from mtv_world_ros.ros.run_node import run
-from mtv_world_ros.ros.sensing.observations import FreshnessLimits, ObservationBuffer
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
 from mtv_world_ros.ros.status_publisher import StatusPublisher
 from mtv_world_ros.ros.world_model.loading import load_spec, reload_cameras
@@ -51,8 +50,8 @@ class PolicyNode(Node):
 
     def __init__(self, load: Load = load_named_policy) -> None:
         super().__init__('policy')
-        declare(self, parameters.TABLE)
-        settings = parameters.read(self)
+        parameters.declare(self, PolicySettings)
+        settings = self._settings()
         self._make_policy = load(settings)
         self._spec = load_spec(settings.checkpoint)
         joint_names = load_named_robot(settings).joint_names
@@ -62,7 +61,7 @@ class PolicyNode(Node):
             joint_names=joint_names,
             width=self._spec.width,
             height=self._spec.height,
-            limits=self._freshness,
+            limits=self._settings,
         )
         frames = PredictedFrames(self._spec.views, joint_names)
         self._actor = Actor(lambda: self._answers.trigger())
@@ -159,7 +158,7 @@ class PolicyNode(Node):
             self._loop.on_report(values_of(status))
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        settings = parameters.read(self)
+        settings = self._settings()
         try:
             self._buffer.accept_cameras(reload_cameras(settings, self._spec))
         except MtvWorldError as error:
@@ -205,18 +204,14 @@ class PolicyNode(Node):
 
         return callback
 
-    def _freshness(self) -> FreshnessLimits:
-        settings = parameters.read(self)
-        return FreshnessLimits(
-            image_age=settings.max_image_age_s,
-            joint_state_age=settings.max_joint_state_age_s,
-            view_skew=settings.max_view_skew_s,
-        )
+    def _settings(self) -> PolicySettings:
+        return parameters.read(self, PolicySettings)
 
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:
     """Runs the node; returns the exit status."""
-    return run(lambda: PolicyNode(load), args)
+    help_text = parameters.help_text('python -m mtv_world_ros.ros.policy.node', PolicySettings)
+    return run(lambda: PolicyNode(load), args, help_text=help_text)
 
 
 if __name__ == '__main__':

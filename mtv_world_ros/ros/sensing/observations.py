@@ -19,7 +19,7 @@ from mtv_world_ros.ros.messages import images as image_messages
 from mtv_world_ros.ros.messages.conversions import to_positions
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.parameters import NodeSettings
 
 #: images kept a view, so that views which arrive one after the other still find their partner
 _NUM_IMAGES = 3
@@ -34,15 +34,6 @@ _AGE_LIMITS = {
 _INFO_FIELDS = tuple(CameraInfo.get_fields_and_field_types())
 #: fields whose change makes another camera of it
 _COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p')
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FreshnessLimits:
-    """Limits [s] beyond which no observation is made."""
-
-    image_age: float
-    joint_state_age: float
-    view_skew: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +70,7 @@ class ObservationBuffer:
         joint_names: Sequence[str],
         width: int,
         height: int,
-        limits: Callable[[], FreshnessLimits],
+        limits: Callable[[], NodeSettings],
         on_image: Callable[[str, Image | CompressedImage], None] | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras)
@@ -181,7 +172,7 @@ class ObservationBuffer:
         return Scene(observation=observation, camera_infos=infos, source_stamp_ns=stamp_ns)
 
     def _pick_images(
-        self, now_ns: int, limits: FreshnessLimits
+        self, now_ns: int, limits: NodeSettings
     ) -> list[tuple[int, Image | CompressedImage]]:
         """Per view the image nearest to the newest moment that every view has seen."""
         for view, images in self._images.items():
@@ -194,12 +185,12 @@ class ObservationBuffer:
         newest = {view: images[-1][0] for view, images in self._images.items()}
         for view, stamp in newest.items():
             what = f"the newest image of view '{view}'"
-            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.image_age)
+            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.max_image_age_s)
         common = min(newest.values())
         picked = [min(i, key=lambda image: abs(image[0] - common)) for i in self._images.values()]
         stamps = [stamp for stamp, _ in picked]
         skew = (max(stamps) - min(stamps)) / NANO
-        if skew > limits.view_skew:
+        if skew > limits.max_view_skew_s:
             apart = ', '.join(
                 f'{view} {(stamp - min(stamps)) / NANO:.3f} s'
                 for view, stamp in zip(self.views, stamps, strict=True)
@@ -207,11 +198,11 @@ class ObservationBuffer:
             raise Rejection(
                 Reason.VIEWS_OUT_OF_SYNC,
                 f'the views are {skew:.3f} s apart ({apart} after the oldest); '
-                f"'max_view_skew_s' allows {limits.view_skew:g} s",
+                f"'max_view_skew_s' allows {limits.max_view_skew_s:g} s",
             )
         return picked
 
-    def _positions(self, stamp_ns: int, now_ns: int, limits: FreshnessLimits) -> FloatArray:
+    def _positions(self, stamp_ns: int, now_ns: int, limits: NodeSettings) -> FloatArray:
         """(J,) positions nearest in time to the images."""
         missing = [name for name, samples in self._joints.items() if not samples]
         if missing:
@@ -219,7 +210,7 @@ class ObservationBuffer:
                 Reason.JOINT_STATE_MISSING, f'no joint state of {missing} was received'
             )
         for name, samples in self._joints.items():
-            what, limit = f"the newest state of joint '{name}'", limits.joint_state_age
+            what, limit = f"the newest state of joint '{name}'", limits.max_joint_state_age_s
             _check_age(Reason.JOINT_STATE_STALE, what, samples[-1][0], now_ns, limit)
         return np.array(
             [
@@ -328,15 +319,6 @@ def _check_age(reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: flo
         reason,
         f"{what} is {when}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for recorded data at its "
         "own time set 'use_sim_time' and play with a clock)",
-    )
-
-
-def freshness(settings: Settings) -> FreshnessLimits:
-    """What of the inputs is too old."""
-    return FreshnessLimits(
-        image_age=settings.max_image_age_s,
-        joint_state_age=settings.max_joint_state_age_s,
-        view_skew=settings.max_view_skew_s,
     )
 
 

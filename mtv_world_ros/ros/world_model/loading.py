@@ -15,8 +15,7 @@ from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
-from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.policy.parameters import PolicySettings
+from mtv_world_ros.ros.parameters import NodeSettings, Settings
 
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
@@ -32,9 +31,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
     )
 
 
-def load_cameras(
-    settings: Settings | PolicySettings, spec: WorldModelSpec
-) -> tuple[CameraModel, ...]:
+def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
     """Loads the calibrated camera of every view, in the model's order.
 
     Raises:
@@ -54,9 +51,7 @@ def load_cameras(
     return tuple(cameras[view] for view in spec.views)
 
 
-def reload_cameras(
-    settings: Settings | PolicySettings, spec: WorldModelSpec
-) -> tuple[CameraModel, ...]:
+def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
     """The same while the node runs.
 
     Raises:

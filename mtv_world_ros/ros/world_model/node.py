@@ -20,7 +20,7 @@ from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run
-from mtv_world_ros.ros.sensing.observations import freshness, ObservationBuffer
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.adapter_parameter import AdapterSwitch
 from mtv_world_ros.ros.world_model.live_fidelity import LiveFidelity
@@ -45,8 +45,8 @@ class WorldModelNode(Node):
 
     def __init__(self, load: Load = load_named_pipeline) -> None:
         super().__init__('world_model')
-        parameters.declare(self)
-        self._settings = parameters.read(self)
+        parameters.declare(self, Settings)
+        self._settings = parameters.read(self, Settings)
         self.add_post_set_parameters_callback(self._on_parameters)
         pipeline = load(self._settings)
         self._spec, self._robot = pipeline.spec, pipeline.robot
@@ -57,7 +57,7 @@ class WorldModelNode(Node):
             joint_names=self._robot.joint_names,
             width=self._spec.width,
             height=self._spec.height,
-            limits=lambda: freshness(self._settings),
+            limits=self.settings,
             on_image=lambda view, message: self._fidelity.see(view, message),
         )
         self._maker = RequestMaker(
@@ -171,7 +171,7 @@ class WorldModelNode(Node):
         self._give_up()
 
     def _on_parameters(self, _: object) -> None:
-        self._settings = parameters.read(self)
+        self._settings = parameters.read(self, Settings)
 
     def _on_period(self) -> None:
         self._inputs.refresh()
@@ -193,7 +193,8 @@ class WorldModelNode(Node):
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_pipeline) -> int:
     """Runs the node; returns the exit status."""
-    return run(lambda: WorldModelNode(load), args)
+    help_text = parameters.help_text('world_model', Settings)
+    return run(lambda: WorldModelNode(load), args, help_text=help_text)
 
 
 if __name__ == '__main__':

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import get_args, Literal
 
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
@@ -11,8 +12,9 @@ from mtv_world_ros.vision.segmenters.sam import sam2_segmenter, sam3_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 from mtv_world_ros.vision.segmenters.weights import find_weights, VISION_MODELS
 
+SegmenterName = Literal['auto', 'colour', 'sam2', 'sam3']
 #: choices of `choose_segmenter`
-SEGMENTERS = ('auto', 'colour', 'sam2', 'sam3')
+SEGMENTERS = get_args(SegmenterName)
 #: the environment variable that names the folder of public weights
 WEIGHTS_VARIABLE = 'MTV_WORLD_WEIGHTS'
 

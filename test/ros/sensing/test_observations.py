@@ -7,7 +7,8 @@ from sensor_msgs.msg import JointState
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header, NANO
-from mtv_world_ros.ros.sensing.observations import FreshnessLimits, ObservationBuffer
+from mtv_world_ros.ros.parameters import NodeSettings
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 
 NOW = 1_000 * NANO
 MS = 1_000_000
@@ -18,7 +19,7 @@ def make_buffer(ros, tmp_path):
     cameras = load_calibration(ros.make_calibration(tmp_path / 'calibration.yaml'))
 
     def make(skew=0.05, joint_names=('a', 'b'), size=(96, 72)):
-        limits = FreshnessLimits(image_age=0.5, joint_state_age=0.5, view_skew=skew)
+        limits = NodeSettings(max_view_skew_s=skew)
         buffer = ObservationBuffer(
             cameras=[cameras[view] for view in ('low', 'high')],
             joint_names=joint_names,
