@@ -19,10 +19,8 @@ from model_scores import add_options, cells, chunk_seconds, COLUMNS, overrides, 
 from page import publish, table
 import torch
 
-from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.runtime import choose_dtype
 from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.distill import distill, DistillConfig
@@ -37,7 +35,7 @@ def student(steps: int, options: argparse.Namespace) -> Path:
         options.work / f'student{steps}',
         load_training_config(options.preset, overrides(options)),
         DistillConfig(num_steps=steps, teacher_steps=options.path_steps),
-        robot=load_robot(robot_path(read_card(teacher)['robot'])),
+        robot=checkpoint_robot(teacher),
         segmenter=assemble_segmenter('colour'),
         seed=options.seed,
         device=options.device,

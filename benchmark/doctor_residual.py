@@ -17,10 +17,10 @@ import numpy as np
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_shape import load_shape, rods
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector
 from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
-from mtv_world_ros.inspection.robot_shape import load_shape, rods
 
 CONFIG = InspectionConfig(residual=ResidualConfig(lags_s=(0.0,)))
 
@@ -36,7 +36,7 @@ def main() -> None:
     episodes = list_episodes(options.dataset)
     if not episodes:
         parser.error(f"'{options.dataset}' holds no episodes")
-    for shape in (load_shape(file, robot), rods(robot, 'for comparison')):
+    for shape in (load_shape(robot), rods(robot, 'for comparison')):
         inspector = Inspector(robot, shape, CONFIG)
         distances, passed, found = [], [], []
         for path in episodes:

@@ -23,12 +23,10 @@ from page import publish, table
 import torch
 from tqdm import tqdm
 
-from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.recording import cached_recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.runtime import choose_dtype
 from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.run import spread, train
@@ -51,7 +49,7 @@ def trained(share: float, options: argparse.Namespace) -> Path:
         load_training_config(options.preset, changes),
         select(options.train, 'all').paths,
         options.work / f'share{share:g}',
-        robot=load_robot(robot_path(read_card(initial)['robot'])),
+        robot=checkpoint_robot(initial),
         segmenter=assemble_segmenter('colour'),
         seed=options.seed,
         device=options.device,

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.errors import CheckpointError, ConfigError, PolicyError
+from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
+from mtv_world_ros.model.card import CAMERAS, read_card, ROBOT_FOLDER
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.policies.policy import Policy
@@ -103,7 +104,7 @@ def load_pipeline(
 
     Args:
         checkpoint: folder, or `bundled`.
-        robot: YAML file or name of a bundled robot; default: the one of the checkpoint.
+        robot: YAML file or name of a bundled robot; default: the one in the checkpoint.
         objects: names of the objects; empty = those the instruction names.
         task: the task to judge, by name or YAML file; default: the one the instruction matches.
         device: `cpu`, `cuda`, ...
@@ -130,17 +131,18 @@ def load_pipeline(
     loaded = load_checkpoint(checkpoint_path(checkpoint), dtype=number_format)
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
+    model = checkpoint_robot(checkpoint, robot)
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
         dtype=number_format,
-        robot=_robot_of(loaded.card, robot),
+        robot=model,
         serving=options,
     )
     return assemble(
         loaded.card,
         world_model,
-        robot=robot,
+        robot=model,
         objects=objects,
         task=task,
         segmenter=assemble_segmenter(segmenter, device=device),
@@ -154,7 +156,7 @@ def assemble(
     card: Any,
     world_model: WorldModel,
     *,
-    robot: str | Path | None = None,
+    robot: RobotModel,
     objects: tuple[str, ...] = (),
     task: str | None = None,
     segmenter: Segmenter | None = None,
@@ -162,14 +164,10 @@ def assemble(
     horizon: HorizonCurve | None = None,
     object_motion: ObjectMotionNetwork | None = None,
 ) -> Pipeline:
-    """Puts the main path around a world model trained as the card says.
-
-    Raises:
-        CheckpointError: the robot is not the one the model was trained with.
-    """
-    segmenter, model = segmenter or assemble_segmenter(), _robot_of(card, robot)
+    """Puts the main path around a world model trained as the card says."""
+    segmenter = segmenter or assemble_segmenter()
     return Pipeline(
-        robot=model,
+        robot=robot,
         world_model=world_model,
         segmenter=segmenter,
         estimator=SuccessEstimator(
@@ -181,7 +179,7 @@ def assemble(
         object_mask=card['object_mask'],
         objects=objects,
         horizon=horizon,
-        object_motion=_predictor(object_motion, model),
+        object_motion=_predictor(object_motion, robot),
     )
 
 
@@ -204,15 +202,49 @@ def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
     return (*(spec for spec in known if spec.name != given.name), given), given.name
 
 
-def _robot_of(card: Any, robot: str | Path | None) -> RobotModel:
-    """The checkpoint's robot, or the file given if it describes the same one."""
-    model = load_robot(robot_path(robot or card['robot']))
-    if model.name != card['robot']:
+def checkpoint_robot(checkpoint: str | Path, robot: str | Path | None = None) -> RobotModel:
+    """Returns the robot that a checkpoint carries or, older ones, names.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        robot: another file of the same robot, or the name of a bundled one.
+
+    Raises:
+        CheckpointError: the file describes a robot of another name.
+        ConfigError: there is no file of the robot.
+    """
+    folder = checkpoint_path(checkpoint)
+    trained = str(read_card(folder)['robot'])
+    carried = folder / ROBOT_FOLDER / ROBOT_YAML
+    default = carried if carried.is_file() else trained
+    model = load_robot(robot_path(robot or default))
+    # older cards name the file of a robot that is not bundled
+    if model.name != trained and Path(trained).suffix not in _YAML:
         raise CheckpointError(
-            f"the checkpoint was trained with robot '{card['robot']}', 'robot_file' describes "
+            f"the checkpoint was trained with robot '{trained}', 'robot_file' describes "
             f"'{model.name}'; use the trained one or train on this robot's episodes"
         )
     return model
+
+
+def checkpoint_cameras(checkpoint: str | Path) -> Path:
+    """Returns the default calibration that a checkpoint carries or, older ones, the robot's.
+
+    Raises:
+        CalibrationError: there is none.
+    """
+    folder = checkpoint_path(checkpoint)
+    carried = folder / ROBOT_FOLDER / CAMERAS
+    if carried.is_file():
+        return carried
+    robot = read_card(folder)['robot']
+    try:
+        return share_path('config', 'cameras', f'{robot}.yaml')
+    except ConfigError as error:
+        raise CalibrationError(
+            f"checkpoint '{checkpoint}' has no default calibration: set 'calibration_file' to the "
+            f'calibration of the cameras ({error})'
+        ) from error
 
 
 def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:

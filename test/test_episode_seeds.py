@@ -17,6 +17,7 @@ from mtv_world_ros.success.calibration import HorizonCurve
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=4, width=64, height=48, robot='yam_bimanual'
 )
+YAM = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
 
 
@@ -35,8 +36,7 @@ class SeededWorldModel(PersistenceWorldModel):
 
 @pytest.fixture(scope='module')
 def recording():
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-    return load_recording(share_path('resource', 'demo_episode'), SPEC, robot)
+    return load_recording(share_path('resource', 'demo_episode'), SPEC, YAM)
 
 
 def imagine(recording, num_seeds, horizon=None):
@@ -52,7 +52,7 @@ def imagine(recording, num_seeds, horizon=None):
     trajectory = JointTrajectory(
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
-    episode = assemble(CARD, model, horizon=horizon).begin(
+    episode = assemble(CARD, model, robot=YAM, horizon=horizon).begin(
         observation, instruction=recording.instruction, seed=3, num_seeds=num_seeds
     )
     return model, list(episode.extend(trajectory))

@@ -53,15 +53,13 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _distill(arguments: argparse.Namespace) -> int:
     import os
 
-    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.card import read_card
     from mtv_world_ros.training.config import load_training_config
 
     teacher = checkpoint_path(arguments.checkpoint)
-    robot = load_robot(robot_path(read_card(teacher)['robot']))
+    robot = checkpoint_robot(teacher)
     overrides = {**_DEFAULTS, **set_overrides(arguments.overrides)}
     config = load_training_config(arguments.preset, overrides)
     paths = select(arguments.dataset, arguments.split, default='train').paths

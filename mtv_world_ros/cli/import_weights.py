@@ -40,11 +40,16 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _import_weights(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.training.config import HistoryConfig, load_training_config
 
     # public weights were trained without history frames
     config = load_training_config(arguments.preset).replace(history=HistoryConfig())
     from mtv_world_ros.model.wan_import.import_weights import import_weights
+
+    robot = load_robot(robot_path(config.video.robot))
+    config = config.replace(video=config.video.replace(robot=robot.name))
 
     text = {
         'prompt': arguments.prompt,
@@ -58,6 +63,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
         autoencoder=config.autoencoder,
         scheduler=config.scheduler,
         card={**config.card({'imported_from': str(arguments.path)}), **text},
+        robot=robot.file,
         elsewhere={part: getattr(arguments, part) for part in _ELSEWHERE},
     )
     for report in reports:

@@ -149,9 +149,7 @@ def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoi
 
 
 def _jobs(arguments: argparse.Namespace) -> list[Job]:
-    from mtv_world_ros.assembly import checkpoint_path, robot_path
-    from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.assembly import checkpoint_robot
     from mtv_world_ros.ranking.jobs import (
         DEFAULT_POLICIES,
         DEFAULT_TASKS,
@@ -168,8 +166,7 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     elif arguments.faults is not None:
         policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
-    robot = arguments.robot or read_card(checkpoint_path(arguments.checkpoint))['robot']
-    expert = Expert(load_robot(robot_path(robot)))
+    expert = Expert(checkpoint_robot(arguments.checkpoint, arguments.robot))
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
     print(f'{len(policies)} policies, {len(tasks)} tasks, {len(jobs)} rollouts in each world')
     return jobs

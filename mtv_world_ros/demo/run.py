@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.bag.images import raw_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
@@ -33,7 +33,6 @@ from mtv_world_ros.evaluation.video import (
     write_png,
     write_video,
 )
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.card import read_card, spec_of
 
 
@@ -70,7 +69,7 @@ def run_demo(
     """
     card = read_card(checkpoint_path(checkpoint))
     spec = spec_of(card)
-    recording = load_recording(episode, spec, load_robot(robot_path(robot or card['robot'])))
+    recording = load_recording(episode, spec, checkpoint_robot(checkpoint, robot))
     options = DemoOptions(
         checkpoint=checkpoint,
         calibration=episode / 'calibration.yaml',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -73,6 +74,7 @@ class RobotModel:
         tools: one per arm.
         base_link: link in which all poses are given.
         mimics: joints that follow commanded ones.
+        file: the YAML that it was read from; None = made in code.
 
     Attributes:
         joint_names: J names.
@@ -95,8 +97,10 @@ class RobotModel:
         tools: Sequence[Tool],
         base_link: str,
         mimics: Sequence[Mimic] = (),
+        file: Path | None = None,
     ) -> None:
         self.name = name
+        self.file = file
         self.pinocchio_model = model
         self.joint_names = tuple(joint_names)
         self.tools = tuple(tools)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+import shutil
 from typing import Any, Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 from pydantic import Field, model_validator
+import yaml
 
 from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool
+from mtv_world_ros.geometry.robot_shape import find_mesh, write_convex_hull
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
 
@@ -131,15 +135,76 @@ def load_robot(path: Path | str) -> RobotModel:
     else:
         base = file.base_link or 'base'
         model = _from_dh(file, base)
-    followers = {mimic.joint for mimic in mimics}
+    joints = file.joints or _movable(model, {mimic.joint for mimic in mimics})
     return RobotModel(
         name=file.name,
         model=model,
-        joint_names=file.joints or [n for n in model.names[1:] if n not in followers],
+        joint_names=joints,
         tools=[_tool(entry) for entry in file.tools],
         base_link=base,
         mimics=mimics,
+        file=path,
     )
+
+
+def _movable(model: pin.Model, followers: set[str]) -> list[str]:
+    """Joints of one number that follow no other; floating and planar ones rest."""
+    return [
+        name
+        for name, joint in zip(model.names[1:], list(model.joints)[1:], strict=True)
+        if joint.nv == 1 and name not in followers
+    ]
+
+
+#: names in a folder that holds a copy of a robot
+ROBOT_YAML, _URDF, _MESHES = 'robot.yaml', 'robot.urdf', 'meshes'
+
+
+def save_robot(file: Path, folder: Path) -> Path:
+    """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
+
+    Meshes are stored as their convex hulls, which is all that drawing a robot uses. A mesh that
+    is not there stays a name.
+
+    Args:
+        file: robot YAML.
+        folder: to make; one that is there is replaced.
+
+    Returns:
+        The copy of the YAML.
+
+    Raises:
+        ConfigError, RobotError: the robot cannot be used.
+    """
+    robot = load_robot(file)
+    partial = folder.with_name(f'{folder.name}.partial')
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    values = read_yaml(file, 'robot file', 'robot_file')
+    values['base_link'] = robot.base_link
+    if values.get('urdf'):
+        tree = _with_hulls(file.parent / values['urdf'], partial)
+        tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
+        values['urdf'] = _URDF
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
+    (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+    return folder / ROBOT_YAML
+
+
+def _with_hulls(urdf: Path, folder: Path) -> Any:
+    tree = ElementTree.parse(urdf)
+    stored: dict[Path, str] = {}
+    for mesh in tree.iter('mesh'):
+        file = find_mesh(mesh.get('filename', ''), urdf)
+        if file is None:
+            continue
+        if file not in stored:
+            stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
+            write_convex_hull(file, folder / stored[file])
+        mesh.set('filename', stored[file])
+    return tree
 
 
 def _tool(entry: ToolEntry) -> Tool:
@@ -163,7 +228,32 @@ def _from_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
     children = {child.get('link') for child in root.iter('child')}
     base = next(link.attrib['name'] for link in root.iter('link')
                 if link.get('name') not in children)  # fmt: skip
-    return model, mimics, base
+    return model, _resolved(mimics), base
+
+
+def _resolved(mimics: Sequence[Mimic]) -> list[Mimic]:
+    """Followers of followers follow the joint that leads them all.
+
+    Raises:
+        RobotError: joints follow each other in a circle.
+    """
+    leaders = {mimic.joint: mimic for mimic in mimics}
+    resolved = []
+    for mimic in mimics:
+        seen = {mimic.joint}
+        while mimic.source in leaders:
+            if mimic.source in seen:
+                raise RobotError(f"joint '{mimic.joint}' follows itself, by way of {sorted(seen)}")
+            seen.add(mimic.source)
+            leader = leaders[mimic.source]
+            mimic = Mimic(
+                joint=mimic.joint,
+                source=leader.source,
+                multiplier=mimic.multiplier * leader.multiplier,
+                offset=mimic.multiplier * leader.offset + mimic.offset,
+            )
+        resolved.append(mimic)
+    return resolved
 
 
 def _take_mimics(joint: ElementTree.Element) -> list[Mimic]:

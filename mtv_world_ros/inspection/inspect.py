@@ -17,6 +17,12 @@ from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_shape import (
+    draw_silhouettes,
+    LinkShape,
+    load_shape,
+    RobotShape,
+)
 from mtv_world_ros.inspection.clocks import (
     check_commands,
     check_joint_states,
@@ -31,12 +37,6 @@ from mtv_world_ros.inspection.motion_residual import (
     ResidualConfig,
 )
 from mtv_world_ros.inspection.report import broken, Finding, Inspection, Section, suspicious
-from mtv_world_ros.inspection.robot_shape import (
-    draw_silhouettes,
-    LinkShape,
-    load_shape,
-    RobotShape,
-)
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,
@@ -237,7 +237,7 @@ def load_inspector(robot_file: Path, config: InspectionConfig | None = None) -> 
         ConfigError, RobotError: the robot cannot be used.
     """
     robot = load_robot(robot_file)
-    return Inspector(robot, load_shape(robot_file, robot), config)
+    return Inspector(robot, load_shape(robot), config)
 
 
 def _section(name: str, checks: Iterable[Checked], notes: Sequence[str]) -> Section:

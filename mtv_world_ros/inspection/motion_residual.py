@@ -17,8 +17,8 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_shape import fill, LinkShape, project_part
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.inspection.robot_shape import fill, LinkShape, project_part
 
 FloatImage = NDArray[np.float32]
 

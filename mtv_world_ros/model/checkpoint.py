@@ -13,7 +13,7 @@ import torch
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
-from mtv_world_ros.model.card import CARD, check_card, read_card
+from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
@@ -42,6 +42,7 @@ class Checkpoint:
         image_encoder: CLIP, in models with text.
         adapter: folder of a LoRA adapter to use on the transformer; see `lora.py`.
         object_motion: folder of an object motion network; see `object_motion/predictor.py`.
+        robot: folder of the robot that it was trained on, and of the default calibration.
     """
 
     transformer: MultiViewWanTransformer
@@ -53,6 +54,7 @@ class Checkpoint:
     image_encoder: ImageEncoder | None = None
     adapter: Path | None = None
     object_motion: Path | None = None
+    robot: Path | None = None
 
 
 def save_checkpoint(
@@ -74,10 +76,8 @@ def save_checkpoint(
     for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
         if encoder is not None:
             encoder.save(partial)
-    if checkpoint.adapter is not None:
-        shutil.copytree(checkpoint.adapter, partial / ADAPTER_FOLDER)
-    if checkpoint.object_motion is not None:
-        shutil.copytree(checkpoint.object_motion, partial / OBJECT_MOTION_FOLDER)
+    for name, part in _folders(checkpoint).items():
+        shutil.copytree(part, partial / name)
     (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
     if folder.exists():
         old = folder.with_name(folder.name + '.old')
@@ -87,6 +87,16 @@ def save_checkpoint(
         shutil.rmtree(old)
     else:
         partial.rename(folder)
+
+
+def _folders(checkpoint: Checkpoint) -> dict[str, Path]:
+    """Parts that are copied as they are."""
+    parts = {
+        ADAPTER_FOLDER: checkpoint.adapter,
+        OBJECT_MOTION_FOLDER: checkpoint.object_motion,
+        ROBOT_FOLDER: checkpoint.robot,
+    }
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Checkpoint:
@@ -110,6 +120,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
     drawn = control == TRAJECTORY_VIDEO
     with_text = (folder / 'text_encoder').is_dir()
     adapter, motion = folder / ADAPTER_FOLDER, folder / OBJECT_MOTION_FOLDER
+    robot = folder / ROBOT_FOLDER
     return Checkpoint(
         transformer=_load_transformer(folder / 'transformer', dtype),
         autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
@@ -120,6 +131,7 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
         image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
         adapter=adapter if adapter.is_dir() else None,
         object_motion=motion if motion.is_dir() else None,
+        robot=robot if robot.is_dir() else None,
     )
 
 

@@ -63,8 +63,8 @@ class NodeSettings(Schema):
     )
     calibration_file: str = parameter(
         '',
-        "YAML with every view's pose; empty = `config/cameras/<robot>.yaml` of the package. Read "
-        'again when an episode begins (`~/reset`, `~/start`).',
+        "YAML with every view's pose; empty = the one in the checkpoint. Read again when an episode "
+        'begins (`~/reset`, `~/start`).',
     )
     max_image_age_s: float = parameter(0.5, 'Older images are no observation [s].', _SECONDS)
     max_joint_state_age_s: float = parameter(

@@ -201,6 +201,7 @@ class DistillTrainer(Trainer):
             scheduler=straight_scheduler(self.parts.scheduler),
             card=card,
             adapter=None,
+            robot=self.robot or self.parts.robot,
         )
         save_checkpoint(student, folder, dtype=dtype)
 

@@ -9,15 +9,18 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import cached_recording, clip_starts, Recording
-from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.data_types import CameraModel, WorldModelSpec
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, TrainingError
+from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.model.card import CARD
+from mtv_world_ros.geometry.robot_file import save_robot
+from mtv_world_ros.model.card import CAMERAS, CARD, ROBOT_FOLDER
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions
@@ -131,6 +134,7 @@ def train(
         TrainingError: no usable episode, the loss is not finite, or another process is gone.
         DiskError: a file cannot be written.
     """
+    config = config.replace(video=config.video.replace(robot=robot.name))  # not a path
     processes = Processes(device)
     out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
@@ -141,6 +145,7 @@ def train(
         actions = kept_actions(
             out, config.video.control, recordings, config.spec, robot, initial=initial
         )
+    _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
     source: BatchSource | CachedSource = BatchSource(
         recordings,
         config,
@@ -203,6 +208,32 @@ def train(
     return trainer.result
 
 
+def _save_robot(
+    robot: RobotModel, recordings: Sequence[Recording], folder: Path, processes: Processes
+) -> None:
+    """Puts what checkpoints carry of the robot and its cameras into a folder."""
+    if robot.file is None or not processes.is_main:
+        return
+    with disk_errors_named(folder):
+        save_robot(robot.file, folder)
+        cameras = common_cameras(recordings)
+        if cameras is not None:
+            save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
+
+
+def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:
+    """Returns the calibration that more than half of the recordings have, or None."""
+    keys = [tuple(_camera_key(camera) for camera in r.cameras) for r in recordings]
+    key, count = Counter(keys).most_common(1)[0]
+    return recordings[keys.index(key)].cameras if 2 * count > len(keys) else None
+
+
+def _camera_key(camera: CameraModel) -> tuple[object, ...]:
+    numbers = np.concatenate([camera.K.ravel(), camera.T_mount_camera.ravel(), camera.distortion])
+    model = (camera.view, camera.mount_link, camera.distortion_model)
+    return (*model, *numbers.round(6).tolist())
+
+
 def _steps_of(result: Path) -> int | None:
     """Steps that a checkpoint or adapter was trained for; None if there is none."""
     card = result / CARD
@@ -241,11 +272,19 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
     Raises:
         EpisodeError: it is too short, or frames are missing everywhere.
     """
-    if not len(clip_starts(recording, spec)):
+    if len(clip_starts(recording, spec)):
+        return
+    periods = np.diff(recording.times)
+    rate = 1 / float(np.median(periods)) if len(periods) else 0.0
+    if 0 < rate < 0.7 * spec.fps:
         raise EpisodeError(
-            f"episode '{recording.path}' is too short, or has too large gaps, for a clip of "
-            f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s)'
+            f"episode '{recording.path}' has {rate:.3g} frames a second, fewer than the model's "
+            f'{spec.fps:g}: set video.fps to {rate:.3g} or less'
         )
+    raise EpisodeError(
+        f"episode '{recording.path}' is too short, or has too large gaps, for a clip of "
+        f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s)'
+    )
 
 
 def counted(skipped: Mapping[str, str]) -> list[str]:

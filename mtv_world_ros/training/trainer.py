@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
-from mtv_world_ros.model.card import OPTIONAL_KEYS
+from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -310,8 +310,14 @@ class Trainer:
         # what `train-motion` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
         motion = mine if mine.is_dir() else self._object_motion
-        parts = (self.config, self.encoders, self.actions, motion)
+        parts = (self.config, self.encoders, self.actions, motion, self.robot)
         export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)
+
+    @property
+    def robot(self) -> Path | None:
+        """Folder of the robot that checkpoints carry, where `train` has put one."""
+        folder = self.folder / ROBOT_FOLDER
+        return folder if folder.is_dir() else None
 
 
 def export_adapter(
@@ -330,6 +336,7 @@ def export_checkpoint(
     encoders: Encoders,
     actions: ActionEncoding | None,
     object_motion: Path | None,
+    robot: Path | None,
     dtype: torch.dtype,
 ) -> None:
     """Writes the averaged weights in a number format, with all other parts beside them."""
@@ -340,6 +347,7 @@ def export_checkpoint(
         card=_with_text(card, base),
         actions=actions,
         object_motion=object_motion,
+        robot=robot,
         text_encoder=base and base.checkpoint.text_encoder,
         image_encoder=base and base.checkpoint.image_encoder,
     )

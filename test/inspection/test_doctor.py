@@ -12,10 +12,10 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape, rods
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector, load_inspector
 from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
-from mtv_world_ros.inspection.robot_shape import draw_silhouettes, load_shape, rods
 
 QUICK = InspectionConfig(residual=ResidualConfig(max_pairs=25, lags_s=(0.0,)))
 
@@ -176,7 +176,7 @@ def lamp(folder: Path, geometry: str):
     (folder / 'lamp.yaml').write_text(ROBOT)
     (folder / 'lamp.urdf').write_text(URDF.replace('GEOMETRY', geometry))
     robot = load_robot(folder / 'lamp.yaml')
-    return robot, load_shape(folder / 'lamp.yaml', robot)
+    return robot, load_shape(robot)
 
 
 def write_cuboid_stl(path: Path, size: tuple[float, float, float]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.assembly import assemble, assemble_segmenter
+from mtv_world_ros.assembly import assemble, assemble_segmenter, checkpoint_robot
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.model.card import read_card
@@ -172,7 +172,10 @@ def test_task_file_of_ones_own_is_taken_beside_the_bundled_ones(tmp_path):
     card = read_card(share_path('resource', 'checkpoint'))
 
     def estimator(task):
-        return assemble(card, None, task=task, segmenter=assemble_segmenter()).estimator
+        robot = checkpoint_robot('bundled')
+        return assemble(
+            card, None, robot=robot, task=task, segmenter=assemble_segmenter()
+        ).estimator
 
     assert [task.name for task in estimator(str(file)).tasks] == ['put_away']
     assert LEFT not in [task.instruction for task in estimator(str(file)).tasks]

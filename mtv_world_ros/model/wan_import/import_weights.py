@@ -12,8 +12,9 @@ from typing import Any
 import torch
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model import wan_keys
-from mtv_world_ros.model.card import CARD, check_card
+from mtv_world_ros.model.card import CARD, check_card, ROBOT_FOLDER
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.tensor_files import (
     INDEX,
@@ -64,6 +65,7 @@ def import_weights(
     scheduler: Mapping[str, Any],
     card: Mapping[str, Any],
     elsewhere: Mapping[str, Path | None] | None = None,
+    robot: Path | None = None,
     shard_bytes: int = SHARD_BYTES,
 ) -> list[PartReport]:
     """Writes a checkpoint folder from public weights, number formats kept.
@@ -78,6 +80,7 @@ def import_weights(
         scheduler: arguments of the noise schedule.
         card: `world_model.json`.
         elsewhere: files or folders of parts that are not in `path`.
+        robot: YAML of the robot that it will be trained on, to be carried by the checkpoint.
         shard_bytes: size at which a new file is begun.
 
     Raises:
@@ -94,6 +97,8 @@ def import_weights(
         reports = _import_parts(sources, partial, transformer, autoencoder, shard_bytes)
         shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
         build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
+        if robot is not None:
+            save_robot(robot, partial / ROBOT_FOLDER)
         (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
         listed = [asdict(report) for report in reports]
         (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')

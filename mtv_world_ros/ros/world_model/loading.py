@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mtv_world_ros.assembly import (
-    checkpoint_path,
-    load_pipeline,
-)
+from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError
-from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
@@ -35,12 +31,9 @@ def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraMo
     """Loads the calibrated camera of every view, in the model's order.
 
     Raises:
-        CalibrationError: the file is wrong or lacks a view.
+        CalibrationError: the file is wrong or lacks a view, or there is none.
     """
-    if settings.calibration_file:
-        path = Path(settings.calibration_file)
-    else:
-        path = share_path('config', 'cameras', f'{spec.robot}.yaml')
+    path = Path(settings.calibration_file or checkpoint_cameras(settings.checkpoint))
     cameras = load_calibration(path)
     missing = [view for view in spec.views if view not in cameras]
     if missing:

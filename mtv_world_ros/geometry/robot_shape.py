@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import os
 from pathlib import Path
+import struct
 from typing import Any
 from xml.etree import ElementTree
 
@@ -51,36 +53,52 @@ class RobotShape:
         parts: of its links.
         source: where they are from, in words.
         is_known: False where rods stand for the links.
+        missing: shapes of the URDF that are not among the parts, and why.
     """
 
     parts: tuple[LinkShape, ...]
     source: str
     is_known: bool = True
+    missing: tuple[str, ...] = ()
 
 
-def load_shape(robot_file: Path, robot: RobotModel) -> RobotShape:
+def load_shape(robot: RobotModel) -> RobotShape:
     """Returns the robot's shape.
 
-    The URDF's visual elements, or where a link has none its collision elements. Rods from joint
-    to joint where the robot is given by a Denavit-Hartenberg table, or its meshes are not there.
+    The URDF's visual elements; for links where it has none, or where their meshes are not there,
+    its collision elements. Rods from joint to joint where the robot is given by a
+    Denavit-Hartenberg table or made in code, and where a link that moves has none of its shapes.
 
     Raises:
         RobotError: a mesh cannot be read, or an element has a shape that no URDF has.
     """
-    urdf = yaml.safe_load(robot_file.read_text(encoding='utf-8')).get('urdf')
+    if robot.file is None:
+        return rods(robot, 'the robot has no file')
+    urdf = yaml.safe_load(robot.file.read_text(encoding='utf-8')).get('urdf')
     if urdf is None:
         return rods(robot, 'the robot is given by a table')
-    path = robot_file.parent / str(urdf)
-    try:
-        parts = tuple(_urdf_shapes(path))
-    except FileNotFoundError as error:
-        return rods(robot, f'there is no mesh {error}')
-    if not {part.link for part in parts} - {robot.base_link}:
+    path = robot.file.parent / str(urdf)
+    links = {link.attrib['name']: link for link in ElementTree.parse(path).iter('link')}
+    found = {name: _link_shapes(link, path) for name, link in links.items()}
+    moving = moving_links(robot)
+    parts = tuple(part for shapes, _ in found.values() for part in shapes)
+    missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
+    if missing:
+        return rods(robot, f'there is no mesh {missing[0]}', missing)
+    if not any(part.link in moving for part in parts):
         return rods(robot, f"'{path.name}' has no shapes")
     return RobotShape(parts=parts, source=f"the shapes of '{path.name}'")
 
 
-def rods(robot: RobotModel, why: str) -> RobotShape:
+def moving_links(robot: RobotModel) -> set[str]:
+    """Returns the links that move against the base link, by the robot's kinematics."""
+    model = robot.pinocchio_model
+    frames = {f.name: f for f in model.frames if f.type == pin.FrameType.BODY}
+    base = frames[robot.base_link].parentJoint
+    return {name for name, frame in frames.items() if frame.parentJoint != base}
+
+
+def rods(robot: RobotModel, why: str, missing: Sequence[str] = ()) -> RobotShape:
     """Returns rods between neighbouring joints, and from the last ones to the tools."""
     model, neutral = robot.pinocchio_model, pin.neutral(robot.pinocchio_model)
     data = model.createData()
@@ -100,7 +118,12 @@ def rods(robot: RobotModel, why: str) -> RobotShape:
         ]  # fmt: skip
     found += [_rod(tool.link, np.zeros(3), tool.T_link_tool[:3, 3]) for tool in robot.tools]
     parts = tuple(rod for rod in found if rod is not None)
-    return RobotShape(parts=parts, source=f'rods from joint to joint ({why})', is_known=False)
+    return RobotShape(
+        parts=parts,
+        source=f'rods from joint to joint ({why})',
+        is_known=False,
+        missing=tuple(missing),
+    )
 
 
 def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
@@ -113,16 +136,28 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
     return LinkShape(link=link, points=_moved(T, _cylinder(ROD_RADIUS_M, length)))
 
 
-def _urdf_shapes(path: Path) -> Iterator[LinkShape]:
-    root = ElementTree.fromstring(path.read_text(encoding='utf-8'))
-    for link in root.iter('link'):
-        for element in link.findall('visual') or link.findall('collision'):
-            geometry = element.find('geometry')
-            if geometry is None or len(geometry) == 0:
-                continue
-            points = _points(geometry[0], path)
-            pose = _origin(element.find('origin'))
-            yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
+def _link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape], list[str]]:
+    """A link's shapes, and why there are none; those of its collisions where visuals lack."""
+    missing: list[str] = []
+    for kind in ('visual', 'collision'):
+        try:
+            shapes = list(_shapes(link, kind, urdf))
+        except FileNotFoundError as error:
+            missing.append(str(error))
+            continue
+        if shapes:
+            return shapes, []
+    return [], missing
+
+
+def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+    for element in link.findall(kind):
+        geometry = element.find('geometry')
+        if geometry is None or len(geometry) == 0:
+            continue
+        points = _points(geometry[0], urdf)
+        pose = _origin(element.find('origin'))
+        yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
@@ -136,7 +171,10 @@ def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
         return float(values['radius']) * _directions(64)
     if shape.tag == 'mesh':
         scale = np.array(values.get('scale', '1 1 1').split(), float)
-        return _mesh(_mesh_file(values['filename'], urdf)) * scale
+        file = find_mesh(values['filename'], urdf)
+        if file is None:
+            raise FileNotFoundError(f"'{values['filename']}'")
+        return _outermost(_load_mesh(file).vertices()) * scale
     raise RobotError(
         f"'{urdf}' has a shape '{shape.tag}'; known are box, capsule, cylinder, mesh, sphere"
     )
@@ -157,8 +195,12 @@ def _directions(count: int) -> FloatArray:
     return np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=-1)
 
 
-def _mesh_file(name: str, urdf: Path) -> Path:
-    """Where a mesh lies: `package://<name>/...` is looked for above the URDF."""
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """Returns where a mesh lies, or None.
+
+    `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
+    installed (`AMENT_PREFIX_PATH`).
+    """
     plain = name.removeprefix('file://')
     if not plain.startswith('package://'):
         candidates = [urdf.parent / plain]
@@ -167,23 +209,49 @@ def _mesh_file(name: str, urdf: Path) -> Path:
         above = urdf.resolve().parents
         candidates = [folder / package / inside for folder in above]
         candidates += [folder / inside for folder in above if folder.name == package]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise FileNotFoundError(f"'{name}'")
+        installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+        candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _mesh(path: Path) -> FloatArray:
-    """Outermost points of a mesh file (STL, DAE, OBJ)."""
+def write_convex_hull(mesh: Path, out: Path) -> None:
+    """Writes the convex hull of a mesh's outermost points as a binary STL [units of the mesh].
+
+    Raises:
+        RobotError: the mesh cannot be read.
+    """
+    import coal
+
+    hull = coal.BVHModelOBBRSS()
+    points = _outermost(_load_mesh(mesh).vertices())
+    hull.beginModel(0, len(points))
+    for point in points:
+        hull.addVertex(point)
+    hull.endModel()
+    try:
+        hull.buildConvexHull(True, 'Qt')
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"mesh '{mesh}' has no volume: {error}") from error
+    faces = [hull.convex.polygons(i) for i in range(hull.convex.num_polygons)]
+    corners = np.array(hull.convex.points())[[[face[k] for k in range(3)] for face in faces]]
+    rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in corners]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+
+
+def _load_mesh(path: Path) -> Any:
+    """A mesh file (STL, DAE, OBJ)."""
     try:
         import coal  # comes with Pinocchio, but not with every build of it
     except ImportError as error:
         raise FileNotFoundError(f"reader: '{path.name}' needs the module coal") from error
     try:
-        mesh = coal.MeshLoader().load(str(path), np.ones(3))
-        points = np.array([mesh.vertex(i) for i in range(mesh.num_vertices)])
+        return coal.MeshLoader().load(str(path), np.ones(3))
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
+
+
+def _outermost(points: FloatArray) -> FloatArray:
     return points[np.unique((points @ _directions(_DIRECTIONS).T).argmax(axis=0))]
 
 
