@@ -81,6 +81,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
+    'plunge': _kind('height', 'test', 0.01, 0.04, 'm', 'a grasp closes this much too low'),
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
     # lateral
     'shift': _kind(
@@ -100,6 +101,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
+    'tip': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans from the lift on'),
     'lean': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
     # opening
     'loose': _kind(
@@ -112,6 +114,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'standard deviation of a slow error of how far the grippers open, as a share',
+    ),
+    'grip': _kind(
+        'opening',
+        'train',
+        0.6,
+        1.0,
+        '',
+        'standard deviation of how far the gripper is open at every way point, as a share',
     ),
     'narrow': _kind(
         'opening', 'test', 0.5, 1.0, '', 'share of its opening that lacks before a grasp; 1 = shut'
@@ -128,12 +138,24 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of its range that the gripper opens on the way',
     ),
+    'snag': _kind('release', 'test', 0.8, 1.0, '', 'share that lacks of how far it lets go'),
     'blink': _kind(
         'release', 'test', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
     ),
     # collision
     'push': _kind(
         'collision', 'train', 0.04, 0.15, 'm', 'it comes in low from the side, from this far'
+    ),
+    'play': _kind(
+        'collision',
+        'train',
+        2,
+        6,
+        '',
+        'number of way points drawn at random: about the object, or where the gripper is',
+    ),
+    'brush': _kind(
+        'collision', 'test', 0.04, 0.1, 'm', 'it goes this far sideways before it rises again'
     ),
     'low_carry': _kind('collision', 'calibrate', 0.04, 0.15, 'm', 'it carries this much lower'),
     'sweep': _kind(

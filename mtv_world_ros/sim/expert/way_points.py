@@ -19,6 +19,8 @@ _LOWEST_M = 0.004
 _TRY_LIFT_M = 0.04
 #: way points of a move at most
 _MOST_STOPS = 40
+#: a way point of play: standard deviations in the plane [m], in yaw [rad]; largest height [m]
+_PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,8 @@ class WayPointFaults:
         self._move, self._angle = float(rng.uniform()), float(rng.uniform(0, 2 * np.pi))
         self._sign = float(rng.choice((-1.0, 1.0)))
         self._draws = rng.normal(size=(_MOST_STOPS, 3))
+        self._openings = rng.normal(size=_MOST_STOPS)
+        self._play = np.random.default_rng(rng.integers(2**32))
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -80,7 +84,10 @@ class WayPointFaults:
         for kind, size in self._variant.sizes:
             edit = _EDITS.get(kind)
             if edit is not None:
-                stops = edit(stops, size, _Side(yaw, self._sign, self._angle, self._draws))
+                side = _Side(
+                    yaw, self._sign, self._angle, self._draws, self._openings, self._play
+                )
+                stops = edit(stops, size, side)
         return stops
 
 
@@ -92,6 +99,8 @@ class _Side:
     sign: float
     angle: float
     draws: FloatArray
+    openings: FloatArray
+    play: np.random.Generator
 
     @property
     def along(self) -> FloatArray:
@@ -121,6 +130,10 @@ def _first(stops: Stops, phase: str) -> int:
     return next(i for i, stop in enumerate(stops) if stop.phase == phase)
 
 
+def _plunge(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('grasp', 'close'), lambda stop: stop.moved(_up(-size)))
+
+
 def _high(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('grasp', 'close'), lambda stop: stop.moved(_up(size)))
 
@@ -145,6 +158,12 @@ def _lean(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _GRASP, lambda s: replace(s, lean=s.lean + side.sign * size))
 
 
+def _tip(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(
+        stops, ('lift', *_PLACE), lambda s: replace(s, lean=s.lean + side.sign * size)
+    )
+
+
 def _loose(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('close', *_HELD), lambda s: replace(s, opening=max(s.opening, size)))
 
@@ -153,9 +172,23 @@ def _slack(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('carry', 'lower'), lambda s: replace(s, opening=max(s.opening, size)))
 
 
+def _grip(stops: Stops, size: float, side: _Side) -> Stops:
+    drawn = [
+        replace(stop, opening=float(np.clip(stop.opening + size * error, 0.0, 1.0)))
+        for stop, error in zip(stops[:-1], side.openings, strict=False)
+    ]
+    return [*drawn, stops[-1]]
+
+
 def _narrow(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(
         stops, ('above', 'grasp'), lambda s: replace(s, opening=s.opening * (1 - size))
+    )
+
+
+def _snag(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(
+        stops, ('open', 'retreat'), lambda s: replace(s, opening=s.opening * (1 - size))
     )
 
 
@@ -218,6 +251,34 @@ def _sweep(stops: Stops, size: float, side: _Side) -> Stops:
     ]
 
 
+def _brush(stops: Stops, size: float, side: _Side) -> Stops:
+    opened = _first(stops, 'open')
+    aside = replace(stops[opened], phase='retreat', seconds=None).moved(size * side.anywhere)
+    return [*stops[: opened + 1], aside, *stops[opened + 1 :]]
+
+
+def _play(stops: Stops, size: float, side: _Side) -> Stops:
+    """Way points drawn at random: before the grasp, on the way to the goal, after the release."""
+    rng, floor = side.play, min(stop.position[2] for stop in stops)
+    begins = {'grasp': 0.6, 'carry': 0.2, 'retreat': 0.2}
+    for _ in range(round(size)):
+        at = _first(stops, str(rng.choice(list(begins), p=list(begins.values()))))
+        where = stops[_first(stops, 'grasp')] if stops[at].phase == 'grasp' else stops[at - 1]
+        x, y = where.position[:2] + rng.normal(0.0, _PLAY_M, 2)
+        # half of them as low as they may be, where things are
+        z = max(floor, where.position[2] + rng.uniform(-_PLAY_HEIGHT_M, _PLAY_HEIGHT_M))
+        drawn = replace(
+            where,
+            phase='above',
+            position=np.array([x, y, z]),
+            yaw=where.yaw + float(rng.normal(0.0, _PLAY_RAD)),
+            opening=float(rng.uniform()),
+            seconds=None,
+        )
+        stops = [*stops[:at], drawn, *stops[at:]]
+    return stops
+
+
 def _elsewhere(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _PLACE, lambda stop: stop.moved(size * side.anywhere))
 
@@ -256,16 +317,22 @@ def _wander(stops: Stops, size: float, side: _Side) -> Stops:
 
 _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'high': _high,
+    'plunge': _plunge,
     'drop_high': _drop_high,
     'aside': _aside,
     'along': _along,
     'turn': _turn,
+    'tip': _tip,
     'lean': _lean,
     'loose': _loose,
     'slack': _slack,
+    'grip': _grip,
     'narrow': _narrow,
     'drops': _drops,
+    'snag': _snag,
     'blink': _blink,
+    'play': _play,
+    'brush': _brush,
     'low_carry': _low_carry,
     'push': _push,
     'sweep': _sweep,
