@@ -24,6 +24,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-retry-0.03',
         'expert-wander-0.02',
         'expert-fumble-0.4',
+        'expert-grip-0.6',
+        'expert-play-2',
     ),
     'calibrate': (
         'expert',
@@ -62,6 +64,15 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-stall-1.2',
         'expert-regrasp-0.01',
         'expert-regrasp-0.03',
+        # added after the first measurement on the kinds above, before any on these
+        'expert-hasty-0.03',
+        'expert-hasty-0.05',
+        'expert-clutch-0.7',
+        'expert-clutch-0.95',
+        'expert-snag-0.5',
+        'expert-snag-0.7',
+        'expert-brush-0.06',
+        'expert-brush-0.1',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

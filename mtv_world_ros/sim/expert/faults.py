@@ -78,10 +78,10 @@ FAULTS: Mapping[str, FaultKind] = {
     # timing
     'late': _kind('timing', 'train', 0.6, 3.0, 's', 'the grippers follow this much later'),
     'early': _kind('timing', 'test', 0.5, 2.0, 's', 'the grippers go this much ahead'),
+    'hasty': _kind('timing', 'test', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
-    'plunge': _kind('height', 'test', 0.01, 0.04, 'm', 'a grasp closes this much too low'),
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
     # lateral
     'shift': _kind(
@@ -101,7 +101,6 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
-    'tip': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans from the lift on'),
     'lean': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
     # opening
     'loose': _kind(
@@ -206,6 +205,9 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'it puts the object down this far off and grasps where it was',
+    ),
+    'clutch': _kind(
+        'regrasp', 'test', 0.8, 1.0, '', 'share by which the fingers close again while it retreats'
     ),
 }
 

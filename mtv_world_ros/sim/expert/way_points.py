@@ -130,10 +130,6 @@ def _first(stops: Stops, phase: str) -> int:
     return next(i for i, stop in enumerate(stops) if stop.phase == phase)
 
 
-def _plunge(stops: Stops, size: float, side: _Side) -> Stops:
-    return _changed(stops, ('grasp', 'close'), lambda stop: stop.moved(_up(-size)))
-
-
 def _high(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('grasp', 'close'), lambda stop: stop.moved(_up(size)))
 
@@ -158,12 +154,6 @@ def _lean(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _GRASP, lambda s: replace(s, lean=s.lean + side.sign * size))
 
 
-def _tip(stops: Stops, size: float, side: _Side) -> Stops:
-    return _changed(
-        stops, ('lift', *_PLACE), lambda s: replace(s, lean=s.lean + side.sign * size)
-    )
-
-
 def _loose(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('close', *_HELD), lambda s: replace(s, opening=max(s.opening, size)))
 
@@ -184,6 +174,15 @@ def _narrow(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(
         stops, ('above', 'grasp'), lambda s: replace(s, opening=s.opening * (1 - size))
     )
+
+
+def _hasty(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('close',), lambda stop: stop.moved(_up(size)))
+
+
+def _clutch(stops: Stops, size: float, side: _Side) -> Stops:
+    released = stops[_first(stops, 'open')].opening
+    return _changed(stops, ('retreat',), lambda s: replace(s, opening=released * (1 - size)))
 
 
 def _snag(stops: Stops, size: float, side: _Side) -> Stops:
@@ -317,12 +316,11 @@ def _wander(stops: Stops, size: float, side: _Side) -> Stops:
 
 _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'high': _high,
-    'plunge': _plunge,
+    'hasty': _hasty,
     'drop_high': _drop_high,
     'aside': _aside,
     'along': _along,
     'turn': _turn,
-    'tip': _tip,
     'lean': _lean,
     'loose': _loose,
     'slack': _slack,
@@ -330,6 +328,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'narrow': _narrow,
     'drops': _drops,
     'snag': _snag,
+    'clutch': _clutch,
     'blink': _blink,
     'play': _play,
     'brush': _brush,
