@@ -16,6 +16,7 @@ from mtv_world_ros.cli import (
     import_dataset,
     import_weights,
     rank,
+    recover,
     replay,
     report,
     train,
@@ -36,6 +37,7 @@ COMMANDS = (
     calibrate,
     report,
     doctor,
+    recover,
     import_dataset,
     import_weights,
 )

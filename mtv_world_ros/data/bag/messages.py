@@ -37,6 +37,11 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def is_standard(msgtype: str) -> bool:
+    """Whether the type is among the standard message packages."""
+    return msgtype in typestore().fielddefs
+
+
 def check_type(msgtype: str) -> str:
     """Returns `msgtype` if it is known.
 

@@ -49,6 +49,18 @@ def dump_qos(qos: Qos) -> str:
     return _dump([_qos_entry(qos)]).strip()
 
 
+def parse_qos(text: str) -> Qos:
+    """The first profile of such a list; the default where it cannot be read."""
+    try:
+        entry = yaml.safe_load(text)[0]
+        words = {key: entry[key] for key in ('reliability', 'durability', 'history')}
+        if all(isinstance(word, str) for word in words.values()):
+            return Qos(**words, depth=int(entry['depth']))
+    except (yaml.YAMLError, LookupError, TypeError, ValueError):
+        pass
+    return Qos()
+
+
 def bag_information(
     file_name: str,
     topics: Sequence[TopicRecord],

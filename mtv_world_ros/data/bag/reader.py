@@ -36,12 +36,14 @@ class BagMessage(NamedTuple):
         msgtype: e.g. `sensor_msgs/msg/Image`.
         stamp_ns: log time [ns].
         data: CDR bytes with encapsulation header.
+        publish_ns: time of publication [ns].
     """
 
     topic: str
     msgtype: str
     stamp_ns: int
     data: bytes
+    publish_ns: int = 0
 
 
 class _Cut(Exception):
@@ -96,6 +98,17 @@ class BagReader:
                 return
             except OSError as error:
                 raise EpisodeError(f"cannot read '{file}': {error}") from error
+
+    def declared(self) -> dict[str, tuple[str, str, str]]:
+        """Message type, `.msg` text and offered profiles by topic, as far as was read by now."""
+        found = {}
+        for channel in self._channels.values():
+            schema = self._schemas.get(channel.schema_id)
+            if schema is not None:
+                text = schema.data.decode(errors='replace')
+                profiles = channel.metadata.get('offered_qos_profiles', '')
+                found[channel.topic] = (schema.name, text, profiles)
+        return found
 
     def _find_files(self) -> list[Path]:
         if self.path.is_file():
@@ -179,13 +192,14 @@ class BagReader:
         if opcode == Opcode.MESSAGE:
             if len(body) < _MESSAGE.size:
                 raise _Cut(f'a message of {len(body)} bytes')
-            number, _, log_time, _ = _MESSAGE.unpack_from(body)
+            number, _, log_time, publish_time = _MESSAGE.unpack_from(body)
             channel = self._channels.get(number)
             if channel is None:
                 raise _Cut(f'a message of channel {number}, which is not declared')
             if (topics is None or channel.topic in topics) and self._is_cdr(channel):
                 msgtype = self._schemas[channel.schema_id].name
-                yield BagMessage(channel.topic, msgtype, log_time, body[_MESSAGE.size :])
+                data = body[_MESSAGE.size :]
+                yield BagMessage(channel.topic, msgtype, log_time, data, publish_time)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
             try:
                 self._declare(opcode, ReadDataStream(io.BytesIO(body)))

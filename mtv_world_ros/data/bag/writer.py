@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+import errno
 import os
 from pathlib import Path
 import shutil
 import tempfile
 from threading import Lock
 from types import TracebackType
-from typing import IO, Self
+from typing import cast, IO, Self
 
 from mcap.writer import CompressionType, Writer
 
@@ -26,22 +27,33 @@ from mtv_world_ros.errors import EpisodeError
 
 #: small chunks: a cut file loses little more than its last chunk
 CHUNK_BYTES = 256 * 1024
+#: space kept free for metadata, and what the index needs for a chunk and a channel in it
+_RESERVE_BYTES = 1024 * 1024
+_INDEX_BYTES = (128, 16)
+RESERVE_NAME = '.reserve'
 
 
 class BagWriter:
     """Records topics of the standard message packages as a rosbag2 MCAP folder.
 
     Everything is written into a hidden folder beside `path` that gets its name in `close()`,
-    so a crash leaves nothing under `path`. As a context manager it closes when the block
-    ends and drops the record when it raises. Messages may come from several threads.
+    so a crash leaves nothing under `path`; `mtv-world recover` finds such a folder. As a context
+    manager it closes when the block ends and drops the record when it raises. Messages may come
+    from several threads.
+
+    Args:
+        path: folder to make.
+        overwrite: replace an existing bag.
+        keep: nothing that was recorded is ever deleted: space for the index is reserved, so that
+            the bag is closed whole even on a full disk; a block that raises closes it, too.
 
     Raises:
         EpisodeError: `path` exists (and not `overwrite`) or its parent cannot be written.
     """
 
-    def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Path | str, *, overwrite: bool = False, keep: bool = False) -> None:
         self.path = Path(path)
-        self._overwrite = overwrite
+        self._overwrite, self._keep = overwrite, keep
         self._check_free()
         self._file_name = f'{self.path.name}_0.mcap'
         self._topics: dict[str, tuple[int, TopicRecord]] = {}
@@ -51,24 +63,39 @@ class BagWriter:
         self._last_ns = 0
         self._lock = Lock()
         self._folder, self._file = self._open()
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        stream = cast('IO[bytes]', self._file)  # all that the writer calls of it
+        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile='ros2', library='mtv_world_ros')
+        self._failure = ''
+
+    @property
+    def num_messages(self) -> int:
+        """Messages recorded so far."""
+        return sum(record.message_count for _, record in self._topics.values())
 
     @property
     def folder(self) -> Path:
         """Folder for files that go with the bag (hidden until `close()`)."""
         return self._folder
 
-    def declare(self, topic: str, msgtype: str, qos: Qos | None = None) -> None:
+    def declare(
+        self, topic: str, msgtype: str, qos: Qos | None = None, definition: str = ''
+    ) -> None:
         """Adds a topic, with the QoS profile that `ros2 bag play` will offer.
 
         Topics that are not declared get a reliable profile of depth 10 at their first message.
+
+        Args:
+            topic: absolute topic name.
+            msgtype: e.g. `sensor_msgs/msg/Image`.
+            qos: the profile.
+            definition: `.msg` text of a type that is not in the standard packages.
 
         Raises:
             EpisodeError: the type is unknown, or the topic has another type already.
         """
         with self._lock:
-            self._channel(topic, msgtype, qos)
+            self._channel(topic, msgtype, qos, definition)
 
     def write_raw(
         self,
@@ -89,11 +116,14 @@ class BagWriter:
             publish_ns: time of publication [ns]; by default the log time.
 
         Raises:
-            EpisodeError: unknown type, a topic of another type, or a negative stamp.
+            EpisodeError: unknown type, a topic of another type, a negative stamp, or the disk
+                does not take it (full); what was written before is kept until `close`.
         """
         if stamp_ns < 0:
             raise EpisodeError(f"'{topic}': stamp {stamp_ns} ns is negative")
         with self._lock:
+            if self._failure:
+                raise EpisodeError(self._failure)
             channel, record = self._channel(topic, msgtype, None)
             self._writer.add_message(
                 channel,
@@ -105,6 +135,17 @@ class BagWriter:
             record.message_count += 1
             self._first_ns = min(stamp_ns, stamp_ns if self._first_ns is None else self._first_ns)
             self._last_ns = max(stamp_ns, self._last_ns)
+            self._store(self._file.flush)
+
+    def flush(self) -> None:
+        """Hands what was recorded to the operating system: a kill loses nothing of it.
+
+        Raises:
+            EpisodeError: the disk does not take it.
+        """
+        with self._lock:
+            if not self._file.closed and not self._failure:
+                self._store(self._writer.flush)
 
     def set_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Sets the MCAP metadata record `name`, also found in metadata.yaml's custom_data."""
@@ -114,7 +155,8 @@ class BagWriter:
         """Finishes the record and gives it its name; a second call does nothing.
 
         Raises:
-            EpisodeError: something else took the name meanwhile; the record is dropped.
+            EpisodeError: something else took the name meanwhile, or the disk does not take the
+                rest; the record is dropped, or with `keep` stays in the hidden folder.
         """
         with self._lock:
             if self._file.closed:
@@ -123,13 +165,20 @@ class BagWriter:
                 self._finish()
                 self._check_free()
                 self._take_name()
+            except OSError as error:
+                raise EpisodeError(self._left_behind(str(error))) from error
+            except EpisodeError as error:
+                raise EpisodeError(self._left_behind(str(error))) from error
             finally:
-                self._drop()
+                self._file.close()
+                if not self._keep:
+                    self._drop()
 
     def abort(self) -> None:
         """Deletes the unfinished recording. Does nothing after `close()`."""
         with self._lock:
-            self._drop()
+            if not self._file.closed:
+                self._drop()
 
     def __enter__(self) -> Self:
         return self
@@ -140,7 +189,7 @@ class BagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is None:
+        if kind is None or self._keep:
             self.close()
         else:
             self.abort()
@@ -153,7 +202,7 @@ class BagWriter:
         if self.path.exists() and not (self.path / 'metadata.yaml').is_file():
             raise EpisodeError(f"'{self.path}' is not a bag folder; it will not be overwritten")
 
-    def _open(self) -> tuple[Path, IO[bytes]]:
+    def _open(self) -> tuple[Path, _Spool]:
         parent = self.path.absolute().parent
         try:
             parent.mkdir(parents=True, exist_ok=True)
@@ -161,29 +210,50 @@ class BagWriter:
                 tempfile.mkdtemp(dir=parent, prefix=f'.{self.path.name}.', suffix='.tmp')
             )
             folder.chmod(0o755)
-            return folder, (folder / self._file_name).open('wb')
+            return folder, _Spool(folder / self._file_name, reserves=self._keep)
         except OSError as error:
             raise EpisodeError(f"cannot write '{self.path}': {error}") from error
 
-    def _channel(self, topic: str, msgtype: str, qos: Qos | None) -> tuple[int, TopicRecord]:
+    def _store(self, flush: Callable[[], None]) -> None:
+        try:
+            flush()
+        except OSError as error:
+            self._failure = f"cannot write '{self.path}': {error}"
+            raise EpisodeError(self._failure) from error
+
+    def _left_behind(self, reason: str) -> str:
+        if not self._keep:
+            return reason
+        return (
+            f"{reason}; what was recorded is in '{self._folder}': make room and call "
+            '`mtv-world recover` with it'
+        )
+
+    def _channel(
+        self, topic: str, msgtype: str, qos: Qos | None, definition: str = ''
+    ) -> tuple[int, TopicRecord]:
         if self._file.closed:
             raise EpisodeError(f"'{self.path}' is closed; '{topic}' cannot be recorded any more")
         known = self._topics.get(topic)
         if known is None:
-            known = self._topics[topic] = self._add_channel(topic, msgtype, qos or Qos())
+            known = self._add_channel(topic, msgtype, qos or Qos(), definition)
+            self._topics[topic] = known
+            self._file.num_channels = len(self._topics)
         elif known[1].msgtype != msgtype:
             raise EpisodeError(f"'{topic}' is recorded as {known[1].msgtype}, not as {msgtype}")
         return known
 
-    def _add_channel(self, topic: str, msgtype: str, qos: Qos) -> tuple[int, TopicRecord]:
+    def _add_channel(
+        self, topic: str, msgtype: str, qos: Qos, definition: str
+    ) -> tuple[int, TopicRecord]:
+        is_foreign = definition and not messages.is_standard(msgtype)
         if msgtype not in self._schemas:
-            text = messages.definition(msgtype)
+            text = definition if is_foreign else messages.definition(msgtype)
             self._schemas[msgtype] = self._writer.register_schema(
                 name=msgtype, encoding='ros2msg', data=text.encode()
             )
-        record = TopicRecord(
-            name=topic, msgtype=msgtype, type_hash=messages.type_hash(msgtype), qos=qos
-        )
+        type_hash = '' if is_foreign else messages.type_hash(msgtype)
+        record = TopicRecord(name=topic, msgtype=msgtype, type_hash=type_hash, qos=qos)
         channel = self._writer.register_channel(
             topic=topic,
             message_encoding='cdr',
@@ -203,9 +273,10 @@ class BagWriter:
         self._writer.add_metadata(
             'rosbag2', {'serialized_metadata': dump_information(information)}
         )
+        self._file.release()
         self._writer.finish()
         self._file.flush()
-        os.fsync(self._file.fileno())
+        self._file.sync()
         self._file.close()
         (self._folder / 'metadata.yaml').write_text(
             dump_metadata_yaml(information), encoding='utf-8'
@@ -223,3 +294,85 @@ class BagWriter:
     def _drop(self) -> None:
         self._file.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class _Spool:
+    """The file of a bag: what the disk does not take stays in memory, and the file stays whole.
+
+    Args:
+        path: file to make.
+        reserves: whether to hold space for the index, so that `release` makes room for it.
+
+    Attributes:
+        num_channels: of the bag; the index grows with it.
+    """
+
+    def __init__(self, path: Path, *, reserves: bool) -> None:
+        self._file = path.open('xb', buffering=0)
+        self._reserve_path = path.with_name(RESERVE_NAME)
+        self._pending = bytearray()
+        self._size = 0
+        self._largest = 0
+        self._num_flushes = 0
+        self.num_channels = 0
+        self._reserved = 0 if reserves else -1
+
+    @property
+    def closed(self) -> bool:
+        return self._file.closed
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._size + len(self._pending)
+
+    def flush(self) -> None:
+        """Writes what is pending, whole or not at all.
+
+        Raises:
+            OSError: the disk does not take it; it stays pending.
+        """
+        if not self._pending:
+            return
+        self._num_flushes += 1
+        self._largest = max(self._largest, len(self._pending))
+        self._reserve()
+        done = 0
+        try:
+            with memoryview(self._pending) as data:
+                while done < len(data):
+                    done += self._file.write(data[done:])
+        except OSError:
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
+            raise
+        self._size += done
+        self._pending.clear()
+
+    def release(self) -> None:
+        """Gives the reserved space back, for the index; nothing is reserved from now on."""
+        self._reserved = -1
+        self._reserve_path.unlink(missing_ok=True)
+
+    def sync(self) -> None:
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _reserve(self) -> None:
+        """Holds space for the next chunk and the index of all chunks so far."""
+        chunk, channel = _INDEX_BYTES
+        index = self._num_flushes * (chunk + channel * self.num_channels)
+        needed = _RESERVE_BYTES + 2 * self._largest + index
+        if not 0 <= self._reserved < needed:
+            return
+        with self._reserve_path.open('ab') as file:
+            try:
+                os.posix_fallocate(file.fileno(), 0, 2 * needed)
+            except OSError as error:
+                if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
+                    raise
+        self._reserved = 2 * needed

@@ -12,6 +12,8 @@ from mtv_world_ros.ros.messages.stamps import NANO
 
 #: the encapsulation header comes first; the stamp is a header's first field
 _OFFSET = 4
+#: a message with a stamp is at least this long
+MIN_STAMPED_BYTES = _OFFSET + 8
 
 
 @cache

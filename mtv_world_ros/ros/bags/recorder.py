@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -19,15 +20,23 @@ from rclpy.utilities import remove_ros_args
 
 from mtv_world_ros.data.bag.metadata import Qos
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.ros.bags.raw_headers import (
+    has_header,
+    message_class,
+    MIN_STAMPED_BYTES,
+    read_stamp,
+)
 from mtv_world_ros.ros.run_node import run
 
 #: messages kept while the disk is busy
 _DEPTH = 2000
 #: after a stop signal, silence for this long means that everything arrived [s]
 SILENCE_S = 0.5
-LONGEST_DRAIN_S = 10.0
+#: nobody waits longer than this for publishers that do not fall silent [s]
+LONGEST_DRAIN_S = 1.0
+#: a kill loses no more than what came in this time [s]
+_FLUSH_PERIOD_S = 0.5
 #: nodes say these as long as they live
 _ENDLESS = ('/diagnostics', '/clock')
 #: topics that are not there yet are looked for this often [s]
@@ -53,6 +62,8 @@ class Recorder(Node):
         self._taken: list[Subscription] = []
         self._declared: list[tuple[str, str, Qos]] = []
         self._next_look_s = 0.0
+        self._next_flush_s = 0.0
+        self._num_lost: Counter[str] = Counter()
         self._end_s = float('inf')
         self._is_announced = False
         self._counts: Counter[str] = Counter()
@@ -62,7 +73,7 @@ class Recorder(Node):
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._writer = self._open()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._on_signal)
 
     def record(self) -> None:
@@ -70,6 +81,7 @@ class Recorder(Node):
 
         Raises:
             ConfigError: a topic has no publisher in time.
+            EpisodeError: the disk is full; the bag holds what was recorded until then.
         """
         begin_s = time.monotonic()
         while not self._stopping and time.monotonic() < self._end_s:
@@ -79,23 +91,42 @@ class Recorder(Node):
             self._after_spin()
         if self._stopping:
             self._drain()
-        if self._writer is not None:
-            self._writer.close()
-        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
-        self.get_logger().info(f"recorded '{self._options.out}': {counted or 'nothing'}")
+        self._close_bag()
 
     def close(self) -> None:
-        """Drops a record that was not finished, and ends the node."""
-        if self._writer is not None:
-            self._writer.abort()
-        self.destroy_node()
+        """Closes the bag, whatever ended the recording, and ends the node."""
+        try:
+            self._close_bag()
+        except EpisodeError as error:
+            self.get_logger().error(str(error))
+        finally:
+            self.destroy_node()
+
+    def _close_bag(self) -> None:
+        """Finishes the bag and says what is in it and what is not; drops one of no message."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        if not (writer.num_messages or self._is_announced):
+            writer.abort()
+            return
+        writer.close()
+        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
+        self._counts.clear()
+        self.get_logger().info(f"recorded '{writer.path}': {counted or 'nothing'}")
+        if self._num_lost:
+            lost = ', '.join(f'{topic} {n}' for topic, n in sorted(self._num_lost.items()))
+            self.get_logger().warning(f'lost before they got here: {lost}')
 
     def _open(self) -> BagWriter | None:
         """What is recorded into from the start."""
-        return BagWriter(self._options.out, overwrite=self._options.overwrite)
+        return BagWriter(self._options.out, overwrite=self._options.overwrite, keep=True)
 
     def _after_spin(self) -> None:
         """What is to be done now and then."""
+        if self._writer is not None and time.monotonic() > self._next_flush_s:
+            self._next_flush_s = time.monotonic() + _FLUSH_PERIOD_S
+            self._writer.flush()
 
     def _on_signal(self, *_: object) -> None:
         self._stopping = True
@@ -147,6 +178,9 @@ class Recorder(Node):
             self._handler(topic, msgtype),
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
             raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                message_lost=lambda event: self._num_lost.update({topic: event.total_count_change})
+            ),
         )
         self._taken.append(taken)
 
@@ -159,8 +193,8 @@ class Recorder(Node):
             now_ns = self.get_clock().now().nanoseconds
             stamp_ns = now_ns
             if by_header:
-                if has_header(msgtype):
-                    self._last_stamp_ns = read_stamp(data) or now_ns
+                if has_header(msgtype) and len(data) >= MIN_STAMPED_BYTES:
+                    self._last_stamp_ns = max(read_stamp(data), 0) or now_ns
                 stamp_ns = self._last_stamp_ns or now_ns
             self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
             self._counts[topic] += 1

@@ -12,8 +12,11 @@ from std_srvs.srv import Trigger
 
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.ros.bags.recorder import LONGEST_DRAIN_S, parse, Recorder, SILENCE_S
+from mtv_world_ros.ros.bags.recorder import parse, Recorder, SILENCE_S
 from mtv_world_ros.ros.run_node import run
+
+#: frames of an episode may be published at the pace of their stamps [s]
+_LONGEST_DRAIN_S = 10.0
 
 
 class EpisodeRecorder(Recorder):
@@ -31,7 +34,7 @@ class EpisodeRecorder(Recorder):
         self._close_bag()
         path = self._options.out / f'episode_{self._number:05d}'
         try:
-            writer = BagWriter(path, overwrite=self._options.overwrite)
+            writer = BagWriter(path, overwrite=self._options.overwrite, keep=True)
         except MtvWorldError as error:
             response.message = str(error)
             return response
@@ -45,11 +48,12 @@ class EpisodeRecorder(Recorder):
     def _on_end(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """The bag is closed as soon as what was sent has arrived."""
         now_s = time.monotonic()
-        self.last_message_s, self._end_before_s = now_s, now_s + LONGEST_DRAIN_S
+        self.last_message_s, self._end_before_s = now_s, now_s + _LONGEST_DRAIN_S
         response.success = True
         return response
 
     def _after_spin(self) -> None:
+        super()._after_spin()
         now_s = time.monotonic()
         is_ending = self._end_before_s < float('inf')
         if is_ending and now_s > min(self.last_message_s + SILENCE_S, self._end_before_s):
@@ -57,9 +61,7 @@ class EpisodeRecorder(Recorder):
 
     def _close_bag(self) -> None:
         self._end_before_s = float('inf')
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        super()._close_bag()
 
 
 def main(args: Sequence[str] | None = None) -> int:

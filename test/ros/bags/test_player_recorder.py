@@ -1,5 +1,6 @@
 """An episode is played into the node and what the node publishes is recorded."""
 
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import JointTrajectory as Trajectory
 from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -270,6 +272,53 @@ def test_a_recorder_whose_parent_is_killed_closes_its_bag_and_ends(tmp_path, ros
     finally:
         process.kill()
         client.close()
+
+
+@pytest.fixture
+def recorded(launch, tmp_path, ros):
+    """A recorder of joint states that are published all the time, at 100 Hz; its folder."""
+    client = ros.Client()
+    recorder = launch('recorder', tmp_path / 'bag', '/joints', '--stamp', 'receive')
+    publisher = client.node.create_publisher(JointState, '/joints', 100)
+    sent = []
+
+    def publish():
+        sent.append(time.monotonic())
+        publisher.publish(ros.make_joint_state(client.now_ns()))
+
+    timer = client.node.create_timer(0.01, publish)
+    client.wait(publisher.get_subscription_count, 'the recorder')
+    client.spin_for(0.5)
+    sent.clear()
+    client.spin_for(2.0)
+    yield recorder, client, sent
+    timer.cancel()
+    client.close()
+
+
+def test_a_recorder_stops_soon_though_publishers_go_on(recorded, tmp_path):
+    recorder, client, _ = recorded
+    recorder.send_signal(signal.SIGINT)
+    begin = time.monotonic()
+    client.wait(lambda: recorder.poll() is not None, 'the end of the recorder')
+    assert time.monotonic() - begin < 2.0 * (1 + os.getloadavg()[0] / os.cpu_count())
+    assert recorder.returncode == 0
+    with AnyReader([tmp_path / 'bag']) as bag:
+        assert bag.message_count > 150
+
+
+def test_a_killed_recorder_loses_no_more_than_a_second(recorded, tmp_path):
+    recorder, client, sent = recorded
+    recorder.kill()
+    recorder.wait()
+    killed = time.monotonic()
+    (bag,) = [recover(source) for source in find_damaged(tmp_path)]
+    stamps = [message.stamp_ns for message in BagReader(bag.path).messages()]
+    assert len(stamps) >= len([at for at in sent if at < killed - 1.0])
+    age_s = (time.time_ns() - stamps[-1]) / NANO - (time.monotonic() - killed)
+    assert age_s < 1.0
+    with AnyReader([tmp_path / 'bag']) as read:
+        assert read.message_count == len(stamps)
 
 
 def is_alive(pid):
