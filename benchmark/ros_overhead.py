@@ -153,14 +153,15 @@ class Robot:
         self._publishers['/instruction'].publish(String(data=INSTRUCTION))
 
     def imagine(self, num_frames: int) -> dict[str, str]:
-        """Sends scenes and trajectories of one chunk until one is imagined; returns its report."""
+        """Sends scenes and trajectories of one chunk until one is out; returns its reports."""
+        ends = ('published', 'rejected', 'failed', 'preempted')
         while True:
             before = len(self.reports)
             self._send(num_frames)
-            self.wait(lambda n=before: any(r['state'] != 'chunk' for r in self.reports[n:]))
-            for report in self.reports[before:]:
-                if report['state'] == 'chunk':
-                    return report
+            self.wait(lambda n=before: any(r['state'] in ends for r in self.reports[n:]))
+            by_state = {report['state']: report for report in self.reports[before:]}
+            if 'published' in by_state:
+                return by_state['published'] | by_state['chunk']
 
     def _send(self, num_frames: int) -> None:
         stamp_ns = self.node.get_clock().now().nanoseconds

@@ -138,7 +138,8 @@ def _report(
     recording: Recording, predictions: Predictions, scored: Scored, views: tuple[str, ...]
 ) -> dict[str, Any]:
     reports = [chunk.report for chunk in predictions.chunks]
-    published = sum(int(report['frames_published']) for report in reports) * len(views)
+    sent = [r for r in predictions.reports if r.get('state') == 'published']
+    published = sum(int(report['frames_published']) for report in sent) * len(views)
     keys = ('j_object_mean', 'j_moving', 'j_copy_mean', 'j_copy_moving')
     means = {view: episode_means(scored.rows, view) for view in views}
     judged = _whole_chunks(recording, predictions.chunks)
@@ -152,6 +153,7 @@ def _report(
         'frames_received': predictions.num_frames,
         'camera_infos_received': predictions.num_infos,
         'latency_s': [float(report['latency_s']) for report in reports],
+        'lead_s': [float(report['lead_s']) for report in reports],
         'real_time_factor': float(np.median([float(r['real_time_factor']) for r in reports])),
         'success': _known(success),
         'success_by_chunk': [_known(float(chunk.report['success'])) for chunk in judged],
@@ -206,6 +208,8 @@ def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
         f'success estimate after each chunk: {told} (recorded outcome: {report["outcome"]})'
     )
     latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
+    leads = ', '.join(f'{value:.2f}' for value in report['lead_s'])
+    lines.append(f'each chunk was judged {leads} s before its end')
     lines.append(
         f'{report["chunks"]} chunks, {report["frames_received"]} of '
         f'{report["frames_published"]} frames received; latency {latencies} s; '

@@ -45,6 +45,7 @@ JOINTS = tuple(
 )
 HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
 SIZE = (96, 72)
+ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 NUM_FRAMES = 4
 CHUNK_S = 0.8
 TIMEOUT_S = 20.0
@@ -234,23 +235,33 @@ class Client:
         return values_of(found[-1]) if found else {}
 
     def wait_for_all(self, topics):
-        """Waits until every frame that was reported as published is here, on all topics."""
+        """Waits until the frames of all chunks are out and here, on all topics."""
 
         def all_here():
-            chunks = self.report_values('chunk')
-            total = int(chunks[-1]['frames_published_total']) if chunks else 0
+            sent = self.report_values('published')
+            if len(sent) < len(self.report_values('chunk')):
+                return False
+            total = int(sent[-1]['frames_published_total']) if sent else 0
             return all(self.totals[topic] == total for topic in topics)
 
         self.wait(all_here, 'frames that were reported as published')
 
+    def wait_for_state(self, state, since):
+        """Waits for a report of a state after the first `since` reports."""
+        self.wait(lambda: any(v['state'] == state for v in self.report_values()[since:]), state)
+
     def next_end(self, since):
         """Waits for the next report after the first `since` that ends a rollout."""
-        ends = ('done', 'preempted', 'rejected', 'failed', 'reset')
-        self.wait(
-            lambda: any(v['state'] in ends for v in self.report_values()[since:]),
-            'the end of a rollout',
-        )
-        return next(v for v in self.report_values()[since:] if v['state'] in ends)
+        return self.wait_for_ends(1, since)[0]
+
+    def wait_for_ends(self, count, since):
+        """Waits until so many rollouts have ended; returns the reports of that."""
+
+        def ended():
+            return [v for v in self.report_values()[since:] if v['state'] in ENDS]
+
+        self.wait(lambda: len(ended()) >= count, f'{count} ends of rollouts')
+        return ended()
 
     def imagine_one(self, *, scene=None, **fields):
         """Sends a scene and a trajectory; returns the report of how it ended."""

@@ -5,6 +5,7 @@ its first pixel, so that a subscriber can tell frames apart.
 """
 
 import sys
+import time
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 VIEWS = ('low', 'high')
 WIDTH, HEIGHT, FPS, NUM_FRAMES = 48, 36, 5.0, 4
-OUT_OF_MEMORY, BLOCKS, CRASHES = 1100, 1200, 1300
+OUT_OF_MEMORY, BLOCKS, CRASHES, SLOW = 1100, 1200, 1300, 1400
+SLOW_S = 0.3
 
 
 class FakeWorldModel:
@@ -53,7 +55,9 @@ class FakeWorldModel:
             raise ModelMemoryError('the device ran out of memory (fake)')
         if seed // 100 == CRASHES // 100:
             raise RuntimeError('a fault of the fake model')
-        while seed // 100 == BLOCKS // 100:
+        end_s = time.monotonic() + (SLOW_S if seed // 100 == SLOW // 100 else 0)
+        while seed // 100 == BLOCKS // 100 or time.monotonic() < end_s:
+            time.sleep(0.001)
             if should_stop():
                 raise RolloutPreempted('stopped')
         frames = np.stack([np.roll(start_frame, k + 1, axis=2) for k in range(NUM_FRAMES)], axis=1)

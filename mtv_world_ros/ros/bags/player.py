@@ -86,6 +86,7 @@ class Player(Node):
         }
         self._clock_output = self.create_publisher(Clock, '/clock', 10) if options.clock else None
         self._ends: list[dict[str, str]] = []
+        self._unpublished: set[tuple[str, str]] = set()
         if options.lock_step:
             self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
         self._executor = SingleThreadedExecutor()
@@ -93,6 +94,7 @@ class Player(Node):
         self._peers = Peers(self, lambda: self._executor.spin_once(timeout_sec=0.05))
         self._counts: Counter[str] = Counter()
         self._first_ns = 0
+        self._timeline: Timeline | None = None
 
     def play(self) -> None:
         """Waits for subscribers and plays, once or in a loop.
@@ -109,6 +111,7 @@ class Player(Node):
                 self.get_logger().warning(problem)
             if not self._options.loop:
                 break
+        self._wait_for_frames()
         self._flush()
         counted = ', '.join(f'{number} {what}' for what, number in self._counts.items())
         self.get_logger().info(f'played {counted or "nothing"}')
@@ -162,10 +165,11 @@ class Player(Node):
         ]
 
     def _play_once(self) -> None:
-        timeline: Timeline | None = None
+        timeline = self._timeline = None
         for message in self._messages():
             if timeline is None:
                 timeline = Timeline(self._first_ns, time.time_ns(), self._options.rate)
+                self._timeline = timeline
             self._wait_until_due(timeline, message.stamp_ns)
             stamp_ns = self._publish(timeline, message)
             if self._options.lock_step and message.msgtype == TRAJECTORY:
@@ -213,6 +217,13 @@ class Player(Node):
             if publisher.get_subscription_count():
                 publisher.wait_for_all_acked(Duration(seconds=4))
 
+    def _wait_for_frames(self) -> None:
+        """In lock-step, lets the clock go on until the frames of the last answer are out."""
+        end_s = time.monotonic() + self._options.answer_timeout
+        while self._unpublished and self._timeline is not None and time.monotonic() < end_s:
+            self._publish_clock(self._timeline.bag_time(time.time_ns()))
+            self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)
+
     def _publish_clock(self, bag_ns: int) -> None:
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_stamp(bag_ns)))
@@ -220,8 +231,13 @@ class Player(Node):
     def _on_report(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = values_of(status)
+            chunk = values.get('rollout', ''), values.get('chunk', '')
             if values.get('state') in ENDS:
                 self._ends.append(values)
+            elif values.get('state') == 'chunk':
+                self._unpublished.add(chunk)
+            elif values.get('state') == 'published':
+                self._unpublished.discard(chunk)
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
         """Holds the bag until the node says how the trajectory ended."""

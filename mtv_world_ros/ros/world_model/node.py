@@ -70,6 +70,7 @@ class WorldModelNode(Node):
             self._spec,
             self._robot.joint_names,
             self.settings,
+            on_judged=self._reporter.judged,
             on_sent=self._reporter.sent,
             on_ended=self._reporter.ended,
             on_error=self._reporter.crash,

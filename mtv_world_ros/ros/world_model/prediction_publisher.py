@@ -1,11 +1,12 @@
-"""Publishes chunks frame by frame, at the model's rate or in a burst."""
+"""Publishes predictions: the verdict of a chunk at once, its frames at the pace that is set."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import time
+from typing import NamedTuple
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -26,34 +27,45 @@ from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Result
 _BURST_PERIOD_S = 0.0005
 #: pause between two chunks of a rollout [s]: subscribers of one chunk's depth empty their queue
 _BURST_PAUSE_S = 0.1
+#: how often the clock is looked at while a frame waits for its time [s]
+_LOOK_PERIOD_S = 0.01
 
 
 @dataclass(slots=True)
 class Sent:
-    """What became of a chunk.
+    """What became of the frames of a chunk.
 
     Attributes:
-        num_frames: frames published.
         publish_s: time spent on publishing [s].
-        first_s, last_s: when the first and the last frame went out [s], of `time.monotonic`.
+        out_s: (N,) when each frame that was published went out [s], of `time.monotonic`.
+        leads_s: (N,) how long before its stamp that was [s], by the node's clock.
     """
 
-    num_frames: int = 0
     publish_s: float = 0.0
-    first_s: float = 0.0
-    last_s: float = 0.0
+    out_s: list[float] = field(default_factory=list)
+    leads_s: list[float] = field(default_factory=list)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames published."""
+        return len(self.out_s)
 
 
 class PredictionPublisher:
-    """Takes results in order and publishes them; reports each when it is out.
+    """Takes results in order. Estimates go out at once, masks as fast as they are taken.
+
+    The images go out at the pace that is set: in `burst` as fast as they are taken; in `realtime`
+    each one period before its stamp, or at once where that has passed. In imagine mode stamps say
+    nothing about the clock, and `realtime` is the model's frame rate.
 
     Args:
-        node: owner of the publishers and the timer.
+        node: owner of the publishers and timers.
         spec: of the world model.
         joint_names: J names, in the robot's order.
         settings: the present parameters.
+        on_judged: called with a chunk when its estimate is out.
         on_sent: called with a chunk when its last frame is out, or when the rest was dropped.
-        on_ended: called with a request's end when all its chunks are out.
+        on_ended: called with a request's end, after the estimates of its chunks.
         on_error: called with what publishing raised.
     """
 
@@ -64,12 +76,13 @@ class PredictionPublisher:
         joint_names: Sequence[str],
         settings: Callable[[], Settings],
         *,
+        on_judged: Callable[[Chunk], None],
         on_sent: Callable[[Chunk, Sent], None],
         on_ended: Callable[[Ended], None],
         on_error: Callable[[Exception], None],
     ) -> None:
-        self._joint_names, self._settings = tuple(joint_names), settings
-        self._on_sent, self._on_ended, self._on_error = on_sent, on_ended, on_error
+        self._node, self._joint_names, self._settings = node, tuple(joint_names), settings
+        self._on_judged, self._on_ended, self._on_error = on_judged, on_ended, on_error
         self._period_s = 1.0 / spec.fps
         # a chunk, and the one before it should a subscriber still ask for a frame of that again
         depth = 2 * spec.num_frames
@@ -77,13 +90,10 @@ class PredictionPublisher:
         self._joints = create_publisher(node, JointState, '~/predicted/joint_states', depth)
         self._success = create_publisher(node, Float64, '~/success', 10)
         self._jaccard = create_publisher(node, Float32MultiArray, '~/jaccard', 10)
-        self._queue: deque[Result] = deque()
-        self._sent = Sent()
-        self._not_before_s = 0.0
-        self._timer = node.create_timer(
-            self._period_s, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        self._images = FrameQueue(node, self._publish_images, self._wait_s, on_sent, on_error)
+        self._masks = FrameQueue(
+            node, self._publish_masks, _burst_wait_s, lambda chunk, sent: None, on_error
         )
-        self._timer.cancel()
 
     def subscriber_counts(self) -> dict[str, int]:
         """Subscribers that each topic is connected to, as `subscribers.<topic>`."""
@@ -92,99 +102,66 @@ class PredictionPublisher:
         return {f'subscribers.{o.topic_name}': o.get_subscription_count() for o in outputs}
 
     def add(self, result: Result) -> None:
-        """Publishes a result after those before it.
+        """Publishes a result.
 
         Without imagine mode, frames of older rollouts that are not out yet are dropped by the
         first chunk of a newer one: they show a future that is no longer planned.
         """
-        if isinstance(result, Chunk) and not result.request.imagine:
-            self._drop_others(result.request.rollout)
-        self._queue.append(result)
-        if self._timer.is_canceled():
-            is_burst = self._settings().pace == 'burst'
-            period = _BURST_PERIOD_S if is_burst else self._period_s
-            self._timer.timer_period_ns = round(period * NANO)
-            self._timer.reset()
-            self._tick()
-
-    def reset(self) -> None:
-        """Drops all frames that are not out yet."""
-        self._drop_others(None)
-
-    def _drop_others(self, rollout: int | None) -> None:
-        kept = deque(r for r in self._queue if r.request.rollout == rollout)
-        dropped = [r for r in self._queue if r.request.rollout != rollout]
-        self._queue = kept
-        for result in dropped:
-            self._finish(result)
-
-    def _tick(self) -> None:
-        """Publishes the next frame; a chunk that cannot be published is dropped."""
-        try:
-            self._publish_next()
-        except Exception as error:  # the node goes on
-            self._on_error(error)
-            self._queue.popleft()
-            self._sent = Sent()
-
-    def _publish_next(self) -> None:
-        """The first call without a frame stops the timer."""
-        self._finish_ended()
-        if not self._queue:
-            self._timer.cancel()
-            return
-        chunk = self._queue[0]
-        assert isinstance(chunk, Chunk)
-        if self._sent.num_frames == 0 and time.monotonic() < self._not_before_s:
-            return
-        self._publish_frame(chunk)
-        if self._sent.num_frames == len(chunk.prediction.video.times):
-            self._queue.popleft()
-            self._publish_estimate(chunk)
-            self._finish(chunk)
-            self._finish_ended()
-
-    def _finish_ended(self) -> None:
-        while self._queue and isinstance(self._queue[0], Ended):
-            self._finish(self._queue.popleft())
-
-    def _finish(self, result: Result) -> None:
         if isinstance(result, Ended):
             self._on_ended(result)
             return
-        sent, self._sent = self._sent, Sent()
-        is_last = result.prediction.chunk + 1 == result.prediction.num_chunks
-        self._not_before_s = 0.0 if is_last else time.monotonic() + _BURST_PAUSE_S
-        self._on_sent(result, sent)
+        try:
+            self._publish_estimate(result)
+        except Exception as error:  # the node goes on
+            self._on_error(error)
+        self._on_judged(result)
+        for frames in (self._masks, self._images):
+            if not result.request.imagine:
+                frames.drop_others(result.request.rollout)
+            frames.add(result)
 
-    def _publish_frame(self, chunk: Chunk) -> None:
-        begin = time.monotonic()
-        index = self._sent.num_frames
-        self._sent.first_s = self._sent.first_s or begin
-        stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
-        for view, publisher in enumerate(self._views):
-            self._publish_view(chunk, view, publisher, index, stamp_ns)
+    def reset(self) -> None:
+        """Drops all frames that are not out yet."""
+        for frames in (self._masks, self._images):
+            frames.drop_others(None)
+
+    def _wait_s(self, chunk: Chunk, index: int, last: Last) -> float:
+        """Pace of the images."""
+        if self._settings().pace == 'burst':
+            return _burst_wait_s(chunk, index, last)
+        if chunk.request.imagine:
+            return last.out_s + self._period_s - time.monotonic()
+        return self._lead_s(chunk, index) - self._period_s
+
+    def _lead_s(self, chunk: Chunk, index: int) -> float:
+        """Time until the stamp of a frame [s], by the node's clock."""
+        now_ns = self._node.get_clock().now().nanoseconds
+        return (stamp_of(chunk, index, 'target') - now_ns) / NANO
+
+    def _publish_images(self, chunk: Chunk, index: int, sent: Sent) -> None:
+        begin_s = time.monotonic()
+        sent.leads_s.append(self._lead_s(chunk, index))
+        stamp_ns = self._publish(chunk, ('predicted', 'trajectory'), index)
         positions = chunk.prediction.positions[index]
-        header = make_header(stamp_ns)
-        self._joints.publish(to_joint_state(self._joint_names, positions, header))
-        self._sent.num_frames += 1
-        self._sent.last_s = time.monotonic()
-        self._sent.publish_s += self._sent.last_s - begin
+        self._joints.publish(to_joint_state(self._joint_names, positions, make_header(stamp_ns)))
+        sent.out_s.append(time.monotonic())
+        sent.publish_s += sent.out_s[-1] - begin_s
 
-    def _publish_view(
-        self, chunk: Chunk, view: int, publisher: ViewPublisher, index: int, stamp_ns: int
-    ) -> None:
-        prediction, info = chunk.prediction, chunk.scene.camera_infos[view]
-        frames: dict[str, Callable[[], ByteArray]] = {
-            'predicted': lambda: prediction.video.frames[view, index],
-            'trajectory': lambda: prediction.trajectory_video.frames[view, index + 1],
-            'mask': lambda: label_image(prediction.masks, view, index),
-        }
-        for stream, frame in frames.items():
-            if publisher.wants(stream):
+    def _publish_masks(self, chunk: Chunk, index: int, sent: Sent) -> None:
+        self._publish(chunk, ('mask',), index)
+        sent.out_s.append(time.monotonic())
+
+    def _publish(self, chunk: Chunk, streams: Sequence[str], index: int) -> int:
+        """Publishes a frame of streams that somebody subscribes to; returns its stamp [ns]."""
+        stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
+        quality = self._settings().jpeg_quality
+        for view, publisher in enumerate(self._views):
+            info = chunk.scene.camera_infos[view]
+            for stream in filter(publisher.wants, streams):
+                pixels = _pixels(chunk, stream, view, index)
                 header = make_header(stamp_ns, info.header.frame_id)
-                quality = self._settings().jpeg_quality
-                publisher.publish(stream, frame(), header, info, quality)
+                publisher.publish(stream, pixels, header, info, quality)
+        return stamp_ns
 
     def _publish_estimate(self, chunk: Chunk) -> None:
         prediction = chunk.prediction
@@ -196,11 +173,102 @@ class PredictionPublisher:
         self._jaccard.publish(to_multi_array(prediction.success.jaccard, labels))
 
 
+class Last(NamedTuple):
+    """The frame before: when it went out [s] of `time.monotonic`, and of which chunk it was."""
+
+    out_s: float = 0.0
+    rollout: int = 0
+    chunk: int = 0
+
+
+class FrameQueue:
+    """Publishes the frames of chunks in order, each when its time has come.
+
+    Args:
+        node: owner of the timer.
+        publish: publishes a frame and notes it.
+        wait_s: how long a frame still has to wait [s], from the one before.
+        on_sent: called with a chunk when its last frame is out, or when the rest was dropped.
+        on_error: called with what publishing raised; the rest of the chunk is dropped.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        publish: Callable[[Chunk, int, Sent], None],
+        wait_s: Callable[[Chunk, int, Last], float],
+        on_sent: Callable[[Chunk, Sent], None],
+        on_error: Callable[[Exception], None],
+    ) -> None:
+        self._publish, self._wait_s = publish, wait_s
+        self._on_sent, self._on_error = on_sent, on_error
+        self._chunks: deque[Chunk] = deque()
+        self._sent, self._last = Sent(), Last()
+        self._timer = node.create_timer(
+            _BURST_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+        self._timer.cancel()
+
+    def add(self, chunk: Chunk) -> None:
+        """Publishes the frames of a chunk after those before it."""
+        self._chunks.append(chunk)
+        if self._timer.is_canceled():
+            self._timer.reset()
+            self._tick()
+
+    def drop_others(self, rollout: int | None) -> None:
+        """Drops the frames of all rollouts but one."""
+        while self._chunks and self._chunks[0].request.rollout != rollout:
+            self._finish()
+
+    def _tick(self) -> None:
+        """Publishes the next frame if its time has come; without one the timer stops."""
+        if not self._chunks:
+            self._timer.cancel()
+            return
+        chunk, index = self._chunks[0], self._sent.num_frames
+        try:
+            wait_s = self._wait_s(chunk, index, self._last)
+            if wait_s <= 0:
+                self._publish(chunk, index, self._sent)
+                self._last = Last(time.monotonic(), chunk.request.rollout, chunk.prediction.chunk)
+        except Exception as error:  # the node goes on
+            self._on_error(error)
+            self._finish()
+            return
+        if self._sent.num_frames == len(chunk.prediction.video.times):
+            self._finish()
+        period_s = min(max(wait_s, _BURST_PERIOD_S), _LOOK_PERIOD_S)
+        if self._timer.timer_period_ns != round(period_s * NANO):
+            self._timer.timer_period_ns = round(period_s * NANO)
+
+    def _finish(self) -> None:
+        chunk, sent = self._chunks.popleft(), self._sent
+        self._sent = Sent()
+        self._on_sent(chunk, sent)
+
+
+def _burst_wait_s(chunk: Chunk, index: int, last: Last) -> float:
+    """Pace of a burst: frames at once, but a pause between two chunks of a rollout."""
+    is_next = last.rollout == chunk.request.rollout and last.chunk != chunk.prediction.chunk
+    return last.out_s + _BURST_PAUSE_S - time.monotonic() if is_next and not index else 0.0
+
+
 def stamp_of(chunk: Chunk, index: int, stamp_mode: str) -> int:
     """Stamp of a chunk's frame [ns]: its predicted time, or that of the real frames behind it."""
     if stamp_mode == 'source':
         return chunk.scene.source_stamp_ns
     return chunk.prediction.stamp_ns + round(chunk.prediction.video.times[index] * NANO)
+
+
+def _pixels(chunk: Chunk, stream: str, view: int, index: int) -> ByteArray:
+    """A frame of a stream, (H, W, 3) RGB or (H, W) labels."""
+    prediction = chunk.prediction
+    if stream == 'mask':
+        return label_image(prediction.masks, view, index)
+    if stream == 'trajectory':
+        return prediction.trajectory_video.frames[view, index + 1]
+    return prediction.video.frames[view, index]
 
 
 def label_image(masks: ObjectMasks, view: int, index: int) -> ByteArray:

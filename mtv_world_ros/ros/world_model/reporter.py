@@ -14,6 +14,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from mtv_world_ros.data_types import SuccessEstimate
 from mtv_world_ros.ros.messages.conversions import to_diagnostics, to_status
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
@@ -28,6 +29,8 @@ _LEVELS = {
     'failed': DiagnosticStatus.ERROR,
 }
 
+#: values of reports whose median and extremes `/diagnostics` shows
+_KEPT = ('latency_s', 'lead_s', 'first_frame_s', 'frame_lead_s', 'real_time_factor')
 #: chunks that latencies are taken over
 _WINDOW = 50
 #: a rejection shows as a warning for this long [s]
@@ -100,23 +103,21 @@ class Reporter:
         text = f'{type(error).__name__}: {error}'
         self._tally.reject(Rejection(Reason.INTERNAL_ERROR, text), time.monotonic())
 
+    def judged(self, chunk: Chunk) -> None:
+        """Counts and reports a chunk that was predicted; its estimate is out."""
+        values = _chunk_values(chunk, self._settings())
+        self._tally.counts['chunks'] += 1
+        self._add_seconds(values)
+        self._publish_report('chunk', values)
+
     def sent(self, chunk: Chunk, sent: Sent) -> None:
-        """Counts and reports a chunk that is out, or whose rest was dropped."""
-        values = _chunk_values(chunk, sent, self._settings())
-        counts = self._tally.counts
-        counts['chunks'] += 1
+        """Counts and reports a chunk whose frames are out, or whose rest was dropped."""
+        values, counts = _sent_values(chunk, sent), self._tally.counts
         counts['frames_published'] += sent.num_frames
         counts['frames_dropped'] += len(chunk.prediction.video.times) - sent.num_frames
-        self._tally.add_seconds(
-            {
-                name: value
-                for name, value in values.items()
-                if name.startswith('stage_s.') or name in ('latency_s', 'real_time_factor')
-                if isinstance(value, float)
-            }
-        )
+        self._add_seconds(values)
         values['frames_published_total'] = counts['frames_published']
-        self._publish_report('chunk', values)
+        self._publish_report('published', values)
 
     def scored(self, scored: Scored) -> None:
         """Reports how a chunk compares with the real frames that came for it."""
@@ -140,6 +141,16 @@ class Reporter:
         level, message = self._tally.level(now_s, num_policies=int(str(state['policies'])))
         values = {**state, **self._tally.values(now_s)}
         self._publish(self._diagnostics, '', level, message, values)
+
+    def _add_seconds(self, values: Mapping[str, object]) -> None:
+        """Keeps the durations for `/diagnostics`."""
+        kept = {
+            name: value
+            for name, value in values.items()
+            if name.startswith('stage_s.') or name in _KEPT
+            if isinstance(value, float)
+        }
+        self._tally.add_seconds(kept)
 
     def _publish_report(self, state: str, values: Mapping[str, object]) -> None:
         level = _LEVELS.get(state, DiagnosticStatus.OK)
@@ -221,19 +232,17 @@ class Tally:
         for name, window in self._seconds.items():
             values[f'{name}.last'] = window[-1]
             values[f'{name}.median'] = float(np.median(window))
+            values[f'{name}.min'] = min(window)
             values[f'{name}.max'] = max(window)
         return values
 
 
-def _chunk_values(chunk: Chunk, sent: Sent, settings: Settings) -> dict[str, object]:
-    """Keys and values of a published chunk; stamps in ns, durations in s."""
+def _chunk_values(chunk: Chunk, settings: Settings) -> dict[str, object]:
+    """Keys and values of a predicted chunk; stamps in ns, durations in s."""
     prediction, request = chunk.prediction, chunk.request
     num_frames = len(prediction.video.times)
-    model_s = sum(prediction.seconds.values())
     values = {
-        **_request_values(request),
-        'chunk': prediction.chunk,
-        'num_chunks': prediction.num_chunks,
+        **_chunk_identity(chunk),
         'chunk_seed': prediction.seed,
         'observation_stamp_ns': prediction.stamp_ns,
         'source_stamp_ns': chunk.scene.source_stamp_ns,
@@ -241,18 +250,40 @@ def _chunk_values(chunk: Chunk, sent: Sent, settings: Settings) -> dict[str, obj
         'last_stamp_ns': stamp_of(chunk, -1, 'target'),
         'stamp_mode': settings.stamp_mode,
         'frames': num_frames,
-        'frames_published': sent.num_frames,
-        'frames_dropped': num_frames - sent.num_frames,
         'latency_s': chunk.ready_s - request.received_s,
-        'first_frame_s': sent.first_s - request.received_s if sent.num_frames else float('nan'),
-        'last_frame_s': sent.last_s - request.received_s if sent.num_frames else float('nan'),
-        'real_time_factor': num_frames * _frame_s(chunk) / model_s,
+        'lead_s': chunk.lead_s,
+        'real_time_factor': num_frames * _frame_s(chunk) / sum(prediction.seconds.values()),
     }
     values |= {f'stage_s.{_key(stage)}': s for stage, s in prediction.seconds.items()}
-    values['stage_s.publish'] = sent.publish_s
     # the request may leave it to the checkpoint
     values['num_inference_steps'] = prediction.num_inference_steps
     return values | _estimate_values(chunk) | _trust_values(chunk, settings.trusted_jaccard)
+
+
+def _sent_values(chunk: Chunk, sent: Sent) -> dict[str, object]:
+    """Keys and values of a chunk whose frames are out, or whose rest was dropped."""
+    values = _chunk_identity(chunk)
+    values |= {
+        'frames_published': sent.num_frames,
+        'frames_dropped': len(chunk.prediction.video.times) - sent.num_frames,
+        'stage_s.publish': sent.publish_s,
+    }
+    if sent.num_frames:
+        received_s = chunk.request.received_s
+        values['first_frame_s'] = sent.out_s[0] - received_s
+        values['last_frame_s'] = sent.out_s[-1] - received_s
+        values['frame_lead_s'] = float(np.median(sent.leads_s))
+    return values
+
+
+def _chunk_identity(chunk: Chunk) -> dict[str, object]:
+    """Which chunk of which plan it is."""
+    prediction = chunk.prediction
+    return {
+        **_request_values(chunk.request),
+        'chunk': prediction.chunk,
+        'num_chunks': prediction.num_chunks,
+    }
 
 
 def _frame_s(chunk: Chunk) -> float:
@@ -263,8 +294,10 @@ def _frame_s(chunk: Chunk) -> float:
 
 
 def _ended_values(ended: Ended) -> dict[str, object]:
-    """Keys and values of a rollout's end."""
+    """Keys and values of a rollout's end, with the last estimate of the plan if there is one."""
     values = {**_request_values(ended.request), 'num_chunks': ended.num_chunks}
+    if ended.last is not None:
+        values |= _success_values(ended.last.prediction.success)
     if ended.reason is not None:
         values |= {'reason': ended.reason.value, 'text': ended.text}
     return values
@@ -295,13 +328,7 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
     prediction = chunk.prediction
     success, masks = prediction.success, prediction.masks
     values: dict[str, object] = {
-        'success': success.probability,
-        'success_low': success.interval[0],
-        'success_high': success.interval[1],
-        'success_spread': success.spread,
-        'success_num_seeds': success.num_seeds,
-        'success_calibrated': success.is_calibrated,
-        'success_reasons': '; '.join(success.reasons),
+        **_success_values(success),
         'objects': masks.names,
         'segmenter': prediction.segmenter,
     }
@@ -310,6 +337,18 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
             values[f'jaccard.{view}.{_key(name)}'] = float(success.jaccard[row, column])
             values[f'mask_status.{view}.{_key(name)}'] = masks.status[row][column]
     return values
+
+
+def _success_values(success: SuccessEstimate) -> dict[str, object]:
+    return {
+        'success': success.probability,
+        'success_low': success.interval[0],
+        'success_high': success.interval[1],
+        'success_spread': success.spread,
+        'success_num_seeds': success.num_seeds,
+        'success_calibrated': success.is_calibrated,
+        'success_reasons': '; '.join(success.reasons),
+    }
 
 
 def _fidelity_values(scored: Scored) -> dict[str, object]:

@@ -81,6 +81,7 @@ class RequestMaker:
             num_inference_steps=settings.num_inference_steps,
             limits=limits,
             received_s=received_s,
+            received_ns=now_ns,
             limit_tolerance=settings.limit_tolerance,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Condition, Thread
 import time
@@ -45,6 +45,7 @@ class Request:
         num_inference_steps: denoising steps a chunk.
         limits: what is too old or too long.
         received_s: when it came in [s], of `time.monotonic`.
+        received_ns: the same by the node's clock [ns].
         limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
@@ -59,6 +60,7 @@ class Request:
     num_inference_steps: int
     limits: TimeLimits
     received_s: float
+    received_ns: int = 0
     limit_tolerance: float = 1e-3
     num_seeds: int = 1
 
@@ -72,14 +74,36 @@ class Chunk:
     prediction: Prediction
     ready_s: float
 
+    @property
+    def lead_s(self) -> float:
+        """How long before its last frame's stamp the chunk was ready [s].
+
+        The time that computing took is taken off the stamp by the wall, not by the node's clock:
+        a player that holds the clock meanwhile makes no lead.
+        """
+        end_ns = self.prediction.stamp_ns + round(float(self.prediction.video.times[-1]) * NANO)
+        ahead_s = (end_ns - self.request.received_ns) / NANO
+        return ahead_s - (self.ready_s - self.request.received_s)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """A request came to its end: `done`, `preempted`, `rejected` or `failed`."""
+    """The one end of a request.
+
+    Attributes:
+        request: the plan.
+        state: `done`, `preempted`, `rejected`, `failed` or `reset`.
+        num_chunks: that were predicted.
+        last: the last one of them: what was known of the plan; None = nothing.
+        reason: why it was rejected or failed.
+        text: the same in words.
+        trace: of an error that nobody raised on purpose.
+    """
 
     request: Request
     state: str
     num_chunks: int
+    last: Chunk | None = None
     reason: Reason | None = None
     text: str = ''
     trace: str = ''
@@ -102,6 +126,8 @@ class RolloutWorker:
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
+        self._known: list[Chunk] = []
+        self._is_starved = False
         self._between: Callable[[], None] | None = None
         self._abandoned = False
         self._closing = False
@@ -127,7 +153,11 @@ class RolloutWorker:
             return self._running is not None or self._pending is not None
 
     def submit(self, request: Request) -> None:
-        """Starts a request; it pre-empts a running one and replaces a waiting one."""
+        """Starts a request; it pre-empts a running one and replaces a waiting one.
+
+        Where the rollout before the running one was pre-empted without a chunk, the running one
+        completes its first chunk: plans that come faster than chunks still get estimates.
+        """
         with self._changed:
             if self._pending is not None:
                 self._put(Ended(request=self._pending, state='preempted', num_chunks=0))
@@ -145,9 +175,10 @@ class RolloutWorker:
         with self._changed:
             self._results = deque(r for r in self._results if isinstance(r, Ended))
             running = None if self._abandoned else self._running
-            for request in (running, self._pending):
-                if request is not None:
-                    self._put(Ended(request=request, state='reset', num_chunks=0))
+            if running is not None:
+                self._put(self._ended(running, 'reset'))
+            if self._pending is not None:
+                self._put(Ended(request=self._pending, state='reset', num_chunks=0))
             self._abandoned = self._running is not None
             self._pending = None
             self._episode, self._last = None, None
@@ -173,6 +204,8 @@ class RolloutWorker:
             with self._changed:
                 if not self._abandoned:
                     self._put(ended)
+                is_preempted = ended.state == 'preempted' and not self._abandoned
+                self._is_starved = is_preempted and not ended.num_chunks
                 self._running, self._abandoned = None, False
 
     def _next(self) -> Request | None:
@@ -184,41 +217,50 @@ class RolloutWorker:
                 job, self._between = self._between, None
                 if job is None:
                     self._running, self._pending = self._pending, None
+                    self._known = []
                     return self._running
             job()
 
     def _should_stop(self) -> bool:
         with self._changed:
-            return self._closing or self._abandoned or self._pending is not None
+            is_replaced = self._pending is not None and (self._known or not self._is_starved)
+            return self._closing or self._abandoned or bool(is_replaced)
 
     def _roll_out(self, request: Request) -> Ended:
-        num_chunks = 0
-
-        def ended(state: str, reason: Reason | None = None, text: str = '') -> Ended:
-            return Ended(
-                request=request, state=state, num_chunks=num_chunks, reason=reason, text=text
-            )
-
         try:
-            for _ in self._imagine(request):
-                num_chunks += 1
+            self._imagine(request)
         except RolloutPreempted:
-            return ended('preempted')
+            return self._ended(request, 'preempted')
         except (ModelMemoryError, MemoryError) as error:
-            return ended('failed', Reason.OUT_OF_MEMORY, str(error) or 'out of memory')
+            text = str(error) or 'out of memory'
+            return self._ended(request, 'failed', Reason.OUT_OF_MEMORY, text)
         except Rejection as error:
-            return ended('rejected', error.reason, str(error))
+            return self._ended(request, 'rejected', error.reason, str(error))
         except MtvWorldError as error:
-            return ended('rejected', Reason.ROLLOUT_INVALID, str(error))
+            return self._ended(request, 'rejected', Reason.ROLLOUT_INVALID, str(error))
         except Exception as error:  # the node outlives whatever the model raises
             text = f'{type(error).__name__}: {error}'
-            return replace(
-                ended('failed', Reason.INTERNAL_ERROR, text), trace=traceback.format_exc()
-            )
-        return ended('done')
+            ended = self._ended(request, 'failed', Reason.INTERNAL_ERROR, text)
+            return replace(ended, trace=traceback.format_exc())
+        return self._ended(request, 'done')
 
-    def _imagine(self, request: Request) -> Iterator[Prediction]:
-        """Yields the chunks of a request, each once it is handed on."""
+    def _ended(
+        self, request: Request, state: str, reason: Reason | None = None, text: str = ''
+    ) -> Ended:
+        """The end of the running request, with what is known of it."""
+        known = self._known
+        last = known[-1] if known else None
+        return Ended(
+            request=request,
+            state=state,
+            num_chunks=len(known),
+            last=last,
+            reason=reason,
+            text=text,
+        )
+
+    def _imagine(self, request: Request) -> None:
+        """Imagines the chunks of a request and hands each on."""
         scene, episode = self._begin(request)
         episode.instruction, episode.objects = request.instruction, request.objects
         episode.seed, episode.num_seeds = request.seed, request.num_seeds
@@ -236,8 +278,8 @@ class RolloutWorker:
                 if request.imagine:
                     self._episode = episode
                     self._last = replace(scene, observation=episode.observation)
+                self._known.append(chunk)
                 self._put(chunk)
-            yield prediction
 
     def _begin(self, request: Request) -> tuple[Scene, ImaginedEpisode]:
         """The scene to start from and its episode: the one that goes on, or a new one."""
