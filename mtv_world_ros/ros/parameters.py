@@ -63,8 +63,8 @@ class NodeSettings(Schema):
     )
     calibration_file: str = parameter(
         '',
-        "YAML with every view's pose; empty = the one in the checkpoint. Read again when an episode "
-        'begins (`~/reset`, `~/start`).',
+        "YAML with every view's pose; empty = the one in the checkpoint. Read again when an "
+        'episode begins (`~/reset`, `~/start`).',
     )
     max_image_age_s: float = parameter(0.5, 'Older images are no observation [s].', _SECONDS)
     max_joint_state_age_s: float = parameter(
@@ -132,7 +132,7 @@ class Settings(NodeSettings):
         'target', 'Stamp of predictions: the predicted time, or the observation they come from.'
     )
     pace: Literal['realtime', 'burst'] = parameter(
-        'realtime', "How frames go out: at the model's frame rate, or each chunk at once."
+        'realtime', 'When images go out: one period before their stamps, or each chunk at once.'
     )
     publish_compressed: bool = parameter(
         True, 'Offer predictions as JPEG too (made when subscribed).'
