@@ -16,12 +16,18 @@ if TYPE_CHECKING:
     from mtv_world_ros.inspection.report import Inspection
 
 
+#: exit status by verdict; 2 is argparse's
+_STATUS = {'ok': 0, 'not checked': 3, 'suspicious': 1, 'broken': 1}
+
+
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'doctor',
         help='check calibration, joints and clocks of an episode or of running topics',
-        epilog='Exit status: 0 where every view and the recording are ok, else 1.',
+        epilog='Exit status: 0 where everything was checked and is ok, 1 where something is '
+        'suspicious or broken, 3 where nothing wrong was found but not everything could be '
+        'checked.',
     )
     parser.add_argument('episode', type=Path, nargs='?')
     parser.add_argument('--live', action='store_true', help='check the running ROS topics')
@@ -71,7 +77,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     _write(inspector, episode, inspection, out)
     print(to_text(inspection))
     print(f"{inspection.verdict}: see '{out / 'report.md'}'")
-    return 0 if inspection.verdict == 'ok' else 1
+    return _STATUS[inspection.verdict]
 
 
 def _write(inspector: Inspector, episode: Episode, inspection: Inspection, out: Path) -> None:

@@ -21,6 +21,7 @@ from mtv_world_ros.geometry.robot_shape import (
     draw_silhouettes,
     LinkShape,
     load_shape,
+    moving_links,
     RobotShape,
 )
 from mtv_world_ros.inspection.clocks import (
@@ -36,7 +37,14 @@ from mtv_world_ros.inspection.motion_residual import (
     MotionResidual,
     ResidualConfig,
 )
-from mtv_world_ros.inspection.report import broken, Finding, Inspection, Section, suspicious
+from mtv_world_ros.inspection.report import (
+    broken,
+    Finding,
+    Inspection,
+    not_checked,
+    Section,
+    suspicious,
+)
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,
@@ -59,6 +67,8 @@ class InspectionConfig:
         broken_residual: likewise.
         rods_factor: both times this, where the robot's shape is not known.
         min_match: correlation of drawn and seen motion below which they are unrelated.
+        better_match: gain in that correlation from which on another roll or focal length is taken
+            to be the right one, as a share.
         max_lag_s: delay of the images against the joint states from which on it matters [s].
         residual: how it is measured.
         clocks: limits of the clock checks.
@@ -68,6 +78,7 @@ class InspectionConfig:
     broken_residual: float = 0.03
     rods_factor: float = 6.0
     min_match: float = 0.12
+    better_match: float = 0.1
     max_lag_s: float = 0.1
     residual: ResidualConfig = field(default_factory=ResidualConfig)
     clocks: ClockConfig = field(default_factory=ClockConfig)
@@ -167,9 +178,7 @@ class Inspector:
     ) -> tuple[Checked, tuple[str, ...]]:
         if residual.reason:
             text = f'calibration not checked against the images: {residual.reason}'
-            if camera.mount_link != self.robot.base_link:
-                return ({'residual': 'not measured'}, []), (text,)
-            return ({'residual': 'not measured'}, [suspicious(text)]), ()
+            return ({'residual': 'not measured'}, [not_checked(text)]), ()
         x, y = residual.shift_px
         measures = {
             'residual': f'{np.hypot(x, y):.1f} px (x {x:+.1f}, y {y:+.1f}) from the drawn robot '
@@ -177,7 +186,12 @@ class Inspector:
             'motion match': f'{residual.match:.2f} over {residual.num_pairs} pairs of frames',
             'image delay': f'{residual.lag_s:+.1f} s against the joint states',
         }
-        findings = [*self._distance(residual, camera)]
+        findings = [*self._distance(residual, camera), *self._better_fit(residual)]
+        if not self.shape.is_known:
+            text = (
+                f'only gross errors were looked for: the robot is drawn with {self.shape.source}'
+            )
+            findings.append(not_checked(text))
         if abs(residual.lag_s) >= self._config.max_lag_s - 1e-9:
             findings.append(
                 suspicious(
@@ -205,6 +219,18 @@ class Inspector:
         if border or distance > self._broken * camera.width:
             return [broken(text)]
         return [suspicious(text)] if distance > self._suspicious * camera.width else []
+
+    def _better_fit(self, residual: MotionResidual) -> list[Finding]:
+        """A roll or a focal length with which the drawn robot fits clearly better."""
+        name, match = residual.best_change
+        if not match > residual.match * (1 + self._config.better_match):
+            return []
+        text = (
+            f'the drawn robot fits the moving pixels better with {name} (match {match:.2f}, as it '
+            f'is {residual.match:.2f}): check the rotation in T_mount_camera, and whether K is '
+            'for this image size'
+        )
+        return [suspicious(text)]
 
     def _recording(self, episode: Episode, joints: JointTrack) -> Section:
         frames_ns = episode.images[episode.views[0]].stamps_ns
@@ -285,7 +311,7 @@ def check_visibility(
         for i, tool in enumerate(robot.tools)
     }
     best = float((1 - seen.behind - seen.outside).max())
-    fixed = camera.mount_link == robot.base_link
+    fixed = camera.mount_link not in moving_links(robot)
     if fixed and seen.behind.min() > 0.5:
         return measures, [
             broken(

@@ -6,7 +6,7 @@ P pairs of frames, J joints, H W pixels of the shrunk images, R the search radiu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.camera import camera_poses, scaled
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import fill, LinkShape, project_part
+from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
 from mtv_world_ros.inspection.clocks import JointTrack
 
 FloatImage = NDArray[np.float32]
@@ -41,6 +41,8 @@ class ResidualConfig:
         saturation: grey levels from which a pixel counts as moving, so that one that changes
             more counts no more.
         lags_s: delays of the images against the joint states that are tried [s].
+        rolls_deg: turns of the camera about its axis that are tried.
+        zooms: factors of the focal length that are tried.
     """
 
     width: int = 384
@@ -49,7 +51,9 @@ class ResidualConfig:
     reach: float = 0.08
     blur_px: float = 1.5
     saturation: float = 25.0
-    lags_s: tuple[float, ...] = (-0.2, -0.1, 0.0, 0.1, 0.2)
+    lags_s: tuple[float, ...] = (-0.8, -0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4, 0.8)
+    rolls_deg: tuple[float, ...] = (-30.0, -10.0, 10.0, 30.0)
+    zooms: tuple[float, ...] = (0.75, 0.9, 1.1, 1.33)
 
     def __post_init__(self) -> None:
         for name in ('width', 'step_s', 'max_pairs', 'reach', 'blur_px', 'saturation'):
@@ -69,6 +73,7 @@ class MotionResidual:
         match: mean correlation of drawn and seen motion there, -1 .. 1.
         contrast: by how many standard deviations that stands out from other shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
+        best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
         reason: why it could not be measured; empty where it was.
     """
@@ -77,6 +82,7 @@ class MotionResidual:
     match: float = float('nan')
     contrast: float = float('nan')
     lag_s: float = float('nan')
+    best_change: tuple[str, float] = ('', float('nan'))
     num_pairs: int = 0
     reason: str = ''
 
@@ -104,7 +110,7 @@ def measure_residual(
         joints: measured positions.
         config: how.
     """
-    if camera.mount_link != robot.base_link:
+    if camera.mount_link in moving_links(robot):
         return MotionResidual(reason=f"the camera moves with '{camera.mount_link}'")
     pairs = _pairs(track.stamps_ns, joints, config)
     if len(pairs) == 0:
@@ -114,22 +120,50 @@ def measure_residual(
     small = _shrunk(camera, config.width)
     seen = _seen_motion(track, pairs, small, config)
 
-    def surface(part: slice, lag_s: float) -> FloatArray | None:
+    def surface(
+        part: slice, lag_s: float = 0.0, drawn_by: CameraModel = small
+    ) -> FloatArray | None:
         stamps_ns = track.stamps_ns[pairs[part]].ravel() - round(lag_s * 1e9)
-        return _surface(seen[part], joints.at(stamps_ns), small, robot, shapes, config)
+        return _surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes, config)
 
-    now = surface(slice(None), 0.0)
+    now = surface(slice(None))
     if now is None:
         return MotionResidual(reason='no link moves within the image')
     shift = _peak(now) * camera.width / small.width
     spread = float(now.std())
+    third = slice(None, None, 3)
+    changes = {name: _top(surface(third, 0.0, c)) for name, c in _changes(small, config).items()}
+    gain = float(now.max()) - _top(surface(third))
+    best = max(changes, key=changes.__getitem__, default='')
     return MotionResidual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
-        lag_s=_best_lag([(lag, surface(slice(None, None, 3), lag)) for lag in config.lags_s]),
+        lag_s=_best_lag([(lag, surface(third, lag)) for lag in config.lags_s]),
+        best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
     )
+
+
+def _changes(camera: CameraModel, config: ResidualConfig) -> dict[str, CameraModel]:
+    """Cameras that are rolled, or have another focal length, by name."""
+    found = {}
+    for degrees in config.rolls_deg:
+        turn = np.eye(4)
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        turn[:2, :2] = [[c, -s], [s, c]]
+        found[f'the camera rolled by {degrees:+g} degrees'] = replace(
+            camera, T_mount_camera=camera.T_mount_camera @ turn
+        )
+    for factor in config.zooms:
+        K = camera.K.copy()
+        K[:2, :2] *= factor
+        found[f'{factor:g} times the focal length'] = replace(camera, K=K)
+    return found
+
+
+def _top(surface: FloatArray | None) -> float:
+    return -np.inf if surface is None else float(surface.max())
 
 
 def _shrunk(camera: CameraModel, width: int) -> CameraModel:
@@ -272,5 +306,5 @@ def _refined(line: FloatArray, at: int) -> float:
 
 
 def _best_lag(surfaces: Sequence[tuple[float, FloatArray | None]]) -> float:
-    peaks = {lag: -np.inf if s is None else float(s.max()) for lag, s in surfaces}
+    peaks = {lag: _top(surface) for lag, surface in surfaces}
     return max(peaks, key=peaks.__getitem__)

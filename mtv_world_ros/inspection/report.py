@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 #: from best to worst
-VERDICTS = ('ok', 'suspicious', 'broken')
+VERDICTS = ('ok', 'not checked', 'suspicious', 'broken')
 _ADVICE = {
-    'ok': 'Nothing wrong was found.',
+    'ok': 'Everything was checked, and nothing wrong was found.',
+    'not checked': 'Nothing wrong was found, but not everything could be checked.',
     'suspicious': 'Look at the overlay pictures before you rely on this recording.',
     'broken': 'Predictions from this recording would be wrong.',
 }
@@ -21,10 +22,15 @@ _LEGEND = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Something wrong: a verdict worse than `ok`, and why in a sentence."""
+    """A verdict worse than `ok`, and why in a sentence."""
 
     verdict: str
     text: str
+
+
+def not_checked(text: str) -> Finding:
+    """A check that could not be made, and why."""
+    return Finding(verdict='not checked', text=text)
 
 
 def suspicious(text: str) -> Finding:
@@ -49,8 +55,8 @@ class Section:
     Attributes:
         name: of the view, or `recording`.
         measures: what was measured, as text, by name.
-        findings: what is wrong.
-        notes: what could not be checked and why, and other things to know.
+        findings: what is wrong, and what could not be checked and why.
+        notes: other things to know.
     """
 
     name: str
