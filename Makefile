@@ -22,7 +22,7 @@ $(STAMP): setup.py requirements/constraints.txt requirements/install.sh
 	@touch $@
 
 demo: $(STAMP)  ## replay the bundled episode through the node; results under out/demo/
-	$(BIN)/mtv-world demo
+	$(BIN)/mtv-world demo --overwrite
 
 lint: $(STAMP)  ## ruff, pyright and import-linter
 	$(BIN)/ruff check .

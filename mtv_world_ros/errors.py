@@ -50,6 +50,18 @@ class TrainingError(MtvWorldError):
     """Training cannot go on (no clips, loss not finite)."""
 
 
+class TrainingInterrupted(TrainingError):
+    """A signal ended a training after it had saved its state; the text says how to go on.
+
+    Attributes:
+        signum: number of the signal.
+    """
+
+    def __init__(self, text: str, signum: int) -> None:
+        super().__init__(text)
+        self.signum = signum
+
+
 class SimulatorError(MtvWorldError):
     """The simulator cannot render or build a scene."""
 
@@ -59,7 +71,7 @@ class PolicyError(MtvWorldError):
 
 
 class DescriptionError(MtvWorldError):
-    """The objects of a scene could not be had; not the same answer as "there are none".
+    """Naming the objects of a scene failed; not the same answer as "there are none".
 
     Attributes:
         status: `unreachable`, `timeout`, `rate_limited`, `server_error`, `rejected`, `refused`,

@@ -83,6 +83,53 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
     return digest.hexdigest()
 
 
+def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
+    """Refuses to replace what a command of the user's did not ask to replace.
+
+    Args:
+        path: file or folder that would be written; an empty folder counts as free.
+        overwrite: the user asked for it.
+        instead: option that names another place.
+
+    Raises:
+        ConfigError: it exists.
+    """
+    is_free = not any(path.iterdir()) if path.is_dir() else not path.exists()
+    if not (overwrite or is_free):
+        raise ConfigError(f"'{path}' exists; give another {instead}, or --overwrite to replace it")
+
+
+def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
+    """Refuses a folder of results that were made with other settings.
+
+    Args:
+        results: folder of JSON files, each with the `settings` it was made with.
+        settings: of this run; stored ones may have more keys.
+        overwrite: the user asked to replace such results.
+
+    Raises:
+        ConfigError: a file was made with other settings, or by another version.
+    """
+    wanted = plain(settings)
+    for file in () if overwrite else sorted(results.glob('*.json')):
+        try:
+            stored = json.loads(file.read_text(encoding='utf-8'))['settings']
+            other = [key for key in wanted if stored[key] != wanted[key]]
+        except (OSError, ValueError):
+            continue  # not readable, thus nothing is lost
+        except (KeyError, TypeError):
+            raise ConfigError(
+                f"'{file}' was written by another version; give another --out, or --overwrite to "
+                'replace it'
+            ) from None
+        if other:
+            differing = '; '.join(f'{k} {stored[k]!r}, now {wanted[k]!r}' for k in other)
+            raise ConfigError(
+                f"'{results.parent}' holds results with other settings ({differing}); give "
+                'another --out, or --overwrite to replace them'
+            )
+
+
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Writes a JSON file; NaN becomes null."""
     write_whole(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')

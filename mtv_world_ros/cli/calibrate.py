@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from mtv_world_ros.cli.options import (
     add_dtype,
     add_model_options,
+    add_overwrite,
     add_seeds,
     add_segmenter,
     add_serving,
@@ -20,6 +21,8 @@ from mtv_world_ros.cli.options import (
     provenance,
     threads_of_workers,
 )
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
@@ -61,6 +64,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action='store_false',
         help='write the report only; do not change the checkpoint',
     )
+    add_overwrite(parser)
     add_dtype(parser)
     add_model_options(parser)
     add_serving(parser)
@@ -77,6 +81,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
     from mtv_world_ros.success.calibration import save_calibration, save_horizon
 
+    folder = checkpoint_path(arguments.checkpoint)
+    _check_places(arguments, folder)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     print(f'{arguments.dataset}: {selection}')
     refuse_test_kinds(selection.paths, 'calibration')
@@ -88,12 +94,29 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
     if arguments.store:
-        folder = checkpoint_path(arguments.checkpoint)
         print(f'stored: {save_calibration(folder, found.calibration)}')
         if horizon is not None:
             print(f'stored: {save_horizon(folder, horizon)}')
     print(text)
     return 0
+
+
+def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
+    """Refuses to write into the installed package, and to replace an earlier calibration."""
+    from mtv_world_ros.assembly import BUNDLED
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.success.calibration import CALIBRATION
+
+    read_card(folder)
+    check_free(arguments.out / 'calibration.json', arguments.overwrite)
+    if not arguments.store:
+        return
+    if arguments.checkpoint == BUNDLED:
+        raise ConfigError(
+            "'bundled' is part of the installed package, into which nothing is written; copy it "
+            f"with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
+        )
+    check_free(folder / CALIBRATION, arguments.overwrite, 'checkpoint')
 
 
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
@@ -131,6 +154,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
             mode='imagine',
             seed=arguments.seed + SEED_STEP * index,
             num_inference_steps=arguments.steps,
+            overwrite=arguments.overwrite,
             actions=('true',),
             ceiling=False,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_checkpoint, add_model_options
+from mtv_world_ros.cli.options import add_checkpoint, add_model_options, add_overwrite
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -15,14 +15,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episode', type=Path, help='default: the bundled one')
     parser.add_argument('--out', type=Path, default=Path('out/demo'))
+    add_overwrite(parser)
     add_checkpoint(parser)
     add_model_options(parser)
     parser.set_defaults(handler=_demo)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.files import check_free, share_path
+
+    check_free(arguments.out, arguments.overwrite)
     from mtv_world_ros.demo.run import run_demo
-    from mtv_world_ros.files import share_path
 
     text = run_demo(
         arguments.episode or share_path('resource', 'demo_episode'),

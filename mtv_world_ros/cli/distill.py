@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from mtv_world_ros.cli.options import add_dtype
+from mtv_world_ros.cli.train import add_saving
 
 #: overrides of the preset: a student starts from a trained model, close to its goal
 _DEFAULTS = {
@@ -46,7 +47,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
     parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all cores')
-    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    add_saving(parser)
     parser.set_defaults(handler=_distill)
 
 
@@ -87,6 +88,7 @@ def _distill(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         dtype=choose_dtype(arguments.dtype, arguments.device),
         save_every=arguments.save_every,
+        save_seconds=60 * arguments.save_minutes,
         num_episodes=arguments.episodes,
         cache=arguments.cache,
     )

@@ -11,6 +11,7 @@ from typing import NamedTuple, TYPE_CHECKING
 from mtv_world_ros.cli.options import (
     add_dtype,
     add_model_options,
+    add_overwrite,
     add_seeds,
     add_segmenter,
     add_serving,
@@ -84,6 +85,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='how objects are named (see config/describer.yaml); default: by the episodes',
     )
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
+    add_overwrite(parser)
     add_dtype(parser)
     add_model_options(parser)
     add_serving(parser)
@@ -207,6 +209,7 @@ def _score(
             threads=threads,
         ),
         describer=arguments.describer and assemble_describer(arguments.describer),
+        overwrite=arguments.overwrite,
         mode=arguments.mode,
         seed=arguments.seed,
         num_seeds=arguments.seeds,

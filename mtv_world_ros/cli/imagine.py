@@ -5,7 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_checkpoint, add_model_options, add_segmenter
+from mtv_world_ros.cli.options import (
+    add_checkpoint,
+    add_model_options,
+    add_overwrite,
+    add_segmenter,
+)
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -33,6 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--max-seconds', type=float, default=3600.0, help='of an episode [s]')
     parser.add_argument('--instruction', default='', help="default: the recorded episode's")
     parser.add_argument('--out', type=Path, default=Path('out/imagine'))
+    add_overwrite(parser)
     add_checkpoint(parser)
     add_model_options(parser)
     add_segmenter(parser)
@@ -66,7 +72,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
         num_inference_steps=arguments.steps,
         segmenter=arguments.segmenter,
     )
-    results = imagine_episodes(options, arguments.out)
+    results = imagine_episodes(options, arguments.out, overwrite=arguments.overwrite)
     print('episode  end          chunks  seconds  bag')
     for result in results:
         print(

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+import shlex
+from typing import Any, TYPE_CHECKING
+
+from mtv_world_ros.errors import CheckpointError
 
 if TYPE_CHECKING:
     from mtv_world_ros.model.wan_import.import_weights import PartReport
@@ -31,8 +34,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
     )
-    parser.add_argument('--guidance-scale', type=float, default=1.0, help='1 = none')
-    parser.add_argument('--negative-prompt', default='', help='negative prompt of guidance')
+    parser.add_argument(
+        '--guidance-scale', type=float, help="1 = none; default: the preset's sampling"
+    )
+    parser.add_argument('--negative-prompt', help="of guidance; default: the preset's sampling")
     for part in _ELSEWHERE:
         option = '--' + part.replace('_', '-')
         parser.add_argument(option, type=Path, help='file or folder; default: in PATH')
@@ -42,10 +47,14 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.training.config import HistoryConfig, load_training_config
+    from mtv_world_ros.training.config import load_training_config
 
-    # public weights were trained without history frames
-    config = load_training_config(arguments.preset).replace(history=HistoryConfig())
+    if not arguments.path.exists():
+        raise CheckpointError(
+            f"'{arguments.path}' does not exist; name a checkpoint's folder or file"
+        )
+    config = load_training_config(arguments.preset)
+    sampling = config.sampling
     from mtv_world_ros.model.wan_import.import_weights import import_weights
 
     robot = load_robot(robot_path(config.video.robot))
@@ -53,8 +62,8 @@ def _import_weights(arguments: argparse.Namespace) -> int:
 
     text = {
         'prompt': arguments.prompt,
-        'negative_prompt': arguments.negative_prompt,
-        'guidance_scale': arguments.guidance_scale,
+        'negative_prompt': _given(arguments.negative_prompt, sampling.negative_prompt),
+        'guidance_scale': _given(arguments.guidance_scale, sampling.guidance_scale),
     }
     reports = import_weights(
         arguments.path,
@@ -68,8 +77,16 @@ def _import_weights(arguments: argparse.Namespace) -> int:
     )
     for report in reports:
         print(_line(report))
-    print(f'checkpoint: {arguments.out}')
+    preset, out = shlex.quote(arguments.preset), shlex.quote(str(arguments.out))
+    print(
+        f'checkpoint: {out}\ntrain it with: mtv-world train DATASET --preset {preset} '
+        f'--init {out} --out DIR'
+    )
     return 0
+
+
+def _given(value: Any, default: Any) -> Any:
+    return default if value is None else value
 
 
 def _line(report: PartReport) -> str:

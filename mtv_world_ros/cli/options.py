@@ -93,6 +93,13 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
 
 
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """Adds `--overwrite`."""
+    parser.add_argument(
+        '--overwrite', action='store_true', help='replace what an earlier run wrote'
+    )
+
+
 def add_dtype(parser: argparse.ArgumentParser) -> None:
     """Adds `--dtype`."""
     parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
@@ -106,8 +113,10 @@ def threads_of_workers(arguments: argparse.Namespace) -> int:
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     """Returns the pipeline of a command's checkpoint and model options."""
-    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.assembly import checkpoint_path, load_pipeline
+    from mtv_world_ros.model.card import read_card
 
+    read_card(checkpoint_path(arguments.checkpoint))  # before torch is imported, which is slow
     return load_pipeline(
         arguments.checkpoint, num_threads=arguments.threads, **pipeline_choices(arguments)
     )

@@ -11,6 +11,7 @@ from mtv_world_ros.cli.options import (
     add_checkpoint,
     add_dtype,
     add_model_options,
+    add_overwrite,
     add_segmenter,
     add_serving,
     pipeline_choices,
@@ -77,6 +78,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='the prediction-powered rates use the true outcomes of the first M of each task',
     )
     parser.add_argument('--max-chunks', type=int, default=8, help='answers of a policy at most')
+    add_overwrite(parser)
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
@@ -108,6 +110,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         config=RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks),
         workers=arguments.workers,
         ray_address=arguments.ray,
+        overwrite=arguments.overwrite,
     )
     optimism = {
         name: Optimism.of(results, out / FOLDER, arguments.seed)

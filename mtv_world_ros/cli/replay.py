@@ -10,12 +10,14 @@ from mtv_world_ros.cli.options import (
     add_checkpoint,
     add_dtype,
     add_model_options,
+    add_overwrite,
     add_segmenter,
     add_serving,
     add_task,
     pipeline_of,
 )
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import check_free
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -31,6 +33,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
+    add_overwrite(parser)
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
@@ -48,6 +51,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.replay.offline import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
+    check_free(out, arguments.overwrite)
     summary = replay_offline(
         pipeline_of(arguments),
         arguments.episode,
@@ -55,6 +59,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         calibration=arguments.calibration,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
+        overwrite=arguments.overwrite,
     )
     print(summary)
     return 0

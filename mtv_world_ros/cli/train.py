@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 import math
 from pathlib import Path
+import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
@@ -77,7 +78,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         default=0,
         help='CPU threads per process; 0 = its share of all cores',
     )
-    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    add_saving(parser)
     parser.add_argument(
         '--data-workers',
         type=int,
@@ -98,6 +99,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(handler=_train)
 
 
+def add_saving(parser: argparse.ArgumentParser) -> None:
+    """Adds `--save-every` and `--save-minutes`."""
+    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    parser.add_argument(
+        '--save-minutes',
+        type=float,
+        default=10.0,
+        help='longest time between saved states [min]; Ctrl-C and SIGTERM save, too',
+    )
+
+
 def _train(arguments: argparse.Namespace) -> int:
     import os
 
@@ -113,12 +125,16 @@ def _train(arguments: argparse.Namespace) -> int:
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
+    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.model.card import read_card
+
     # importing torch takes seconds: what is often mistyped is checked before
     if not arguments.dataset.is_dir():
         select(arguments.dataset)  # says that it holds no episodes
+    if arguments.init:
+        read_card(checkpoint_path(arguments.init))
     import torch
 
-    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
@@ -140,6 +156,7 @@ def _train(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         dtype=dtype,
         save_every=arguments.save_every,
+        save_seconds=60 * arguments.save_minutes,
         num_episodes=arguments.episodes,
         initial=arguments.init and checkpoint_path(arguments.init),
         cache=arguments.cache,
@@ -148,10 +165,12 @@ def _train(arguments: argparse.Namespace) -> int:
         peak_flops=arguments.peak_tflops * 1e12,
         latent_cache=arguments.latent_cache,
     )
-    if config.lora.rank:
-        print(f'adapter for {arguments.init}: {folder}')
-    else:
-        print(f'checkpoint: {folder}\nevaluate it with: mtv-world evaluate {folder} DATASET')
+    print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
+    model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
+    dataset = str(arguments.held_out or arguments.dataset)
+    out = arguments.out / f'evaluation_{read_card(folder)["trained_on"]["steps"]}'
+    words = [model[0], dataset, *model[1:], '--out', str(out)]
+    print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
     return 0
 
 
@@ -176,7 +195,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
     """Returns the overrides of `--set SECTION.KEY=VALUE` options.
 
     Raises:
-        ConfigError: one has no value.
+        ConfigError: one has no value, or one that is not YAML.
     """
     import yaml
 
@@ -187,7 +206,10 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
         key, equals, value = item.partition('=')
         if not equals:
             raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
-        overrides[key] = yaml.safe_load(value)
+        try:
+            overrides[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set '{item}': {value!r} is not a YAML value") from None
     return overrides
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from mtv_world_ros.cli.options import add_overwrite
+from mtv_world_ros.files import check_free
+
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
@@ -26,10 +29,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--learning-rate', type=float, default=2e-3)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--threads', type=int, default=0, help='0 = all cores but one')
+    add_overwrite(parser)
     parser.set_defaults(handler=_train)
 
 
 def _train(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.splits import select
+
+    if not arguments.dataset.is_dir():
+        select(arguments.dataset)  # says that it holds no episodes, before torch is imported
     import numpy as np
 
     from mtv_world_ros.assembly import robot_path
@@ -46,6 +54,7 @@ def _train(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.training.run import find_episodes
 
+    check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     views = [view.strip() for view in arguments.views.split(',')]

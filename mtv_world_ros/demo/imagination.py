@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import time
 
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import check_free
 from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.processes import (
     module_command,
@@ -59,15 +61,26 @@ class ImagineOptions:
     segmenter: str = 'colour'
 
 
-def imagine_episodes(options: ImagineOptions, out: Path) -> list[dict[str, object]]:
+def imagine_episodes(
+    options: ImagineOptions, out: Path, *, overwrite: bool = False
+) -> list[dict[str, object]]:
     """Runs the episodes; `out` gets a bag for each, `episodes.json` and `logs/`.
+
+    Args:
+        options: what is started.
+        out: folder of the results.
+        overwrite: remove the episodes of an earlier run from it.
 
     Returns:
         What `episodes.json` says, one entry for each episode that was begun.
 
     Raises:
+        ConfigError: `out` holds episodes, and `overwrite` is not set.
         EpisodeError: a process failed; the message names its log.
     """
+    for bag in sorted(out.glob('episode_*')):
+        check_free(bag, overwrite)
+        shutil.rmtree(bag)
     logs = out / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
     (out / 'episodes.json').unlink(missing_ok=True)

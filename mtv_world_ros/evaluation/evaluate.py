@@ -31,7 +31,7 @@ from mtv_world_ros.evaluation.references import round_trip
 from mtv_world_ros.evaluation.report.summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
-from mtv_world_ros.files import plain, write_json
+from mtv_world_ros.files import check_same_settings, plain, write_json
 from mtv_world_ros.parallel import score_all
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.vision.describers.describer import Describer
@@ -68,6 +68,7 @@ def evaluate(
     provenance: Mapping[str, str] = MappingProxyType({}),
     parallel: Parallel | None = None,
     describer: Describer | None = None,
+    overwrite: bool = False,
     show_progress: bool = True,
     **options: Any,
 ) -> Summary:
@@ -87,6 +88,7 @@ def evaluate(
         provenance: what the results were made with, by heading; goes into metrics.json.
         parallel: processes to score with; None = this one.
         describer: names the objects from each episode's first frame; None = see `Job.objects`.
+        overwrite: replace results of other settings; only asked where there is a name.
         show_progress: draw a progress bar.
         **options: fields of `EvaluationConfig`.
 
@@ -94,13 +96,15 @@ def evaluate(
         What was found.
 
     Raises:
-        ConfigError: unknown option or mode, or weights that are not there.
+        ConfigError: unknown option or mode, weights that are not there, or `out` holds results of
+            other settings.
         EpisodeError: no episode can be used.
     """
     config, out = config_from(options), Path(out)
     if not config.num_inference_steps:  # results say the number
         config = replace(config, num_inference_steps=pipeline.spec.num_inference_steps)
     run = _Run(pipeline, out, name, config, parallel, describer)
+    check_same_settings(out / 'episodes', run.settings, overwrite or not name)
     jobs = make_jobs(episode_paths, zero_shot, config.seed)
     results, failed = [], {}
     bar = tqdm(run.results(jobs), total=len(jobs), unit='ep', disable=not show_progress)

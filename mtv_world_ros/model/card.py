@@ -149,6 +149,16 @@ def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
                 f"adapter '{adapter}' was trained with '{key}' {other}, this checkpoint's is "
                 f'{mine}; use the checkpoint that it was trained on'
             )
+    mine, other = history_settings(card), history_settings(theirs)
+    if mine != other:
+        raise CheckpointError(
+            f"adapter '{adapter}' was trained with history ({_settings(other)}), this checkpoint "
+            f'has ({_settings(mine)}); use the checkpoint that it was trained on'
+        )
+
+
+def _settings(history: HistorySettings) -> str:
+    return ', '.join(f'{name} {value}' for name, value in history.model_dump().items())
 
 
 def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:

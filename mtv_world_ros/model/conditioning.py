@@ -56,6 +56,20 @@ class Conditioning:
         """(B,) in [0, 1000], as the transformer takes it."""
         return None if self.history_sigmas is None else 1000 * self.history_sigmas
 
+    def with_one_start(self) -> Conditioning:
+        """Returns the same with the start image in one place, as Wan2.1-Fun-Control was trained.
+
+        Where the reference tokens would show the start image, its channel slot alone has it and
+        the tokens are of zeros; where they show another frame, the slot is zero. (VideoX-Fun,
+        scripts/wan2.1_fun/train_control_lora.py, `clip_idx`.)
+        """
+        shown = self.reference if self.anchor is None else self.anchor
+        largest = shown.abs().flatten(1).amax(1)
+        difference = (shown - self.reference).abs().flatten(1).amax(1)
+        # encoded twice, the same picture differs by rounding
+        same = (difference <= 0.01 * largest).reshape(-1, 1, 1, 1, 1)
+        return replace(self, start=self.start * same.unsqueeze(3), anchor=shown * ~same)
+
     def repeated(self, count: int) -> Conditioning:
         """Returns the same for `count` samples, where it is for one."""
         held = self._held()

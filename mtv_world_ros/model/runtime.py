@@ -22,6 +22,26 @@ def set_num_threads(num_threads: int) -> None:
     torch.set_num_threads(num_threads or max(1, usable - 1))
 
 
+def check_device(name: str) -> None:
+    """Checks that this machine has a device.
+
+    Raises:
+        ConfigError: it has not, or torch does not know it.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ConfigError(f"device '{name}' is not known; e.g. cpu, cuda or cuda:1") from None
+    if device.type == 'cuda' and not torch.cuda.is_available():
+        why = f'torch {torch.__version__} finds no GPU'
+        if torch.version.cuda is None:
+            why = f'torch {torch.__version__} is built without CUDA'
+        raise ConfigError(f"device '{name}' cannot be used: {why}; use cpu")
+    if device.type == 'cuda' and (device.index or 0) >= torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        raise ConfigError(f"device '{name}': this machine has cuda:0 to cuda:{count - 1}")
+
+
 def choose_dtype(name: str, device: str) -> torch.dtype:
     """Returns the number format; `auto` is bfloat16 where the device multiplies it natively.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from diffusers import FlowMatchEulerDiscreteScheduler
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,8 @@ def sample_latents(
     """
     shape = conditioning.control.shape[1:]
     device = conditioning.control.device
+    if transformer.start_image == 'either':
+        conditioning = conditioning.with_one_start()
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     latents = _noise(generators, shape).to(device)
     conditioning = conditioning.repeated(len(seeds))
@@ -96,7 +99,10 @@ def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.
         sigmas = torch.linspace(1.0, 1.0 / num_inference_steps, num_inference_steps).tolist()
         scheduler.set_timesteps(sigmas=sigmas, device=device)
     else:
-        scheduler.set_timesteps(num_inference_steps, device=device)
+        # Wan's and VideoX-Fun's: evenly from .999 to 0, the last one left out. diffusers by itself
+        # ends a step of training higher, shifted by 3 at .060 in place of .058 for 50 steps.
+        levels = np.linspace(0.999, 0.0, num_inference_steps + 1)[:-1]
+        scheduler.set_timesteps(sigmas=levels, device=device)  # type: ignore[arg-type]
 
 
 def denoise(

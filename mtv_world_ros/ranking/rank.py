@@ -14,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import plain, write_json, write_whole
+from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.jobs import Job, Result
@@ -45,6 +45,7 @@ def run_jobs(
     config: RolloutConfig,
     workers: int = 1,
     ray_address: str | None = None,
+    overwrite: bool = False,
     show_progress: bool = True,
 ) -> tuple[list[list[Result]], dict[str, str]]:
     """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
@@ -58,14 +59,15 @@ def run_jobs(
         config: how episodes are run.
         workers: processes; with Ray, at most so many at once.
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
+        overwrite: replace results of other settings.
         show_progress: draw a progress bar.
 
     Raises:
         ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
-            differ.
+            differ, or a folder holds results of other settings.
         MtvWorldError: a worker died, or no job has a result.
     """
-    stores = [_Store(checkpoint, config, jobs) for checkpoint in checkpoints]
+    stores = [_Store(checkpoint, config, jobs, overwrite) for checkpoint in checkpoints]
     wanted = {job: tuple(k for k, s in enumerate(stores) if job not in s.found) for job in jobs}
     left = [WantedJob(job, numbers) for job, numbers in wanted.items() if numbers]
     failed: dict[str, str] = {}
@@ -90,13 +92,16 @@ class _Store:
         found: results by job.
     """
 
-    def __init__(self, checkpoint: Checkpoint, config: RolloutConfig, jobs: Sequence[Job]) -> None:
+    def __init__(
+        self, checkpoint: Checkpoint, config: RolloutConfig, jobs: Sequence[Job], overwrite: bool
+    ) -> None:
         self._out = checkpoint.out
         self._settings = {
             **checkpoint.settings,
             'steps': config.num_inference_steps,
             'max_chunks': config.max_chunks,
         }
+        check_same_settings(self._out / FOLDER, self._settings, overwrite)
         stored = {job: _stored(self._out, job, self._settings) for job in jobs}
         self.found = {job: result for job, result in stored.items() if result is not None}
 

@@ -89,7 +89,7 @@ def replay_offline(
     seed: int = 0,
     num_inference_steps: int = 0,
     limits: ReplayLimits | None = None,
-    overwrite: bool = True,
+    overwrite: bool = False,
     show_progress: bool = True,
 ) -> ReplaySummary:
     """Imagines every joint trajectory of an episode from the newest frames before it.

@@ -109,7 +109,10 @@ class AugmentConfig(Schema):
         default=0.0, description='probability of a sample without its trajectory video'
     )
     reference_dropout: Share = Field(
-        default=0.0, description='probability of a sample without its start image'
+        default=0.0, description='probability of a sample without its reference image'
+    )
+    start_dropout: Share = Field(
+        default=0.0, description="probability of a sample without its start image's channel slot"
     )
     image_dropout: Share = Field(
         default=0.0, description="probability of a sample without its start image's CLIP tokens"
@@ -165,6 +168,10 @@ class SamplingConfig(Schema):
     section: ClassVar = 'sampling'
 
     num_inference_steps: Count = Field(default=4, description='denoising steps')
+    guidance_scale: float = Field(
+        default=1.0, description='of models with text; 1 = no guidance, and half the work'
+    )
+    negative_prompt: str = Field(default='', description='text that guidance leads away from')
 
 
 class OptimizerConfig(Schema):

@@ -134,7 +134,10 @@ class DistillTrainer(Trainer):
     def loss(self, batch: Batch) -> Loss:
         """The loss of all student steps along one path of the teacher per clip."""
         encoded = encode_batch(self.encoders, batch, self.config.objective, self.device)
-        condition = encoded.conditioning.in_dtype(self.weights.worker.dtype)
+        condition = encoded.conditioning
+        if self.weights.worker.start_image == 'either':
+            condition = condition.with_one_start()
+        condition = condition.in_dtype(self.weights.worker.dtype)
         draws = Draws(self.seed, batch.step, batch.numbers)
         noise = draws.normal(*encoded.clean.shape[1:]).to(self.device)
         if condition.history is not None:

@@ -133,14 +133,15 @@ def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor
 def drop_conditions(
     conditioning: Conditioning, augment: AugmentConfig, draws: Draws
 ) -> Conditioning:
-    """Drops control, start image or its CLIP tokens in random samples, each independently.
+    """Drops control, reference, start slot or CLIP tokens in random samples, each independently.
 
     Dropped inputs are zero. VideoX-Fun drops one in ten samples; classifier-free guidance needs
     a model trained without its condition.
     """
     dropped = {
         ('control', 'start_control'): augment.control_dropout,
-        ('reference', 'start', 'anchor'): augment.reference_dropout,
+        ('reference', 'anchor'): augment.reference_dropout,
+        ('start',): augment.start_dropout,
         ('image',): augment.image_dropout,
     }
     changes = {}

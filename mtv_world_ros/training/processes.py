@@ -83,6 +83,16 @@ class Processes:
                 'own message, then run the same command again: it goes on from the last state'
             ) from error
 
+    def any(self, flag: bool) -> bool:
+        """Whether a flag is set in any of the processes; all of them have to ask.
+
+        Raises:
+            TrainingError: another process is gone.
+        """
+        if self.count == 1:
+            return flag
+        return self.summed(torch.tensor([float(flag)], device=self.device)).item() > 0
+
     def sum_into(self, tensors: Sequence[Tensor]) -> None:
         """Replaces tensors, all of one number format, by their sums over the processes."""
         if self.count == 1:

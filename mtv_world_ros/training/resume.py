@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.training.averaged_weights import Weights
+from mtv_world_ros.training.config import TrainingConfig
 
 #: folder of the state in that of the training
 STATE = 'state'
@@ -77,6 +78,35 @@ def read_card(folder: Path) -> dict[str, Any] | None:
     _recover(folder / STATE)
     file = folder / STATE / _CARD
     return json.loads(file.read_text()) if file.is_file() else None
+
+
+def architecture(config: TrainingConfig) -> dict[str, Any]:
+    """Returns what of a preset decides weights and videos, by dotted name, as JSON has it."""
+    values = {
+        **{f'transformer.{name}': value for name, value in config.transformer.items()},
+        **{f'autoencoder.{name}': value for name, value in config.autoencoder.items()},
+        **{f'video.{n}': v for n, v in config.video.model_dump(exclude={'clip_stride_s'}).items()},
+        'lora.rank': config.lora.rank,
+    }
+    return json.loads(json.dumps(values))
+
+
+def check_architecture(folder: Path, config: TrainingConfig) -> None:
+    """Checks that a preset has the architecture of the state in a folder, if there is one.
+
+    Raises:
+        TrainingError: it has another one; names the first difference.
+    """
+    held, mine = read_card(folder), architecture(config)
+    if held is None or 'lora.rank' not in held:  # of a version that did not keep it
+        return
+    theirs = {name: value for name, value in held.items() if '.' in name}
+    for name in sorted({*theirs, *mine}):
+        if theirs.get(name) != mine.get(name):
+            raise TrainingError(
+                f"'{folder / STATE}' was trained with {name} {theirs.get(name)}, this preset has "
+                f'{mine.get(name)}; give --preset and --set as before, or another --out'
+            )
 
 
 def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -> None:

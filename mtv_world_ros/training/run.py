@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
+import signal
+import threading
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,11 +19,18 @@ from tqdm import tqdm
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import cached_recording, clip_starts, Recording
 from mtv_world_ros.data_types import CameraModel, WorldModelSpec
-from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, TrainingError
+from mtv_world_ros.errors import (
+    ConfigError,
+    EpisodeError,
+    MtvWorldError,
+    TrainingError,
+    TrainingInterrupted,
+)
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model.card import CAMERAS, CARD, ROBOT_FOLDER
+from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions
@@ -29,7 +39,7 @@ from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.latent_cache.clips import cached, CachedSource
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.processes import Processes
-from mtv_world_ros.training.resume import disk_errors_named, DiskError
+from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -93,6 +103,7 @@ def train(
     device: str = 'cpu',
     dtype: torch.dtype = torch.float32,
     save_every: int = 250,
+    save_seconds: float = math.inf,
     num_episodes: int | None = None,
     initial: Path | None = None,
     cache: Path | None = None,
@@ -119,6 +130,7 @@ def train(
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward.
         save_every: steps between saved states.
+        save_seconds: longest time between saved states [s].
         num_episodes: use this many episodes, spread evenly over the data set.
         initial: checkpoint whose weights a new run starts from; a resumed run has its own. For an
             adapter or a model with text, its other parts are used too, also when resumed.
@@ -131,10 +143,15 @@ def train(
         latent_cache: keeps what the encoders make of the clips; None = encode in every step.
 
     Raises:
-        TrainingError: no usable episode, the loss is not finite, or another process is gone.
+        ConfigError: the device is not there.
+        TrainingInterrupted: Ctrl-C or SIGTERM; the state of the last step is saved.
+        TrainingError: no usable episode, the loss is not finite, another process is gone, or `out`
+            holds a training of another architecture.
         DiskError: a file cannot be written.
     """
     config = config.replace(video=config.video.replace(robot=robot.name))  # not a path
+    check_device(device)
+    check_architecture(out, config)
     processes = Processes(device)
     out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
@@ -202,7 +219,7 @@ def train(
         ideal = ideal_seconds(config, actions, dtype, peak * processes.count)
     try:
         with disk_errors_named(out):
-            _loop(trainer, source, save_every, held_out, ideal)
+            _loop(trainer, source, save_every, save_seconds, held_out, ideal)
     finally:
         source.close()
     return trainer.result
@@ -244,26 +261,64 @@ def _loop(
     trainer: Trainer,
     source: BatchSource | CachedSource,
     save_every: int,
+    save_seconds: float,
     held_out: HeldOut | None,
     ideal: float | None,
 ) -> None:
     folder, is_main = trainer.folder, trainer.processes.is_main
-    with TrainingLog(
-        folder,
-        step=trainer.step,
-        total=trainer.config.optimizer.steps,
-        active=is_main,
-        ideal_seconds=ideal,
-    ) as log:
+    total = trainer.config.optimizer.steps
+    log = TrainingLog(folder, step=trainer.step, total=total, active=is_main, ideal_seconds=ideal)
+    with StopSignals() as signals, log:
         reports = trainer.run(
             source,
             save_every=save_every,
+            save_seconds=save_seconds,
             on_save=lambda _: trainer.export(trainer.result),
+            should_stop=signals.came,
         )
         for report in reports:
             log.add(report)
             if held_out is not None and is_main:
                 held_out.after(report.step, trainer, log)
+    if trainer.step < total:
+        raise TrainingInterrupted(
+            f"stopped at step {trainer.step} of {total}, which is saved in '{folder / STATE}'",
+            signals.number or signal.SIGTERM,
+        )
+
+
+class StopSignals:
+    """Notes SIGINT and SIGTERM in place of their effect; a second one has its effect again.
+
+    A context manager; outside the main thread, which alone gets signals, it does nothing.
+
+    Attributes:
+        number: of the signal that came; 0 = none.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._before: dict[signal.Signals, Any] = {}
+
+    def came(self) -> bool:
+        """Whether one came."""
+        return self.number != 0
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for kind in (signal.SIGINT, signal.SIGTERM):
+                self._before[kind] = signal.signal(kind, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
+        self._before.clear()
+
+    def _note(self, number: int, _: object) -> None:
+        self.number = number
+        tqdm.write('saving after this step; once more to stop at once')
+        self.__exit__()
 
 
 def check_clips(recording: Recording, spec: WorldModelSpec) -> None:

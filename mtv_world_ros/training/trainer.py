@@ -44,7 +44,14 @@ from mtv_world_ros.training.objective import (
     sigma_weights,
 )
 from mtv_world_ros.training.processes import memory_errors_named, Processes
-from mtv_world_ros.training.resume import check_card, load_state, read_card, save_state, STATE
+from mtv_world_ros.training.resume import (
+    architecture,
+    check_card,
+    load_state,
+    read_card,
+    save_state,
+    STATE,
+)
 from mtv_world_ros.training.self_rollout import SelfRollout
 
 #: losses averaged for the progress bar and the log
@@ -179,13 +186,20 @@ class Trainer:
         *,
         save_every: int,
         on_save: Callable[[int], None],
+        save_seconds: float = math.inf,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> Iterator[StepReport]:
         """Trains to `config.optimizer.steps`, yielding a report for each step.
+
+        When `should_stop` says so in any of the processes, the state is saved and the reports
+        end early.
 
         Args:
             source: makes the clips of `clips`.
             save_every: steps between saved states.
             on_save: called with the step after each save, in the main process only.
+            save_seconds: longest time between saved states [s].
+            should_stop: asked after each step.
 
         Raises:
             TrainingError: the loss is not finite, the device is out of memory, a state cannot be
@@ -199,7 +213,8 @@ class Trainer:
             seed=self.seed,
             device=self.device,
         )
-        while self.step < self.config.optimizer.steps:
+        saved, stops = time.monotonic(), False
+        while self.step < self.config.optimizer.steps and not stops:
             started = time.perf_counter()
             batch = source.batch(self.step)
             waited = time.perf_counter() - started
@@ -210,10 +225,13 @@ class Trainer:
                 report = self.train_step(batch)
             self.step += 1
             yield replace(report, seconds=time.perf_counter() - started, waited=waited)
+            stops = self.processes.any(should_stop())
             due = self.step % save_every == 0 or self.step == self.config.optimizer.steps
+            due |= stops or time.monotonic() - saved >= save_seconds
             if due and self.processes.is_main:
                 self.save_state()
                 on_save(self.step)
+                saved = time.monotonic()
 
     def loss(self, batch: Batch | EncodedBatch) -> Loss:
         """The loss of a batch, or of a part of one."""
@@ -277,6 +295,7 @@ class Trainer:
     def _identity(self) -> dict[str, Any]:
         """Values that must be the same in a resumed run."""
         return {
+            **architecture(self.config),
             'seed': self.seed,
             'control': self.config.video.control,
             'base': self.base and self.base.digest,
@@ -386,7 +405,10 @@ def batch_loss(
     noise = draws.normal(*clean.shape[1:]).to(device)
     noisy = add_noise(clean, noise, sigmas.to(device))
     kept = _kept(draws, config, device)
-    cond = drop_conditions(batch.conditioning, config.augment, draws)
+    cond = batch.conditioning
+    if transformer.start_image == 'either':
+        cond = cond.with_one_start()
+    cond = drop_conditions(cond, config.augment, draws)
     if cond.history is not None:
         cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
     cond = cond.in_dtype(dtype)

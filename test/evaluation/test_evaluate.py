@@ -107,7 +107,10 @@ def test_finished_episodes_are_not_imagined_again(make_pipeline, episodes, oracl
     assert calls == 3 * 2 * 2
     again, _ = run(pipeline, episodes, tmp_path, name='oracle')
     assert oracle.num_calls == calls and again == first
-    run(pipeline, episodes, tmp_path, name='oracle', seed=1)
+    with pytest.raises(ConfigError, match='other settings .seed 0, now 1'):
+        run(pipeline, episodes, tmp_path, name='oracle', seed=1)
+    assert oracle.num_calls == calls
+    run(pipeline, episodes, tmp_path, name='oracle', seed=1, overwrite=True)
     assert oracle.num_calls > calls
 
 

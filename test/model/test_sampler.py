@@ -29,6 +29,7 @@ class Oracle:
     """Knows the clean latents; predicts them, or the flow towards them."""
 
     dtype = torch.float32
+    start_image = 'both'
 
     def __init__(self, prediction: str) -> None:
         self.prediction = prediction
@@ -44,6 +45,7 @@ class ConstantFlow:
     """Predicts the mean of its text as the flow everywhere."""
 
     dtype = torch.float32
+    start_image = 'both'
     prediction = 'flow'
 
     def __call__(
@@ -95,10 +97,10 @@ def test_reaches_what_a_perfect_predictor_predicts(
 
 @pytest.mark.parametrize('steps', [4, 50])
 def test_noise_levels_are_spread_and_shifted_as_wan_does(steps: int) -> None:
-    """`s * sigma / (1 + (s - 1) * sigma)`; Euler's last one is 1 / n, UniPC's an n-th of 1000."""
+    """`s * sigma / (1 + (s - 1) * sigma)`; Euler's last one is 1 / n, UniPC's .999 / n."""
     levels = {
         'euler': (EULER, np.linspace(1, 1 / steps, steps), 1e-6),
-        'unipc': (UNIPC, np.linspace(1, 1 / 1000, steps + 1)[:-1], 2e-6),
+        'unipc': (UNIPC, np.linspace(0.999, 0, steps + 1)[:-1], 2e-6),
     }
     for config, plain, tolerance in levels.values():
         scheduler = build_scheduler(config)
@@ -156,3 +158,18 @@ def test_stops_between_steps() -> None:
 def test_a_schedule_without_flow_matching_is_refused(config: dict, message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         build_scheduler(config)
+
+
+@pytest.mark.parametrize(('steps', 'shift'), [(4, 3.0), (50, 3.0), (50, 5.0)])
+def test_unipc_has_the_noise_levels_of_videox_fun(steps: int, shift: float) -> None:
+    """Its `FlowUniPCMultistepScheduler`: sigma_max .999 and sigma_min 0 of the unshifted table."""
+    scheduler = build_scheduler({**UNIPC, 'flow_shift': shift})
+    set_timesteps(scheduler, steps, torch.device('cpu'))
+    table = 1.0 - np.linspace(1, 1 / 1000, 1000)[::-1]
+    even = np.linspace(table[0], table[-1], steps + 1)[:-1]
+    wanted = shift * even / (1 + (shift - 1) * even)
+    sigmas = np.asarray(scheduler.sigmas)
+    np.testing.assert_allclose(sigmas, [*wanted, 0.0], atol=1e-6)
+    assert [int(t) for t in scheduler.timesteps] == [int(1000 * sigma) for sigma in wanted]
+    if (steps, shift) == (50, 3.0):
+        assert sigmas[-2] == pytest.approx(0.0576, abs=1e-4)  # diffusers alone: 0.0604

@@ -44,7 +44,7 @@ def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, mo
 
 
 def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_result):
-    """A second run takes what is there; other settings or a broken file are run again."""
+    """A second run takes what is there, a broken file is run again, other settings when asked."""
     jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
     scored = []
 
@@ -59,14 +59,20 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
         'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Counting()
     )
 
-    def run(*names):
+    def run(*names, overwrite=False):
         checkpoints = [
             Checkpoint(
                 make_pipeline=lambda: None, out=tmp_path / str(k), settings={'checkpoint': name}
             )
             for k, name in enumerate(names)
         ]
-        found, failed = run_jobs(jobs, checkpoints, config=RolloutConfig(), show_progress=False)
+        found, failed = run_jobs(
+            jobs,
+            checkpoints,
+            config=RolloutConfig(),
+            overwrite=overwrite,
+            show_progress=False,
+        )
         assert not failed and len(found) == len(names)
         return found[0]
 
@@ -78,7 +84,9 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
     (tmp_path / '0' / 'rollouts' / f'{jobs[1].name}.json').write_text('{"settings"')
     run('a')
     assert scored[2:] == [(1, 0)]
-    run('b')
+    with pytest.raises(ConfigError, match="other settings .checkpoint 'a', now 'b'"):
+        run('b')
+    run('b', overwrite=True)
     assert scored[3:] == [(0, 0), (1, 0)]
     # a second checkpoint is imagined alone where the first one's results are there
     run('b', 'c')

@@ -135,6 +135,8 @@ def test_foreign_folder_is_not_overwritten(make_pipeline, episodes, tmp_path):
     (tmp_path / 'out').mkdir()
     (tmp_path / 'out' / 'thesis.tex').write_text('...')
     with pytest.raises(EpisodeError, match='not a bag folder'):
+        replay(make_pipeline(), episodes[0], tmp_path / 'out', overwrite=True)
+    with pytest.raises(EpisodeError, match='exists already'):
         replay(make_pipeline(), episodes[0], tmp_path / 'out')
     assert (tmp_path / 'out' / 'thesis.tex').exists()
 

@@ -29,7 +29,9 @@ def conditions() -> Conditioning:
 
 
 def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
-    augment = AugmentConfig(control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3)
+    augment = AugmentConfig(
+        control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3, start_dropout=0.15
+    )
     out = drop_conditions(conditions(), augment, Draws(0, 0, range(COUNT)))
     gone = {
         name: (getattr(out, name) == 0).flatten(1).all(1)
@@ -38,12 +40,31 @@ def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
     for name, dropped in gone.items():  # a sample is dropped whole or not at all
         assert torch.equal(dropped, (getattr(out, name) == 0).flatten(1).any(1)), name
     assert torch.equal(gone['control'], gone['start_control'])
-    assert torch.equal(gone['reference'], gone['start'])
-    shares = [gone[name].float().mean().item() for name in ('control', 'reference', 'image')]
-    assert shares == pytest.approx([0.1, 0.2, 0.3], abs=0.03)
-    both = (gone['control'] & gone['reference']).float().mean().item()
-    assert both == pytest.approx(0.02, abs=0.01)  # independent: the product
+    names = ('control', 'reference', 'image', 'start')
+    shares = [gone[name].float().mean().item() for name in names]
+    assert shares == pytest.approx([0.1, 0.2, 0.3, 0.15], abs=0.03)
+    for other, product in (('control', 0.02), ('start', 0.03)):  # independent: the product
+        both = (gone[other] & gone['reference']).float().mean().item()
+        assert both == pytest.approx(product, abs=0.012)
     assert (out.text == 1).all()
+
+
+def test_the_start_image_is_in_one_place() -> None:
+    """As `clip_idx` of VideoX-Fun decides: 0 leaves the slot, any other frame the tokens."""
+    frames = torch.rand(3, 2, 3, 1, 1)
+    other = torch.rand(3, 2, 3, 1, 1) + 1
+    slot = frames.unsqueeze(3).repeat(1, 1, 1, 2, 1, 1)
+    parts = {'control': slot, 'start_control': frames, 'start': slot, 'reference': frames}
+    first = Conditioning(**parts).with_one_start()
+    assert torch.equal(first.start, slot) and first.anchor is not None
+    assert not first.anchor.any()
+    anchor = torch.stack([frames[0], other[1], 1.001 * frames[2]])  # the same up to rounding
+    mixed = Conditioning(**parts, anchor=anchor).with_one_start()
+    assert mixed.anchor is not None
+    for index, shows_start in enumerate((True, False, True)):
+        assert mixed.start[index].any() == shows_start
+        assert mixed.anchor[index].any() != shows_start
+    assert torch.equal(mixed.anchor[1], other[1])
 
 
 def test_without_dropout_nothing_is_drawn() -> None:

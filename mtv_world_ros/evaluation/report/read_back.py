@@ -65,9 +65,7 @@ def read_evaluations(folder: Path) -> list[Evaluated]:
         ConfigError: the folder holds no evaluation, or one of another version.
     """
     folder = Path(folder)
-    hint = f"run 'mtv-world evaluate CHECKPOINT DATASET --out {folder}'"
-    if not (folder / 'metrics.json').is_file():
-        raise ConfigError(f"'{folder}' holds no evaluation (metrics.json); {hint}")
+    hint = check_evaluation(folder)
     try:
         metrics = json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
         if 'methods' not in metrics:
@@ -81,6 +79,23 @@ def read_evaluations(folder: Path) -> list[Evaluated]:
     labels = list(metrics['methods'])
     found = [part for part in parts if part.metrics.get('label') in labels]
     return sorted(found, key=lambda part: labels.index(part.metrics['label']))
+
+
+def check_evaluation(folder: Path) -> str:
+    """Returns the command that makes an evaluation in a folder, for other errors.
+
+    Raises:
+        ConfigError: the folder holds none.
+    """
+    hint = f"run 'mtv-world evaluate CHECKPOINT DATASET --out {folder}'"
+    if (folder / 'metrics.json').is_file():
+        return hint
+    if any(folder.glob('episodes/*.json')):
+        raise ConfigError(
+            f"the evaluation in '{folder}' is not finished (no metrics.json); run its command "
+            'again: it goes on where it stopped'
+        )
+    raise ConfigError(f"'{folder}' holds no evaluation (metrics.json); {hint}")
 
 
 def _read(folder: Path, metrics: dict[str, Any]) -> Evaluated:

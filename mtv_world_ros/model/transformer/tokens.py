@@ -18,7 +18,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.transformer.cross_attention import Context
 
 #: where the start image may enter: as reference tokens, in its channel slot, or both
-START_IMAGES = ('both', 'reference', 'channel')
+START_IMAGES = ('both', 'either', 'reference', 'channel')
 
 
 def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:

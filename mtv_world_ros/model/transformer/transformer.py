@@ -57,7 +57,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             cross-attention also where `context` is `none`.
         action_dim: numbers an action, for controls other than `trajectory_video`.
         num_context_tokens: learned tokens in place of the text where `context` is `none`.
-        start_image: where the start image enters: `both`, as `reference` tokens alone, or in its
+        start_image: where the start image enters: `both`, `either` (see
+            `Conditioning.with_one_start`), as `reference` tokens alone, or in its
             `channel` slot alone.
         copies_control: the convolutional decoder may also copy from the trajectory video, where
             that shows the objects themselves (`rendering.object_motion`).

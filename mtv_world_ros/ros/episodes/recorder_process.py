@@ -45,7 +45,7 @@ class Recording:
         logs = self._out / 'logs'
         logs.mkdir(parents=True, exist_ok=True)
         self._log = logs / 'recorder.log'
-        arguments = (str(self._out), *topics, '--overwrite', '--stamp', 'header')
+        arguments = (str(self._out), *topics, '--stamp', 'header')
         command = module_command('episodes.recorder', *arguments)
         self._process = start_process('recorder', command, logs)
         self._peers.wait(self._is_on, f"the recorder; see '{self._log}'", 2 * _TIMEOUT_S)

@@ -1,0 +1,244 @@
+"""Nothing that exists is replaced unasked, a stopped training goes on, mistakes get one line."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import check_free, check_same_settings, share_path, write_json
+
+ROOT = Path(__file__).parents[1]
+EPISODE = share_path('resource', 'demo_episode')
+#: of the preset `small`, made tiny
+TINY = {
+    'transformer': 'num_attention_heads=2 attention_head_dim=12 ffn_dim=32 num_layers=1 '
+    'stem_widths=[8,16,16] frames_per_token=2 freq_dim=16',
+    'video': 'num_frames=2 width=48 height=40',
+    'optimizer': 'batch_size=1 warmup_steps=1',
+}
+SETTINGS = [w for name, v in TINY.items() for x in v.split() for w in ('--set', f'{name}.{x}')]
+
+
+def train_words(out: Path, *more: str) -> list[str]:
+    """A training of seconds on the bundled episode."""
+    words = ['train', str(EPISODE.parent), '--out', str(out), '--dtype', 'float32']
+    return [*words, '--threads', '1', *SETTINGS, *more]
+
+
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which a command refuses."""
+    capsys.readouterr()
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert said.startswith('mtv-world: ') and said.count('\n') == 1, said
+    return said
+
+
+def test_a_file_or_a_folder_that_holds_something_is_replaced_only_when_asked(
+    tmp_path: Path,
+) -> None:
+    check_free(tmp_path / 'new', False)
+    check_free(tmp_path, False)  # empty
+    file = tmp_path / 'report.html'
+    file.write_text('old')
+    for path in (file, tmp_path):
+        with pytest.raises(ConfigError, match='exists; give another --out, or --overwrite'):
+            check_free(path, False)
+        check_free(path, True)
+
+
+def test_results_with_other_settings_are_replaced_only_when_asked(tmp_path: Path) -> None:
+    folder = tmp_path / 'episodes'
+    settings = {'name': 'a (12)', 'steps': 4}
+    check_same_settings(folder, settings, False)
+    write_json(folder / 'one.json', {'settings': {**settings, 'path': 'x'}, 'result': {}})
+    check_same_settings(folder, settings, False)
+    with pytest.raises(
+        ConfigError, match=r'other settings \(steps 4, now 8\); give another --out'
+    ):
+        check_same_settings(folder, {**settings, 'steps': 8}, False)
+    with pytest.raises(ConfigError, match='written by another version'):
+        check_same_settings(folder, {**settings, 'truth': 'ids'}, False)
+    check_same_settings(folder, {'name': 'b'}, True)
+
+
+def test_calibrate_writes_neither_into_the_package_nor_over_a_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(EPISODE.parent), '--out', str(tmp_path / 'out')]
+    said = refused(['calibrate', 'bundled', *words], capsys)
+    assert 'part of the installed package' in said and '--no-store' in said
+    mine = tmp_path / 'mine'
+    mine.mkdir()
+    for name in ('world_model.json', 'success_calibration.json'):
+        shutil.copy(share_path('resource', 'checkpoint') / name, mine)
+    assert "success_calibration.json' exists" in refused(['calibrate', str(mine), *words], capsys)
+
+
+def test_imagined_episodes_and_predictions_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = tmp_path / 'episode_00000' / 'kept'
+    kept.parent.mkdir()
+    kept.write_text('')
+    start = ['--episodes', str(EPISODE), '--out', str(tmp_path)]
+    assert "episode_00000' exists" in refused(['imagine', *start], capsys)
+    offline = ['replay', str(EPISODE), '--offline', '--out', str(kept.parent)]
+    assert "episode_00000' exists" in refused(offline, capsys)
+    assert "episode_00000' exists" in refused(['demo', '--out', str(kept.parent)], capsys)
+    assert kept.is_file()
+
+
+def test_a_report_of_several_evaluations_needs_a_place_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    half = tmp_path / 'half' / 'episodes'
+    half.mkdir(parents=True)
+    (half / 'one.json').write_text('{}')
+    page = tmp_path / 'page.html'
+    page.write_text('old')
+    both = ['report', str(half.parent), str(tmp_path)]
+    assert '2 evaluations go into one page; give --out FILE' in refused(both, capsys)
+    assert 'page.html' in refused([*both, '--out', str(page)], capsys)
+    assert page.read_text() == 'old'
+    assert 'is not finished' in refused(['report', str(half.parent)], capsys)
+
+
+@pytest.mark.parametrize('kind', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_training_and_says_how_to_go_on(kind: int, tmp_path: Path) -> None:
+    out = tmp_path / 'run'
+    words = train_words(out, '--set', 'optimizer.steps=100000', '--save-every', '1000000')
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mtv_world_ros.cli', *words],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
+    end = time.monotonic() + 240
+    log = out / 'log.jsonl'
+    while not (log.is_file() and log.read_text()):
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    process.send_signal(kind)
+    said = process.communicate(timeout=120)[1].splitlines()[-1]
+    assert process.returncode == 128 + kind
+    step = json.loads((out / 'state' / 'state.json').read_text())['step']
+    assert step >= 10
+    assert said.startswith(f'mtv-world: stopped at step {step} of 100000, which is saved in ')
+    again = shlex.split(said.partition('; go on with: ')[2])
+    assert again == ['mtv-world', *words]
+    # the command that it printed goes on, here for two steps more
+    done = subprocess.run(
+        [sys.executable, '-m', 'mtv_world_ros.cli', *again[1:]]
+        + ['--set', f'optimizer.steps={step + 2}'],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f'resumed at step {step}' in done.stderr + done.stdout
+    card = json.loads((out / 'checkpoint' / 'world_model.json').read_text())
+    assert card['trained_on']['steps'] == step + 2
+
+
+@pytest.fixture(scope='module')
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A training of two steps, and what it printed."""
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    out, said = tmp_path_factory.mktemp('trained') / 'run', StringIO()
+    with redirect_stdout(said):
+        assert main(train_words(out, '--set', 'optimizer.steps=2')) == 0
+    return out, said.getvalue()
+
+
+def test_the_evaluation_that_train_prints_runs(trained: tuple[Path, str]) -> None:
+    out, said = trained
+    words = shlex.split(said.partition('evaluate it with: ')[2])
+    assert words[:2] == ['mtv-world', 'evaluate']
+    assert main([*words[1:], '--no-report', '--no-ceiling', '--actions', 'true']) == 0
+    assert (out / 'evaluation_2' / 'metrics.json').is_file()
+
+
+def test_resuming_another_architecture_is_refused_before_anything_is_touched(
+    trained: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = trained
+    before = {path: path.stat().st_mtime_ns for path in out.rglob('*')}
+    more = ['--set', 'optimizer.steps=4']
+    said = refused(train_words(out, *more, '--set', 'transformer.num_layers=2'), capsys)
+    assert 'was trained with transformer.num_layers 1, this preset has 2' in said
+    said = refused(train_words(out, *more, '--views', 'low'), capsys)
+    assert 'transformer.num_views 2, this preset has 1' in said
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob('*')}
+
+
+@pytest.mark.parametrize(
+    ('more', 'message'),
+    [
+        (['--set', 'optimizer.steps=abc'], "optimizer.steps is 'abc'; it must be a whole number"),
+        (['--set', 'optimizer.steps=['], "'[' is not a YAML value"),
+        (['--device', 'gpu'], "device 'gpu' is not known; e.g. cpu, cuda"),
+        (['--init', 'nowhere'], "'nowhere' is not a checkpoint"),
+        pytest.param(
+            ['--device', 'cuda'],
+            "device 'cuda' cannot be used: torch ",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU'),
+        ),
+    ],
+)
+def test_wrong_values_get_one_line(
+    more: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert message in refused(train_words(tmp_path / 'run', *more), capsys)
+    assert not (tmp_path / 'run' / 'state').exists()
+
+
+def test_states_are_saved_by_time_too(tmp_path: Path) -> None:
+    words = train_words(tmp_path, '--set', 'optimizer.steps=3', '--save-minutes', '0')
+    seen = []
+    from mtv_world_ros.training.trainer import Trainer
+
+    save = Trainer.save_state
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, 'save_state', lambda self: (seen.append(self.step), save(self)))
+        assert main(words) == 0
+    assert seen == [1, 2, 3]
+
+
+def test_the_version_is_that_of_package_xml(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(['--version'])
+    assert end.value.code == 0
+    version = capsys.readouterr().out.split()[1]
+    assert f'<version>{version}</version>' in (ROOT / 'package.xml').read_text()
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['trian', 'x'], "there is no command 'trian' (did you mean 'train'?)"),
+        (['evaluate', 'a', 'b', '--out', 'c', '--devise', 'cpu'], "(did you mean '--device'?)"),
+    ],
+)
+def test_what_is_mistyped_gets_its_nearest(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert message in capsys.readouterr().err
