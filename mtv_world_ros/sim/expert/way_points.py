@@ -84,9 +84,7 @@ class WayPointFaults:
         for kind, size in self._variant.sizes:
             edit = _EDITS.get(kind)
             if edit is not None:
-                side = _Side(
-                    yaw, self._sign, self._angle, self._draws, self._openings, self._play
-                )
+                side = _Side(yaw, self._sign, self._angle, self._draws, self._openings, self._play)
                 stops = edit(stops, size, side)
         return stops
 
