@@ -80,6 +80,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Pa
     assert report['chunks'] == 3
     assert report['frames_received'] == report['frames_published'] == 3 * 16 * 2
     assert report['camera_infos_received'] == report['frames_received']
+    assert report['outcome'] == 'success' and report['success'] > 0.5
     for view in ('low', 'high'):
         assert report['views'][view]['j_moving'] > report['views'][view]['j_copy_moving']
     sheet = cv2.imread(str(tmp_path / 'out' / 'contact_sheet.png'))

@@ -21,7 +21,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.pipeline import ObservedEpisode, Pipeline
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
@@ -452,3 +452,97 @@ def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
     episode.instruction = 'pick the red block'
     (chunk,) = episode.extend(part_of(commands(recording, 4.8), 3.2, 4.8))
     assert model.sizes[1:] == [(2, len(chunk.masks.names), *recording.frames.shape[2:4])]
+
+
+# real frames between plans
+
+
+LARGE = replace(SPEC, width=96, height=72)
+
+
+@pytest.fixture(scope='module')
+def large_recording() -> Recording:
+    return load_recording(share_path('resource', 'demo_episode'), LARGE, YAM)
+
+
+@pytest.fixture
+def observed() -> ObservedEpisode:
+    return ObservedEpisode(assemble(CARD, PersistenceWorldModel(LARGE), robot=YAM))
+
+
+def seen_at(recording: Recording, frame: int) -> Observation:
+    return Observation(
+        cameras=recording.cameras,
+        frames=recording.frames[:, frame],
+        positions=recording.positions[frame],
+        stamp_ns=recording.stamp_ns + frame * 200_000_000,
+    )
+
+
+def judge(observed: ObservedEpisode, recording: Recording, frame: int, instruction: str = ''):
+    """The estimate of a plan that does nothing, at a frame."""
+    now = seen_at(recording, frame)
+    stay = JointTrajectory(joint_names=YAM.joint_names, times=[1.6], positions=now.positions[None])
+    episode = observed.begin(now, instruction=instruction or recording.instruction)
+    (chunk,) = episode.extend(stay)
+    assert np.array_equal(chunk.start.frames, now.frames)
+    return chunk.success
+
+
+def live(observed: ObservedEpisode, recording: Recording, first: int, last: int) -> None:
+    for frame in range(first + 1, last):
+        assert observed.is_due(recording.stamp_ns + frame * 200_000_000)
+        observed.see(seen_at(recording, frame))
+
+
+def test_a_grasp_seen_two_plans_ago_counts(
+    observed: ObservedEpisode, large_recording: Recording
+) -> None:
+    """At the recording's end the blocks are stacked: whether a grasp did it, only memory knows."""
+    last = len(large_recording.times) - 1
+    for first, then in ((0, 16), (16, 32), (32, last)):
+        judge(observed, large_recording, first)
+        live(observed, large_recording, first, then)
+    known = judge(observed, large_recording, last)
+    assert known.features['moved'] == 1.0 and known.features['grasp'] > 0.0
+    observed.forget()
+    unknown = judge(observed, large_recording, last)
+    assert unknown.features['moved'] == 0.0
+    assert known.probability > 0.5 > unknown.probability
+
+
+def test_another_instruction_or_a_reset_begins_a_new_episode(
+    observed: ObservedEpisode, large_recording: Recording
+) -> None:
+    def judged(instruction: str = '') -> float:
+        return judge(observed, large_recording, 40, instruction).features['moved']
+
+    def live_again() -> None:
+        observed.forget()
+        judge(observed, large_recording, 0)
+        live(observed, large_recording, 0, 40)
+
+    live_again()
+    assert judged() == 1.0
+    other = f'{large_recording.instruction}.'
+    live_again()
+    assert judged(other) == 0.0  # the same task in other words, told at frame 40
+    live_again()
+    observed.forget()
+    assert judged() == 0.0
+
+
+def test_frames_between_those_of_the_model_and_before_the_first_plan_are_not_kept(
+    observed: ObservedEpisode, large_recording: Recording
+) -> None:
+    start_ns = large_recording.stamp_ns
+    assert not observed.is_due(start_ns)
+    judge(observed, large_recording, 0)
+    due = [ms for ms in range(1, 1000, 33) if observed.is_due(start_ns + ms * 1_000_000)]
+    assert due[0] == pytest.approx(200, abs=33)
+    assert not observed.is_behind
+    live(observed, large_recording, 0, 1 + LARGE.num_frames)
+    assert observed.is_behind
+    observed.catch_up()
+    assert not observed.is_behind
+    assert not observed.is_due(start_ns + LARGE.num_frames * 200_000_000 + 100_000_000)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.pipeline import ObservedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.replay.prediction_writer import ERROR, OK, PredictionWriter
 
@@ -94,6 +95,9 @@ def replay_offline(
 ) -> ReplaySummary:
     """Imagines every joint trajectory of an episode from the newest frames before it.
 
+    The estimates remember the episode's recorded frames since its first trajectory, as the node's
+    do in mode observe.
+
     Frames that the next trajectory supersedes are left out. What is wrong with one trajectory
     rejects that one alone, with its reason in the summary and in `/world_model/report`.
 
@@ -119,20 +123,21 @@ def replay_offline(
     if not episode.trajectories:
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
+    limits, observed = limits or ReplayLimits(), ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
     bar = tqdm(total=len(starts), unit='trajectory', disable=not show_progress)
     with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
         for index, (stamp, trajectory) in enumerate(episode.trajectories):
             until = starts[index + 1] if index + 1 < len(starts) else None
             try:
-                observation = observe(episode, pipeline, stamp, limits or ReplayLimits())
+                observation = observe(episode, pipeline, stamp, limits)
                 shifted = _shifted(trajectory, stamp, observation.stamp_ns)
-                imagined = pipeline.begin(
-                    observation,
-                    instruction=instruction_at(episode, stamp),
-                    seed=seed + 1000 * index,
-                    num_inference_steps=num_inference_steps,
-                )
+                before = starts[index - 1] if index else stamp
+                for seen in _seen_between(episode, pipeline, before, stamp, limits):
+                    observed.see(seen)
+                imagined = observed.begin(observation, instruction=instruction_at(episode, stamp))
+                imagined.seed = seed + 1000 * index
+                imagined.num_inference_steps = num_inference_steps
                 _write_rollout(writer, imagined.extend(shifted), summary, until, spec.fps)
             except MtvWorldError as error:
                 summary.rejected.append((stamp, str(error)))
@@ -208,6 +213,16 @@ def observe(
         positions=_positions(episode, pipeline, stamp_ns, limits),
         stamp_ns=min(stamps),
     )
+
+
+def _seen_between(
+    episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int, limits: ReplayLimits
+) -> Iterator[Observation]:
+    """What was seen between two moments, once a frame of the model."""
+    period_ns = round(1e9 / pipeline.spec.fps)
+    for stamp_ns in range(begin_ns + period_ns, end_ns, period_ns):
+        with suppress(ObservationError):
+            yield observe(episode, pipeline, stamp_ns, limits)
 
 
 def _positions(

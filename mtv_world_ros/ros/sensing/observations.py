@@ -88,6 +88,11 @@ class ObservationBuffer:
         """Names of the views, in the model's order."""
         return tuple(self._images)
 
+    @property
+    def newest_stamp_ns(self) -> int:
+        """The newest moment that every view has seen [ns]; 0 = none yet."""
+        return min(images[-1][0] if images else 0 for images in self._images.values())
+
     def add_image(self, view: str, message: Image | CompressedImage) -> None:
         """Stores an image.
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import sys
 import time
 
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -58,7 +60,7 @@ class WorldModelNode(Node):
             width=self._spec.width,
             height=self._spec.height,
             limits=self.settings,
-            on_image=lambda view, message: self._fidelity.see(view, message),
+            on_image=self._on_image,
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, self.settings, lambda: self._worker.last_scene
@@ -111,6 +113,15 @@ class WorldModelNode(Node):
         self._worker.close()
         self._fidelity.close()
         self.destroy_node()
+
+    def _on_image(self, view: str, message: Image | CompressedImage) -> None:
+        """Hands real images on; an observation of all views once a frame of the model."""
+        self._fidelity.see(view, message)
+        if self._worker.sees(self._buffer.newest_stamp_ns):
+            with suppress(Rejection):  # the plan that comes too early is told
+                self._worker.see(
+                    self._buffer.observe(self.get_clock().now().nanoseconds).observation
+                )
 
     def _on_instruction(self, message: String) -> None:
         self._maker.instruction = message.data

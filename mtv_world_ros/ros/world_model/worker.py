@@ -9,9 +9,9 @@ from threading import Condition, Thread
 import time
 import traceback
 
-from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.pipeline import ImaginedEpisode, ObservedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO
@@ -121,7 +121,7 @@ class RolloutWorker:
     """
 
     def __init__(self, pipeline: Pipeline, notify: Callable[[], None]) -> None:
-        self._pipeline = pipeline
+        self._pipeline, self._observed = pipeline, ObservedEpisode(pipeline)
         self._notify = notify
         self._changed = Condition()
         self._pending: Request | None = None
@@ -164,6 +164,16 @@ class RolloutWorker:
             self._pending = request
             self._changed.notify_all()
 
+    def sees(self, stamp_ns: int) -> bool:
+        """Tells whether a real observation of this time is wanted by `see`."""
+        return self._observed.is_due(stamp_ns)
+
+    def see(self, observation: Observation) -> None:
+        """Takes a real observation between plans; later plans are judged with it in mind."""
+        self._observed.see(observation)
+        with self._changed:
+            self._changed.notify_all()
+
     def run_between(self, job: Callable[[], None]) -> None:
         """Runs a job that must not raise, never during a rollout; it replaces a waiting one."""
         with self._changed:
@@ -182,6 +192,7 @@ class RolloutWorker:
             self._abandoned = self._running is not None
             self._pending = None
             self._episode, self._last = None, None
+            self._observed.forget()
 
     def take(self) -> list[Result]:
         """Returns the results since the last call, in order."""
@@ -211,15 +222,29 @@ class RolloutWorker:
     def _next(self) -> Request | None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._between or self._pending)
+                self._changed.wait_for(self._has_work)
                 if self._closing:
                     return None
                 job, self._between = self._between, None
+                if job is None and self._pending is None:
+                    job = self._catch_up
                 if job is None:
                     self._running, self._pending = self._pending, None
                     self._known = []
                     return self._running
             job()
+
+    def _has_work(self) -> bool:
+        is_asked = self._closing or self._between is not None or self._pending is not None
+        return is_asked or self._observed.is_behind
+
+    def _catch_up(self) -> None:
+        """Looks at real frames while no rollout runs; what fails here is forgotten."""
+        try:
+            self._observed.catch_up()
+        except Exception:
+            self._observed.forget()
+            traceback.print_exc()
 
     def _should_stop(self) -> bool:
         with self._changed:
@@ -287,7 +312,14 @@ class RolloutWorker:
             if request.imagine and self._episode is not None and self._last is not None:
                 return self._last, self._episode
         scene = request.scene
-        return scene, self._pipeline.begin(scene.observation, should_stop=self._should_stop)
+        if request.imagine:
+            episode = self._pipeline.begin(scene.observation)
+        else:
+            episode = self._observed.begin(
+                scene.observation, instruction=request.instruction, objects=request.objects
+            )
+        episode.should_stop = self._should_stop
+        return scene, episode
 
     def _put(self, result: Result) -> None:
         self._results.append(result)
