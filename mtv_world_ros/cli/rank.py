@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
-agree. DIR gets ranking.json, ranking.md, ranking.html and two files for every rollout: the result,
-and the last real frames over the last imagined ones. Running the same command again goes on where
-it was stopped.
+agree. DIR gets ranking.json, ranking.md, ranking.html, flips.png (six commands that change what
+happens, real and imagined) and two files for every rollout: the result, and the last real frames
+over the last imagined ones. Running the same command again goes on where it was stopped.
 """
 _EPILOG = """\
 A policy is `expert`, followed by faults with their sizes, e.g. expert-noise-0.03-late-0.3; the
@@ -89,11 +89,13 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.ranking.flip_sheet import flip_sheet
     from mtv_world_ros.ranking.optimism import Optimism
     from mtv_world_ros.ranking.rank import FOLDER, run_jobs
     from mtv_world_ros.ranking.report import console, write_ranking
     from mtv_world_ros.ranking.runner import RolloutConfig
     from mtv_world_ros.ranking.summary import Summary
+    from mtv_world_ros.sim.collect.contact_sheet import write_sheet
 
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
@@ -133,6 +135,10 @@ def _rank(arguments: argparse.Namespace) -> int:
     path, *_ = [
         write_ranking(summary, out) for summary, out in zip(summaries, folders, strict=True)
     ]
+    for name, out, results in zip(names, folders, found, strict=True):
+        sheet = flip_sheet(results, optimism[name].flips, out / FOLDER)
+        if sheet is not None:
+            write_sheet(out / 'flips.png', sheet)
     print(f'{console(summaries[0])}\n\nreport: {path}')
     return 0
 

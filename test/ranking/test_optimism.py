@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.ranking.flip_sheet import flip_sheet
 from mtv_world_ros.ranking.optimism import (
     areas_under_roc,
     find_flips,
@@ -112,6 +113,12 @@ def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_pat
     real, imagined = kept
     np.testing.assert_array_equal(real, np.concatenate(list(left), axis=1))
     np.testing.assert_array_equal(imagined, np.concatenate(list(placed), axis=1))
+    flips = find_flips(results, tmp_path)
+    sheet = flip_sheet(results, flips, tmp_path)
+    one = flip_sheet(results, flips, tmp_path, count=1)
+    assert sheet is not None and one is not None and len(sheet) == 2 * len(one)
+    assert np.array_equal(sheet[: len(one)], one)
+    assert flip_sheet(results[:1], {}, tmp_path) is None
 
 
 def test_pixels_that_are_alike_in_both_ends_do_not_count():

@@ -44,7 +44,8 @@ def _small(frame: ByteArray, width: int) -> ByteArray:
     return np.pad(small, ((0, 2), (0, 2), (0, 0)), constant_values=_PAPER).astype(np.uint8)
 
 
-def _titled(text: str, picture: ByteArray) -> ByteArray:
+def titled(text: str, picture: ByteArray) -> ByteArray:
+    """Returns a picture (H, W, 3) with a line of text above it."""
     line = np.full((_LINE, picture.shape[1], 3), _PAPER, np.uint8)
     cv2.putText(line, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
     return np.concatenate([line, picture])
@@ -55,7 +56,7 @@ def _row(out: Path, pair: Sequence[EpisodeEntry | None], num_frames: int, width:
     strips = [entry and film_strip(out / entry.name, num_frames, width) for entry in pair]
     shape = next(strip.shape for strip in strips if strip is not None)
     blocks = [
-        _titled(
+        titled(
             f'{entry.name}: {entry.instruction} ({entry.outcome})' if entry else f'no {outcome}',
             np.full(shape, 235, np.uint8) if strip is None else strip,
         )
