@@ -55,6 +55,7 @@ setup(
         'pydantic>=2.10',
         'rosbags>=0.11',
         'safetensors>=0.8',
+        'simplejpeg>=1.8',
         'tokenizers>=0.22',
         'torch>=2.6',
         'tqdm>=4.66',

@@ -24,6 +24,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails, PydanticCustomError
 import yaml
 
+from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
 
 Item = TypeVar('Item')
@@ -208,7 +209,7 @@ def read_yaml(
         ConfigError: it cannot be read, or is not YAML.
     """
     try:
-        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        return parse_yaml(read_text(path, 'yaml_bytes'))
     except FileNotFoundError as missing:
         raise error(f"{what} '{path}' does not exist; set '{setting}' to one") from missing
     except yaml.YAMLError as broken:

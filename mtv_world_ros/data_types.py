@@ -91,6 +91,12 @@ class CameraModel:
                 f"'{self.distortion_model}', expected one of "
                 f'{DISTORTION_MODELS[self.distortion_model]}'
             )
+        for name in ('T_mount_camera', 'distortion'):
+            if not np.isfinite(getattr(self, name)).all():
+                raise CalibrationError(
+                    f"camera '{self.view}' has {name} {getattr(self, name).tolist()}; every value "
+                    'must be finite'
+                )
         if not (np.isfinite(self.K).all() and self.K[0, 0] > 0 and self.K[1, 1] > 0):
             raise CalibrationError(
                 f"camera '{self.view}' is not calibrated: K = {self.K.tolist()}; fx and fy must "

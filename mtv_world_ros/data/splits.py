@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import json
 from pathlib import Path
 from typing import Any
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 
@@ -82,7 +82,7 @@ def _card(dataset: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        card = json.loads(file.read_text(encoding='utf-8'))
+        card = read_json(file)
         splits = card.get('splits', {})
         entries = card.get('episodes', [])
         if not isinstance(splits, dict) or any('name' not in entry for entry in entries):

@@ -13,6 +13,7 @@ from mtv_world_ros.config import check_keys, read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.files import write_whole
+from mtv_world_ros.geometry.camera import check_plausible
 from mtv_world_ros.geometry.transforms import is_rigid, pose
 
 _KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
@@ -60,7 +61,7 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
 def _camera(view: str, row: Any, where: str) -> CameraModel:
     check_keys(row, _KEYS, _REQUIRED, where, error=CalibrationError)
     try:
-        return CameraModel(
+        camera = CameraModel(
             view=view,
             width=int(row['width']),
             height=int(row['height']),
@@ -70,7 +71,9 @@ def _camera(view: str, row: Any, where: str) -> CameraModel:
             mount_link=str(row['mount_link']),
             T_mount_camera=_pose(row),
         )
-    except (ValueError, TypeError, CalibrationError) as error:
+        check_plausible(camera)
+        return camera
+    except (ValueError, TypeError, ArithmeticError, CalibrationError) as error:
         raise CalibrationError(f'{where}: {error}') from error
 
 

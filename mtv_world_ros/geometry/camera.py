@@ -20,6 +20,12 @@ from mtv_world_ros.geometry.transforms import inverse
 
 #: nearest depth that is projected [m]
 MIN_DEPTH_M = 0.01
+#: focal lengths of real lenses, in lengths of the image's longer side
+_FOCAL_RANGE = (0.05, 100.0)
+_MOST_PIXELS = 20_000
+#: cameras are nearer to what carries them [m]
+_FARTHEST_M = 100.0
+_LARGEST_COEFFICIENT = 1e4
 #: condition number from which on rays count as parallel
 _PARALLEL = 1e9
 
@@ -128,6 +134,50 @@ def _check_consistent(informed: CameraModel) -> None:
             f"camera_info of view '{informed.view}' contradicts itself: K = "
             f'{informed.K.tolist()} for images of {size[0]}x{size[1]} (is it for another image '
             'size?); its last row must be 0 0 1 and cx, cy inside the image'
+        )
+    check_plausible(informed)
+    _check_lens(informed)
+
+
+def check_plausible(camera: CameraModel) -> None:
+    """Checks that intrinsics and pose can be those of a real camera.
+
+    Raises:
+        CalibrationError: focal lengths, a distortion or a mount that no camera has.
+    """
+    where = f"camera '{camera.view}'"
+    size = np.array([camera.width, camera.height])
+    focal = camera.K[[0, 1], [0, 1]]
+    if (camera.width > _MOST_PIXELS) or (camera.height > _MOST_PIXELS):
+        raise CalibrationError(f'{where} has a size of {size} px; at most {_MOST_PIXELS}')
+    low, high = _FOCAL_RANGE
+    if ((focal < low * size.max()) | (focal > high * size.max())).any():
+        raise CalibrationError(
+            f'{where} has focal lengths {focal.tolist()} px for images of {size[0]}x{size[1]}; '
+            f'{low * size.max():g} to {high * size.max():g} px are those of real lenses'
+        )
+    if np.abs(camera.T_mount_camera[:3, 3]).max() > _FARTHEST_M:
+        raise CalibrationError(
+            f'{where} is {camera.T_mount_camera[:3, 3].tolist()} m from its mount; at most '
+            f'{_FARTHEST_M:g} m (is the unit metres?)'
+        )
+    if (np.abs(camera.distortion) > _LARGEST_COEFFICIENT).any():
+        raise CalibrationError(
+            f'{where} has distortion coefficients {camera.distortion.tolist()}; no lens has any '
+            f'above {_LARGEST_COEFFICIENT:g}'
+        )
+
+
+def _check_lens(camera: CameraModel) -> None:
+    """Refuses a distortion that does not even show what lies around the middle of the image."""
+    size = np.array([camera.width, camera.height])
+    corners = (size - 1) * np.array([[x, y] for x in (0.25, 0.75) for y in (0.25, 0.75)])
+    with np.errstate(all='ignore'):
+        rays = unproject(camera, corners)
+    if not np.isfinite(rays).all():
+        raise CalibrationError(
+            f"camera '{camera.view}' has distortion coefficients {camera.distortion.tolist()} of "
+            f"'{camera.distortion_model}', which fold the middle of the image; calibrate again"
         )
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
+from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
@@ -31,13 +34,14 @@ def match_joints(
         TrajectoryError: joints named twice or missing, velocities that are not finite.
     """
     given = trajectory.joint_names
+    _check_size(trajectory)
     if trajectory.velocities is not None and not np.isfinite(trajectory.velocities).all():
         point, joint = np.argwhere(~np.isfinite(trajectory.velocities))[0]
         raise TrajectoryError(
             f"the velocity of joint '{given[joint]}' is not finite at point {point}; give numbers "
             'or leave all velocities out'
         )
-    doubled = sorted({name for name in given if given.count(name) > 1})
+    doubled = sorted(name for name, count in Counter(given).items() if count > 1)
     if doubled:
         raise TrajectoryError(f'joints {doubled} are named more than once')
     missing = [name for name in robot.joint_names if name not in given]
@@ -56,6 +60,14 @@ def match_joints(
         if trajectory.velocities is None
         else _pick(trajectory.velocities, given, robot, np.zeros(len(robot.joint_names))),
     )
+
+
+def _check_size(trajectory: JointTrajectory) -> None:
+    try:
+        check_limit('joint_names', len(trajectory.joint_names), 'the trajectory')
+        check_limit('trajectory_points', len(trajectory.times), 'the trajectory')
+    except LimitError as error:
+        raise TrajectoryError(str(error)) from error
 
 
 def _pick(

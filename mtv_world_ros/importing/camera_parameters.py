@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, ValidationInfo
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import Pair, Schema
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
@@ -194,7 +194,7 @@ def _formatted(name: str, episode_index: int, where: str) -> str:
 
 def _read_json(file: Path, where: str) -> Any:
     try:
-        return json.loads(file.read_text(encoding='utf-8'))
+        return read_json(file)
     except OSError as error:
         raise CalibrationError(f"{where}: cannot read '{file}': {error}") from error
     except ValueError as error:

@@ -17,6 +17,7 @@ from av.container import InputContainer
 import cv2
 import numpy as np
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 
@@ -165,7 +166,7 @@ class LeRobotDataset:
         if not file.is_file():
             raise EpisodeError(f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there")
         try:
-            info = json.loads(file.read_text(encoding='utf-8'))
+            info = read_json(file)
         except ValueError as error:
             raise EpisodeError(f"'{file}' is not JSON: {error}") from error
         if not isinstance(info, Mapping):

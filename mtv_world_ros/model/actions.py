@@ -14,6 +14,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest, TrainingError
 
@@ -201,7 +202,7 @@ class ActionEncoding:
             CheckpointError: a file is missing, broken, or of another control.
         """
         try:
-            found = json.loads((folder / STATISTICS).read_text())
+            found = read_json(folder / STATISTICS)
             if found['control'] != control:
                 raise CheckpointError(
                     f"'{folder / STATISTICS}' is of control '{found['control']}', "
@@ -223,7 +224,7 @@ class ActionEncoding:
 
 
 def _load_tokenizer(folder: Path) -> Any:
-    return FastTokenizer.from_json(json.loads((folder / TOKENIZER).read_text(encoding='utf-8')))
+    return FastTokenizer.from_json(read_json(folder / TOKENIZER))
 
 
 def collate(encoded: Sequence[np.ndarray]) -> np.ndarray:

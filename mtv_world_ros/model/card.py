@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import expected, ListOf, Positive, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError
@@ -113,8 +113,8 @@ def read_card(folder: Path) -> dict[str, Any]:
             "or set 'checkpoint' to a folder that has it"
         )
     try:
-        card = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        card = read_json(path)
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
     check_card(card, path)
     return card

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import torch
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
@@ -165,6 +166,9 @@ def _fill(module: Any, folder: Path) -> None:
 
 def _config(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text())
-    except (OSError, json.JSONDecodeError) as error:
+        values = read_json(file)
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
+    if not isinstance(values, dict):
+        raise CheckpointError(f"'{file}' cannot be loaded: it must hold keys and values")
+    return values

@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import nn, Tensor
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.card import CARD
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
@@ -219,7 +220,10 @@ class Adapters:
     def _check_base(self, path: Path) -> None:
         file = path / BASE_FILE
         mine = _base(self._transformer)
-        theirs = json.loads(file.read_text()) if file.is_file() else mine
+        try:
+            theirs = dict(read_json(file)) if file.is_file() else mine
+        except (OSError, ValueError, TypeError) as error:
+            raise CheckpointError(f"'{file}' cannot be read: {error}") from error
         for key, value in mine.items():
             if theirs.get(key) != value:
                 raise CheckpointError(

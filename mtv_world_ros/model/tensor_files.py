@@ -14,6 +14,7 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
@@ -107,10 +108,10 @@ def _check_shards(files: list[Path]) -> None:
 
 def _open_index(path: Path) -> dict[str, StoredTensor]:
     try:
-        places: dict[str, str] = json.loads(path.read_text())['weight_map']
-    except (OSError, ValueError, KeyError) as error:
+        places: dict[str, str] = read_json(path)['weight_map']
+        files = sorted({path.parent / Path(name).name for name in places.values()})
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CheckpointError(f"'{path}' is no index of shards: {error}") from error
-    files = sorted({path.parent / name for name in places.values()})
     missing = sorted(file.name for file in files if not file.is_file())
     if missing:
         raise CheckpointError(

@@ -9,6 +9,7 @@ from math import exp, isfinite, nan
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, nearest
 from mtv_world_ros.files import write_whole
 
@@ -194,7 +195,7 @@ def _load(path: Path, kind: type[Record]) -> Record | None:
     if not path.is_file():
         return None
     try:
-        values = json.loads(path.read_text(encoding='utf-8'))
+        values = read_json(path)
         _check_keys(values, kind)
         return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
     except (OSError, ValueError, TypeError) as error:

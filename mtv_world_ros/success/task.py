@@ -21,6 +21,8 @@ from mtv_world_ros.vision.describers.describer import ends_phrase
 GRIPPERS = ('open', 'any')
 #: `final` means true in each of this many last samples (0.5 s at 10 Hz)
 HELD_SAMPLES = 5
+#: characters of an object's name in an instruction: what matches it takes bounded time
+_LONGEST_NAME = 64
 #: keys of relations whose values are picture files by view, and what reads them
 PICTURES = {'pictures': load_pictures, 'regions': load_regions}
 
@@ -92,9 +94,8 @@ class TaskSpec:
 
     def bind(self, instruction: str) -> dict[str, str] | None:
         """Returns the placeholders' objects if the instruction fits the template, else None."""
-        pattern = re.sub(
-            r'\\\{(\w+)\\\}', r'(?P<\1>[\\w -]+?)', re.escape(self.instruction.lower())
-        )
+        name = rf'(?P<\1>[\\w -]{{1,{_LONGEST_NAME}}}?)'
+        pattern = re.sub(r'\\\{(\w+)\\\}', name, re.escape(self.instruction.lower()))
         found = re.fullmatch(pattern, ' '.join(instruction.lower().split()).rstrip('.! '))
         if found is None:
             return None

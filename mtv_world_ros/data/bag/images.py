@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
+import zlib
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+import simplejpeg
 
+from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ObservationError
 
@@ -20,7 +24,13 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     'mono8': (1, cv2.COLOR_GRAY2RGB),
 }
 #: signatures at start and end of JPEG and PNG; decoders fill the rest of a cut file with grey
-_SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', b'\x89PNG': b'IEND'}
+_PNG = b'\x89PNG'
+_SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', _PNG: b'IEND'}
+#: JPEG markers: frame headers, and a scan
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_SCAN = b'\xff\xda'
+#: warning of a decoder that lost nothing
+_HARMLESS = 'extraneous bytes before marker 0xd9'
 #: largest padding after the end: some cameras pad their files
 _MAX_PADDING = 4096
 
@@ -36,6 +46,10 @@ def check_raw(*, encoding: str, height: int, width: int, step: int, num_bytes: i
             f"image encoding '{encoding}' is not supported; supported are {', '.join(ENCODINGS)}"
         )
     channels = ENCODINGS[encoding][0]
+    try:
+        check_limit('image_pixels', width * height, f'an image of {width}x{height}')
+    except LimitError as error:
+        raise ObservationError(str(error)) from error
     if height < 1 or width < 1 or step < channels * width:
         raise ObservationError(
             f'image of {width}x{height} {encoding} has a step of {step} bytes, expected at least '
@@ -66,7 +80,7 @@ def raw_to_rgb(
 
 
 def check_compressed(layout: str, data: NDArray[np.uint8]) -> None:
-    """Checks the fields of a sensor_msgs/CompressedImage by the data's signature.
+    """Checks the fields of a sensor_msgs/CompressedImage by the data's signature and header.
 
     Args:
         layout: the message's `format`, e.g. `rgb8; jpeg compressed bgr8`.
@@ -90,6 +104,7 @@ def check_compressed(layout: str, data: NDArray[np.uint8]) -> None:
         raise ObservationError(
             f"compressed image of format '{layout}' holds depth; supported are 8-bit colours"
         )
+    _check_size(layout, data)
 
 
 def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
@@ -98,6 +113,9 @@ def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
     Raises:
         ObservationError: as `check_compressed`, or the file is damaged.
     """
+    if data[:4].tobytes() != _PNG:
+        check_compressed(layout, data)
+        return _check_jpeg(layout, data)
     bgr = _decode(layout, data, cv2.IMREAD_COLOR)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -118,9 +136,70 @@ def compressed_to_ids(layout: str, data: NDArray[np.uint8]) -> ByteArray:
 
 def _decode(layout: str, data: NDArray[np.uint8], mode: int) -> NDArray[Any]:
     check_compressed(layout, data)
+    if data[:4].tobytes() != _PNG:
+        _check_jpeg(layout, data)
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise ObservationError(
-            f"compressed image of format '{layout}' ({len(data)} bytes) is damaged"
-        )
+        raise _damaged(layout, data)
     return image
+
+
+def _check_jpeg(layout: str, data: NDArray[np.uint8]) -> ByteArray:
+    """(H, W, 3) RGB; a decoder's warning that data are missing counts as damage."""
+    content = data.tobytes()
+    try:
+        return simplejpeg.decode_jpeg(content, 'RGB')
+    except ValueError as error:
+        if _HARMLESS in str(error):  # many USB cameras write a byte too much
+            return simplejpeg.decode_jpeg(content, 'RGB', strict=False)
+        raise _damaged(layout, data, f': {error}') from error
+
+
+def _damaged(layout: str, data: NDArray[np.uint8], why: str = '') -> ObservationError:
+    return ObservationError(
+        f"compressed image of format '{layout}' ({len(data)} bytes) is damaged{why}"
+    )
+
+
+def _check_size(layout: str, data: NDArray[np.uint8]) -> None:
+    """Reads width and height from the file's header, before anything is decoded."""
+    try:
+        check_limit('image_bytes', len(data), 'the file')
+        content = data.tobytes()
+        width, height = (_png_size if content.startswith(_PNG) else _jpeg_size)(content)
+        check_limit('image_pixels', width * height, f'an image of {width}x{height}')
+        if not content.startswith(_PNG):
+            check_limit('jpeg_scans', content.count(_SCAN), 'the file')
+    except LimitError as error:
+        raise ObservationError(f"compressed image of format '{layout}': {error}") from error
+    except (struct.error, IndexError) as error:
+        raise _damaged(layout, data, ': it has no header') from error
+
+
+def _png_size(content: bytes) -> tuple[int, int]:
+    """Width and height [px]; IndexError where a part of the file does not match its checksum."""
+    position, kind = 8, b''
+    while kind != b'IEND':
+        length, kind = struct.unpack_from('>I4s', content, position)
+        end = position + 8 + length
+        (crc,) = struct.unpack_from('>I', content, end)
+        if zlib.crc32(content[position + 4 : end]) != crc:
+            raise IndexError(kind)
+        position = end + 4
+    return struct.unpack_from('>II', content, 16)
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Width and height [px] of the frame header."""
+    position = 2
+    while True:
+        marker = content[position + 1]
+        if content[position] != 0xFF:
+            raise IndexError(position)
+        if marker in _FRAMES:
+            height, width = struct.unpack_from('>HH', content, position + 5)
+            return width, height
+        if marker == 0xFF:  # fill
+            position += 1
+        else:
+            position += 2 + struct.unpack_from('>H', content, position + 2)[0]

@@ -27,6 +27,11 @@ STRING = 'std_msgs/msg/String'
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 
 NANO = 1_000_000_000
+#: what the reader of generated code raises for bytes that are no such message
+_UNREADABLE = (
+    SerdeError, struct.error, ValueError, LookupError, TypeError, ArithmeticError, MemoryError,
+    AssertionError,
+)  # fmt: skip
 #: CameraInfo's names of the distortion models that are called otherwise here
 _ROS_DISTORTION = {'none': 'plumb_bob'}
 
@@ -91,7 +96,7 @@ def deserialize(msgtype: str, data: bytes) -> Any:
         parsed = store.get_msgdef(msgtype)
         read = parsed.deserialize_cdr_le if data[1] else parsed.deserialize_cdr_be
         return read(memoryview(data)[4:], 0, parsed.cls, store)[0]
-    except (SerdeError, struct.error, ValueError, IndexError) as error:
+    except _UNREADABLE as error:
         raise EpisodeError(
             f'{len(data)} bytes do not hold a whole {msgtype} message ({error})'
         ) from error

@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from mtv_world_ros.bounded_input import parse_yaml
+
 VERSION = 9
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
@@ -52,7 +54,7 @@ def dump_qos(qos: Qos) -> str:
 def parse_qos(text: str) -> Qos:
     """The first profile of such a list; the default where it cannot be read."""
     try:
-        entry = yaml.safe_load(text)[0]
+        entry = parse_yaml(text)[0]
         words = {key: entry[key] for key in ('reliability', 'durability', 'history')}
         if all(isinstance(word, str) for word in words.values()):
             return Qos(**words, depth=int(entry['depth']))

@@ -17,15 +17,16 @@ from mcap.records import Channel, Metadata, Schema
 import yaml
 import zstandard
 
+from mtv_world_ros.bounded_input import limits, parse_yaml, PREFIX, read_bytes
 from mtv_world_ros.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<QQQII')
-#: read of a chunk that claims to be longer than the file
-_MAX_CHUNK_BYTES = 64 * 1024 * 1024
-_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_READ_BYTES = 2**20
+#: records that are looked into
+_KNOWN = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 
 
 class BagMessage(NamedTuple):
@@ -44,6 +45,9 @@ class BagMessage(NamedTuple):
     stamp_ns: int
     data: bytes
     publish_ns: int = 0
+
+
+_MORE = f'the environment variable {PREFIX}CHUNK_BYTES allows more'
 
 
 class _Cut(Exception):
@@ -73,6 +77,7 @@ class BagReader:
         self.custom_data: dict[str, str] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
+        self._most_bytes = limits().chunk_bytes
         self._files = self._find_files()
 
     def topics(self) -> dict[str, str]:
@@ -116,14 +121,17 @@ class BagReader:
         if not self.path.is_dir():
             raise EpisodeError(f"there is no episode '{self.path}'")
         information = self._read_information()
-        self.custom_data = {
-            str(key): str(text) for key, text in (information.get('custom_data') or {}).items()
-        }
-        named = [self.path / Path(n).name for n in information.get('relative_file_paths') or []]
+        custom, paths = (information.get(key) for key in ('custom_data', 'relative_file_paths'))
+        if isinstance(custom, Mapping):
+            self.custom_data = {str(key): str(text) for key, text in custom.items()}
+        names = paths if isinstance(paths, list) else []
+        named = [self.path / Path(name).name for name in names if isinstance(name, str) and name]
         for file in named:
             if not file.is_file():
                 self._problem(f"'{file}' is named in metadata.yaml but is not there")
-        files = [file for file in named if file.is_file()] or sorted(self.path.glob('*.mcap'))
+        files = [file for file in named if file.is_file()] or [
+            file for file in sorted(self.path.glob('*.mcap')) if file.is_file()
+        ]
         if not files:
             self._raise_no_files()
         return [_check_storage(file) for file in files]
@@ -134,9 +142,9 @@ class BagReader:
             self._problem(f"'{self.path}' has no metadata.yaml (the recorder was killed?)")
             return {}
         try:
-            content = yaml.load(file.read_bytes(), Loader=_YAML_LOADER)  # noqa: S506
+            content = parse_yaml(read_bytes(file, 'yaml_bytes'))
             return dict(content['rosbag2_bagfile_information'])
-        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        except (yaml.YAMLError, OSError, LookupError, TypeError, ValueError) as error:
             reason = ' '.join(str(error).split())
             self._problem(f"'{file}' is not rosbag2 metadata and was ignored ({reason})")
             return {}
@@ -160,7 +168,7 @@ class BagReader:
             raise EpisodeError(f"'{file}' is not an MCAP file: it starts with {magic!r}")
         for opcode, body in self._records(stream, file, size):
             if opcode == Opcode.CHUNK:
-                for inner, part in _split(_decompress(body, stream.tell())):
+                for inner, part in _split(_decompress(body, stream.tell(), self._most_bytes)):
                     yield from self._take(inner, part, topics)
             else:
                 yield from self._take(opcode, body, topics)
@@ -181,9 +189,14 @@ class BagReader:
                     )
                     return
                 if opcode == Opcode.CHUNK:
-                    yield opcode, stream.read(_MAX_CHUNK_BYTES)
+                    yield opcode, stream.read(self._most_bytes)
                 raise _Cut(f'no whole record at byte {start} of {size}')
             data_ended = data_ended or opcode == Opcode.DATA_END
+            if opcode not in _KNOWN:
+                stream.seek(length, io.SEEK_CUR)
+                continue
+            if length > self._most_bytes:
+                raise _Cut(f'the record at byte {start} has {length} bytes; {_MORE}')
             yield opcode, stream.read(length)
 
     def _take(
@@ -276,11 +289,13 @@ def _split(records: bytes) -> Iterator[tuple[int, bytes]]:
         position += length
 
 
-def _decompress(body: bytes, end: int) -> bytes:
-    """Records of a chunk; as many as there are if the chunk was cut."""
+def _decompress(body: bytes, end: int, most: int) -> bytes:
+    """Records of a chunk; as many as there are if the chunk was cut; never more than it states."""
     if len(body) < _CHUNK.size:
         return b''
     _, _, size, crc, name_length = _CHUNK.unpack_from(body)
+    if size > most:
+        raise _Cut(f'the chunk before byte {end} holds {size} bytes; {_MORE}')
     name_end = _CHUNK.size + name_length
     compression = body[_CHUNK.size : name_end]
     whole = len(body) >= name_end + 8
@@ -288,7 +303,7 @@ def _decompress(body: bytes, end: int) -> bytes:
         (length,) = struct.unpack_from('<Q', body, name_end)
         whole = len(body) == name_end + 8 + length
     try:
-        records = _inflate(compression, body[name_end + 8 :])
+        records = _inflate(compression, body[name_end + 8 :], size + 1)
     except (zstandard.ZstdError, RuntimeError) as error:
         raise _Cut(f'the chunk before byte {end} cannot be decompressed ({error})') from error
     damaged = len(records) != size or (crc and zlib.crc32(records) != crc)
@@ -297,13 +312,21 @@ def _decompress(body: bytes, end: int) -> bytes:
     return records
 
 
-def _inflate(compression: bytes, data: bytes) -> bytes:
-    if not compression:
+def _inflate(compression: bytes, data: bytes, most: int) -> bytes:
+    """At most so many bytes of the content."""
+    if not compression or not data:
         return data
     if compression == b'zstd':
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data) if data else b''
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            content = bytearray()
+            while len(content) < most:
+                piece = stream.read(min(_READ_BYTES, most - len(content)))
+                if not piece:
+                    break
+                content += piece
+            return bytes(content)
     if compression == b'lz4':
-        return lz4.frame.LZ4FrameDecompressor().decompress(data) if data else b''
+        return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most)
     raise EpisodeError(
         f"the bag is compressed with '{compression.decode(errors='replace')}'; known are zstd "
         'and lz4'

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import json
 from math import isqrt
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import import_transformers, StoredTensor
 from mtv_world_ros.model.wan_keys import KeyMap
@@ -31,7 +31,10 @@ def describe(
     kind = transformers.UMT5Config if part == 'text_encoder' else transformers.CLIPVisionConfig
     file = source / 'config.json'
     if file.is_file():
-        values = json.loads(file.read_text())
+        try:
+            values = dict(read_json(file))
+        except (OSError, ValueError, TypeError) as error:
+            raise CheckpointError(f"'{file}' cannot be read: {error}") from error
         if values.get('model_type') != kind.model_type:
             raise CheckpointError(
                 f"'{file}' is of a {values.get('model_type')}, expected {kind.model_type}"

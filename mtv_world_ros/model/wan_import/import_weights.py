@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model import wan_keys
@@ -179,8 +180,8 @@ def _check_heads(source: Path, expected: int) -> None:
     if not file.is_file():
         return
     try:
-        config = json.loads(file.read_text())
-    except json.JSONDecodeError as error:
+        config = read_json(file)
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"'{file}' is not valid JSON: {error}") from error
     heads = config.get('num_heads', config.get('num_attention_heads', expected))
     if heads != expected:

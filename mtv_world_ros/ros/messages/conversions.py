@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -12,8 +13,9 @@ from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiAr
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
+from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.messages.rejection import bounded, Reason, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 
 
@@ -32,7 +34,10 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
             f'the trajectory has {len(names)} joint names and {len(message.points)} points; it '
             'needs at least one of each',
         )
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    with bounded(Reason.TRAJECTORY_MALFORMED):
+        check_limit('joint_names', len(names), 'the trajectory')
+        check_limit('trajectory_points', len(message.points), 'the trajectory')
+    repeated = _repeated(names)
     if repeated:
         raise Rejection(Reason.JOINT_NAMES, f'joint names {repeated} occur more than once')
     positions = _rows(message, 'positions')
@@ -85,7 +90,7 @@ def to_positions(message: JointState) -> dict[str, float]:
     """Returns position by joint name [rad or m].
 
     Raises:
-        Rejection: no positions, not one a name, or not finite.
+        Rejection: no positions, not one a name, names repeated, or not finite.
     """
     if not message.position or len(message.position) != len(message.name):
         raise Rejection(
@@ -93,6 +98,11 @@ def to_positions(message: JointState) -> dict[str, float]:
             f'the joint state has {len(message.name)} names and {len(message.position)} '
             'positions; it needs one position a name',
         )
+    with bounded(Reason.JOINT_STATE_INVALID):
+        check_limit('joint_names', len(message.name), 'the joint state')
+    repeated = _repeated(message.name)
+    if repeated:
+        raise Rejection(Reason.JOINT_STATE_INVALID, f'joint names {repeated} occur more than once')
     positions = dict(zip(message.name, message.position, strict=True))
     wrong = [name for name, value in positions.items() if not np.isfinite(value)]
     if wrong:
@@ -100,6 +110,10 @@ def to_positions(message: JointState) -> dict[str, float]:
             Reason.JOINT_STATE_INVALID, f'the positions of joints {wrong} are not finite'
         )
     return positions
+
+
+def _repeated(names: Iterable[str]) -> list[str]:
+    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) -> JointState:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 
+from mtv_world_ros.bounded_input import LimitError
 from mtv_world_ros.errors import MtvWorldError
 
 
@@ -54,4 +55,13 @@ def rejected_as(reason: Reason) -> Iterator[None]:
     except Rejection:
         raise
     except MtvWorldError as error:
+        raise Rejection(reason, str(error)) from error
+
+
+@contextmanager
+def bounded(reason: Reason) -> Iterator[None]:
+    """Turns a limit that is exceeded inside into a `Rejection` for `reason`."""
+    try:
+        yield
+    except LimitError as error:
         raise Rejection(reason, str(error)) from error

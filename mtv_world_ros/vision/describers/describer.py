@@ -58,7 +58,7 @@ def objects_from_instruction(instruction: str) -> tuple[str, ...]:
     names: list[str] = []
     at = 0
     while at < len(tokens):
-        phrase = _phrase(tokens[at:])
+        phrase = _phrase(tokens[at : at + _MAX_WORDS])
         if phrase and ' '.join(phrase) not in names:
             names.append(' '.join(phrase))
         at += max(1, len(phrase))
@@ -70,7 +70,7 @@ def _phrase(tokens: list[str]) -> list[str]:
     if tokens[0] not in PALETTE and tokens[0] not in OTHER_COLOURS:
         return []
     phrase = tokens[:1]
-    for word in tokens[1:_MAX_WORDS]:
+    for word in tokens[1:]:
         if ends_phrase(word) or word in PALETTE or not word[0].isalpha():
             break
         phrase.append(word)

@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.files import write_whole
@@ -228,7 +229,7 @@ class DescriptionCache:
     def get(self, key: str) -> tuple[SceneObject, ...] | None:
         """Returns what was kept; None if there is nothing, or nothing that can be read."""
         try:
-            kept = json.loads(self._file(key).read_text(encoding='utf-8'))
+            kept = read_json(self._file(key))
             return check_objects(kept['objects'], complete=False)
         except (OSError, ValueError, KeyError, TypeError, DescriptionError):
             return None  # asked again, and written over

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import json
 from pathlib import Path
 from typing import Any
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 
 #: `model_type` in a folder's config.json -> (class in transformers, a public name of it)
@@ -136,7 +136,7 @@ def _model_type(config: Path) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = json.loads(path.read_text(encoding='utf-8'))
+        values = read_json(path)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"'{path}' cannot be read: {error}") from error
     return values if isinstance(values, dict) else {}

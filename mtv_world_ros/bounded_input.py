@@ -1,0 +1,223 @@
+"""Limits on what comes from outside, and readers that keep to them before they do any work.
+
+Bags, images, YAML, JSON, checkpoints, messages and answers of servers are read through here. A
+limit that is too low for you is raised with an environment variable, e.g.
+`MTV_WORLD_MAX_IMAGE_PIXELS=200000000`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+import errno
+import json
+import os
+from pathlib import Path
+import stat
+from typing import Any
+
+import yaml
+
+from mtv_world_ros.errors import ConfigError
+
+PREFIX = 'MTV_WORLD_MAX_'
+#: plain YAML values may be numbers, whose digits cost quadratic time
+_LONGEST_NUMBER = 4_000
+_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Most of everything that is taken from outside.
+
+    Attributes:
+        yaml_bytes: of a YAML text.
+        yaml_nodes: values in it, once aliases and merges are written out.
+        nesting: levels of lists and maps, in YAML, JSON and answers of policy servers.
+        json_bytes: of a JSON file; tokenizers have tens of megabytes.
+        image_bytes: of an image file in a message.
+        image_pixels: of an image, before it is decoded.
+        jpeg_scans: of a progressive JPEG; each costs a pass over all pixels.
+        chunk_bytes: of a bag's chunk once it is inflated, and of a message.
+        joint_names: in a message.
+        trajectory_points: in a message.
+        instruction_characters: of an instruction.
+        answer_bytes: of an answer of a policy server or of a language model.
+        array_bytes: of an array in an answer.
+    """
+
+    yaml_bytes: int = 4 * 2**20
+    yaml_nodes: int = 200_000
+    nesting: int = 64
+    json_bytes: int = 256 * 2**20
+    image_bytes: int = 64 * 2**20
+    image_pixels: int = 50_000_000
+    jpeg_scans: int = 64
+    chunk_bytes: int = 2**28
+    joint_names: int = 1_000
+    trajectory_points: int = 20_000
+    instruction_characters: int = 4_000
+    answer_bytes: int = 64 * 2**20
+    array_bytes: int = 256 * 2**20
+
+    @classmethod
+    def from_environment(cls) -> Limits:
+        """Returns the limits as the environment sets them.
+
+        Raises:
+            ConfigError: a variable is not a positive whole number.
+        """
+        values = {}
+        for field in fields(cls):
+            variable = PREFIX + field.name.upper()
+            text = os.environ.get(variable)
+            if text is not None:
+                if not (text.isascii() and text.isdigit() and len(text) < 16 and int(text) > 0):
+                    raise ConfigError(
+                        f"environment variable '{variable}' is '{text}'; it must be a positive "
+                        'whole number'
+                    )
+                values[field.name] = int(text)
+        return cls(**values)
+
+
+def limits() -> Limits:
+    """Returns the present limits."""
+    return Limits.from_environment()
+
+
+class LimitError(ValueError):
+    """Something from outside is larger than is allowed."""
+
+
+def check_limit(name: str, value: int, what: str) -> None:
+    """Checks a size against the limit of this name.
+
+    Args:
+        name: of the field of `Limits`.
+        value: the size.
+        what: has the size, e.g. `the image`.
+
+    Raises:
+        LimitError: it is larger; names the variable that allows more.
+    """
+    most = getattr(limits(), name)
+    if value > most:
+        unit = name.rsplit('_', 1)[-1]
+        raise LimitError(
+            f'{what} has {value} {unit}; at most {most} are read (the environment variable '
+            f'{PREFIX}{name.upper()} allows more)'
+        )
+
+
+def read_bytes(path: Path | str, limit: str) -> bytes:
+    """Returns the content of a regular file; never waits for a pipe or a device.
+
+    Args:
+        path: the file.
+        limit: name of the field of `Limits`.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file.
+        LimitError: it is too large.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, 'rb') as file:
+        status = os.fstat(descriptor)
+        if stat.S_ISDIR(status.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, 'it is no regular file', str(path))
+        check_limit(limit, status.st_size, f"'{path}'")
+        return file.read(status.st_size)
+
+
+def read_text(path: Path | str, limit: str) -> str:
+    """Returns the UTF-8 text of a regular file; see `read_bytes`."""
+    return read_bytes(path, limit).decode('utf-8')
+
+
+def read_json(path: Path | str) -> Any:
+    """Returns the values of a JSON file.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file.
+        ValueError: it is too large, too deeply nested, or not JSON.
+    """
+    return parse_json(read_bytes(path, 'json_bytes'), f"'{path}'")
+
+
+def parse_json(text: str | bytes, what: str) -> Any:
+    """Returns the values of a JSON text whose size was checked.
+
+    Raises:
+        ValueError: it is not JSON, or too deeply nested.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise LimitError(f'{what} is nested too deeply') from None
+
+
+def parse_yaml(text: str | bytes) -> Any:
+    """Returns the plain values of a YAML text.
+
+    Raises:
+        yaml.YAMLError: it is not YAML, or too large once aliases are written out.
+    """
+    try:
+        check_limit('yaml_bytes', len(text), 'the text')
+        _YamlCount().check(yaml.parse(text, Loader=_LOADER))
+        return yaml.load(text, Loader=_LOADER)  # noqa: S506
+    except yaml.YAMLError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+        # values that their tags do not fit, such as `!!timestamp x`
+        raise yaml.YAMLError(str(error)) from error
+
+
+class _YamlCount:
+    """Counts nodes with every alias written out, as merging and comparing them would."""
+
+    def __init__(self) -> None:
+        self._sizes: dict[str, int] = {}  # by anchor; of those that are complete
+        self._open: list[tuple[str | None, int]] = []  # anchor, count before it
+        self._count = 0
+
+    def check(self, events: Iterator[yaml.Event]) -> None:
+        """Goes through the events of a parser; raises LimitError."""
+        most, deepest = limits().yaml_nodes, limits().nesting
+        for event in events:
+            self._take(event)
+            if len(self._open) > deepest:
+                raise LimitError(
+                    f'it is nested in more than {deepest} levels (the environment variable '
+                    f'{PREFIX}NESTING allows more)'
+                )
+            if self._count > most:
+                raise LimitError(
+                    f'it holds more than {most} values, with aliases written out (the environment '
+                    f'variable {PREFIX}YAML_NODES allows more)'
+                )
+
+    def _take(self, event: yaml.Event) -> None:
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self._sizes:
+                raise LimitError(f"the alias '*{event.anchor}' stands for what it is in")
+            self._count += self._sizes[event.anchor]
+        elif isinstance(event, yaml.NodeEvent):
+            self._count += 1
+            self._begin(event)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = self._open.pop()
+            if anchor:
+                self._sizes[anchor] = self._count - before
+
+    def _begin(self, event: yaml.NodeEvent) -> None:
+        self._sizes.pop(event.anchor or '', None)
+        if not isinstance(event, yaml.ScalarEvent):
+            self._open.append((event.anchor, self._count - 1))
+        elif not event.style and len(event.value) > _LONGEST_NUMBER:
+            raise LimitError(f'a plain value has {len(event.value)} characters; quote it')
+        elif event.anchor:
+            self._sizes[event.anchor] = 1
