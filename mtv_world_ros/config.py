@@ -6,12 +6,11 @@ Defaults, ranges and descriptions stand in its fields and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import re
 from typing import Annotated, Any, ClassVar, Self, TYPE_CHECKING, TypeVar
 
-import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -31,14 +30,25 @@ Item = TypeVar('Item')
 Model = TypeVar('Model', bound='Schema')
 
 
-def expected(what: str) -> WrapValidator:
-    """Returns an annotation: errors of its field say that `what` is valid, e.g. `in [0, 1]`."""
+def wrong(what: str, says: str = ', must be', parts: int = 1) -> PydanticCustomError:
+    """Returns the error of a value: `what` is valid, e.g. `in [0, 1]`.
+
+    Args:
+        what: is valid.
+        says: stands between the value and `what`, where a value is named by its quoted key.
+        parts: number of keys of the value's path that are quoted.
+    """
+    return PydanticCustomError('expected', '{what}', {'what': what, 'says': says, 'parts': parts})
+
+
+def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidator:
+    """Returns an annotation: whatever is wrong with a value of its field, the error is `wrong`."""
 
     def checked(value: Any, validate: Any) -> Any:
         try:
             return validate(value)
         except ValidationError:
-            raise PydanticCustomError('expected', '{what}', {'what': what}) from None
+            raise wrong(what, says, parts) from None
 
     return WrapValidator(checked)
 
@@ -156,6 +166,10 @@ def _explain(failed: ValidationError, kind: type[Schema]) -> str:
 def _quoted(error: ErrorDetails) -> str:
     """E.g. `'gripper_open' is 'wide', must be a finite number`."""
     name, value = f"'{error['loc'][-1]}'", error['input']
+    if error['type'] == 'expected':
+        context = error.get('ctx', {})
+        name = _path(error['loc'][-context['parts'] :])
+        return f"'{name}' is {value!r}{context['says']} {context['what']}"
     if error['type'] == 'tuple_type':
         return f'{name} is {value!r}; {name} must be a list'
     if error['type'] == 'literal_error':
@@ -216,67 +230,3 @@ def read_yaml(
         raise error(f"{what} '{path}' cannot be read, it is not valid YAML: {broken}") from broken
     except (OSError, ValueError) as unread:
         raise error(f"{what} '{path}' cannot be read: {unread}; set '{setting}'") from unread
-
-
-def check_keys(
-    values: Any,
-    known: Iterable[str],
-    required: Iterable[str],
-    where: str,
-    *,
-    error: type[MtvWorldError] = ConfigError,
-) -> Mapping[str, Any]:
-    """Returns `values` if it is a mapping with known and all required keys.
-
-    Raises:
-        ConfigError: or `error`, where it is not.
-    """
-    if not isinstance(values, Mapping):
-        raise error(f'{where}: expected keys and values, got {values!r}')
-    known = list(known)
-    for key in values:
-        if key not in known:
-            raise error(
-                f"{where}: unknown key '{key}'{nearest(str(key), known)}; known are "
-                f'{", ".join(known)}'
-            )
-    for key in required:
-        if key not in values:
-            raise error(f"{where}: key '{key}' is missing")
-    return values
-
-
-def number(values: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    """Returns a finite number."""
-    value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ConfigError(f"{where}: '{key}' is {value!r}, must be a finite number")
-    return float(value)
-
-
-def numbers(values: Mapping[str, Any], key: str, count: int, where: str) -> tuple[float, ...]:
-    """Returns so many finite numbers."""
-    value = values[key]
-    if not isinstance(value, list) or len(value) != count:
-        raise ConfigError(f"{where}: '{key}' is {value!r}, must be a list of {count} numbers")
-    return tuple(number({key: item}, key, 0.0, where) for item in value)
-
-
-def text(values: Mapping[str, Any], key: str, default: str, where: str) -> str:
-    """Returns a text."""
-    value = values.get(key, default)
-    if not isinstance(value, str):
-        raise ConfigError(f"{where}: '{key}' is {value!r}, must be a text")
-    return value
-
-
-def word(values: Mapping[str, Any], key: str, known: Iterable[str], where: str) -> str:
-    """Returns one of the known words, the first by default."""
-    known = list(known)
-    value = values.get(key, known[0])
-    if value not in known:
-        raise ConfigError(
-            f"{where}: '{key}' is {value!r}{nearest(str(value), known)}; valid are "
-            f'{", ".join(known)}'
-        )
-    return value

@@ -4,21 +4,81 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, Strict
 import yaml
 
-from mtv_world_ros.config import check_keys, read_yaml
+from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, validated, wrong
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import check_plausible
 from mtv_world_ros.geometry.transforms import is_rigid, pose
 
-_KEYS = ('width', 'height', 'K', 'distortion_model', 'distortion', 'mount_link',
-         'T_mount_camera', 'position', 'quaternion_xyzw')  # fmt: skip
-_REQUIRED = ('width', 'height', 'K', 'mount_link')
+
+def _numbers(value: Any) -> FloatArray:
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ArithmeticError) as error:
+        raise ValueError(f'{value!r} is no list of numbers: {error}') from error
+
+
+def _intrinsics(value: Any) -> FloatArray:
+    K = _numbers(value)
+    if K.shape == (4,):
+        return np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
+    if K.shape != (3, 3):
+        raise wrong('3 x 3 or fx, fy, cx, cy [px]')
+    return K
+
+
+def _rigid(value: Any) -> FloatArray:
+    T = _numbers(value)
+    if T.shape != (4, 4) or not is_rigid(T):
+        raise wrong('a rigid pose: 4 x 4, its 3 x 3 part a rotation, its last row 0 0 0 1')
+    return T
+
+
+_Pixels = Annotated[int, Strict(False), expected('a whole number')]
+
+
+class _View(Schema):
+    """What a file says of a camera; see `load_calibration`."""
+
+    section = ''
+
+    width: _Pixels
+    height: _Pixels
+    K: Annotated[Any, AfterValidator(_intrinsics)]
+    distortion_model: str = 'none'
+    distortion: ListOf[float] = ()
+    mount_link: str
+    T_mount_camera: Annotated[Any, AfterValidator(_rigid)] = None
+    position: ListOf[float] = ()
+    quaternion_xyzw: ListOf[float] = ()
+
+    def camera(self, view: str) -> CameraModel:
+        """Returns the camera.
+
+        Raises:
+            ValueError: its pose is not given once.
+        """
+        given = self.model_fields_set & {'T_mount_camera', 'position', 'quaternion_xyzw'}
+        if given not in ({'T_mount_camera'}, {'position', 'quaternion_xyzw'}):
+            raise ValueError("give either 'T_mount_camera', or 'position' and 'quaternion_xyzw'")
+        T = self.T_mount_camera
+        return CameraModel(
+            view=view,
+            width=self.width,
+            height=self.height,
+            K=self.K,
+            distortion_model=self.distortion_model,
+            distortion=np.array(self.distortion),
+            mount_link=self.mount_link,
+            T_mount_camera=pose(self.position, self.quaternion_xyzw) if T is None else T,
+        )
 
 
 def load_calibration(path: Path | str) -> dict[str, CameraModel]:
@@ -59,43 +119,10 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
 
 
 def _camera(view: str, row: Any, where: str) -> CameraModel:
-    check_keys(row, _KEYS, _REQUIRED, where, error=CalibrationError)
+    given = validated(_View, row, where, error=CalibrationError)
     try:
-        camera = CameraModel(
-            view=view,
-            width=int(row['width']),
-            height=int(row['height']),
-            K=_intrinsics(row['K']),
-            distortion_model=str(row.get('distortion_model', 'none')),
-            distortion=np.array(row.get('distortion', ()), dtype=float),
-            mount_link=str(row['mount_link']),
-            T_mount_camera=_pose(row),
-        )
+        camera = given.camera(view)
         check_plausible(camera)
         return camera
-    except (ValueError, TypeError, ArithmeticError, CalibrationError) as error:
+    except (ValueError, CalibrationError) as error:
         raise CalibrationError(f'{where}: {error}') from error
-
-
-def _intrinsics(value: Any) -> FloatArray:
-    K = np.array(value, dtype=float)
-    if K.shape == (4,):
-        return np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
-    if K.shape != (3, 3):
-        raise ValueError(f'K is {value!r}, must be 3 x 3 or fx, fy, cx, cy [px]')
-    return K
-
-
-def _pose(row: Mapping[str, Any]) -> FloatArray:
-    given = {'T_mount_camera', 'position', 'quaternion_xyzw'} & set(row)
-    if given == {'position', 'quaternion_xyzw'}:
-        return pose(row['position'], row['quaternion_xyzw'])
-    if given != {'T_mount_camera'}:
-        raise ValueError("give either 'T_mount_camera', or 'position' and 'quaternion_xyzw'")
-    T = np.array(row['T_mount_camera'], dtype=float)
-    if T.shape != (4, 4) or not is_rigid(T):
-        raise ValueError(
-            f'T_mount_camera is {row["T_mount_camera"]!r}, must be a rigid pose: 4 x 4, its 3 x 3 '
-            'part a rotation, its last row 0 0 0 1'
-        )
-    return T

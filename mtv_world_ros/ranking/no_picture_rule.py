@@ -92,7 +92,7 @@ def judge_without_pictures(episode: ImaginedEpisode, commands: FloatArray) -> bo
     roles = {
         role: replace(
             things[name],
-            size=task.sizes_m.get(role, things[name].size),
+            size=np.asarray(task.sizes_m.get(role, things[name].size)),
             is_rim_held=name.split()[-1] in task.rims,
         )
         for role, name in bound.items()

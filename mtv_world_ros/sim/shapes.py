@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mtv_world_ros.errors import nearest, SimulatorError
+from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.vision.colour_words import PALETTE
 
 Rgb = tuple[float, float, float]
@@ -16,8 +17,8 @@ Size = tuple[float, float, float]
 WOOD, PLASTIC = 400.0, 150.0  # kg/m3; plastic stands for hollow or thin-walled things
 #: walls of plates and bowls; a gripper holds on to their rim [m]
 RIM_M = 0.012
-#: walls of containers, floors of all that is hollow [m]; how heavy an empty container is [kg]
-WALL_M, FLOOR_M, CONTAINER_KG = 0.006, 0.005, 0.8
+#: walls of containers [m]; how heavy an empty container is [kg]
+WALL_M, CONTAINER_KG = 0.006, 0.8
 _NUM_RING = 16
 _GREEN = (0.14, 0.65, 0.22)
 #: long round things would roll away on a friction of points alone

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
 import json
 from math import exp, isfinite, nan
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Self
+
+from pydantic import Field, model_validator
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.config import ListOf, Model, Positive, Schema
+from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.files import write_whole
 
 CALIBRATION = 'success_calibration.json'
@@ -19,7 +21,8 @@ HORIZON = 'horizon.json'
 #: that never moves needs no grasp, which is no sign of success.
 DOUBTS = frozenset({'grasp', 'carry'})
 
-Record = TypeVar('Record')
+#: NaN = not known
+_Known = Annotated[float, Field(allow_inf_nan=True)]
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
@@ -28,8 +31,7 @@ def weighed(features: Mapping[str, float], name: str) -> float:
     return min(value, 0.0) if name in DOUBTS else value
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class Calibration(Schema):
     """What `mtv-world calibrate` found: F features, standardised, weighed and added up.
 
     Attributes:
@@ -47,26 +49,27 @@ class Calibration:
         made: command, date, machine.
     """
 
-    features: tuple[str, ...]
-    means: tuple[float, ...]
-    scales: tuple[float, ...]
-    weights: tuple[float, ...]
+    features: ListOf[str]
+    means: ListOf[float]
+    scales: ListOf[float]
+    weights: ListOf[float]
     bias: float
     segmenter: str
-    tasks: tuple[str, ...]
+    tasks: ListOf[str]
     num_episodes: int
     num_seeds: int = 1
     l2: float = 1.0
-    scores: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    made: Mapping[str, str] = field(default_factory=dict)
+    scores: Mapping[str, Mapping[str, Any]] = {}
+    made: Mapping[str, str] = {}
 
-    def __post_init__(self) -> None:
+    @model_validator(mode='after')
+    def _are_equally_many(self) -> Self:
         lengths = {len(self.means), len(self.scales), len(self.weights), len(self.features)}
-        numbers = [*self.means, *self.scales, *self.weights, self.bias]
         if len(lengths) != 1 or not self.features:
             raise ValueError('features, means, scales and weights are not equally many')
-        if not all(isfinite(number) for number in numbers) or min(self.scales) <= 0:
-            raise ValueError('a number is not finite, or a scale is not positive')
+        if min(self.scales) <= 0:
+            raise ValueError('a scale is not positive')
+        return self
 
     def probability(self, features: Mapping[str, float]) -> float:
         """Returns the probability of success; features that are NaN count as the mean."""
@@ -105,8 +108,7 @@ def load_calibration(folder: Path) -> Calibration | None:
     return _load(Path(folder) / CALIBRATION, Calibration)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HorizonCurve:
+class HorizonCurve(Schema):
     """Mean J of the objects that move, of episodes imagined as a whole from their first frame.
 
     Attributes:
@@ -118,16 +120,18 @@ class HorizonCurve:
         made: command, date, machine.
     """
 
-    period_s: float
-    values: tuple[float, ...]
-    lower: tuple[float, ...]
+    period_s: Positive
+    values: ListOf[_Known]
+    lower: ListOf[_Known]
     segmenter: str
     num_episodes: int
-    made: Mapping[str, str] = field(default_factory=dict)
+    made: Mapping[str, str] = {}
 
-    def __post_init__(self) -> None:
-        if not self.period_s > 0 or len(self.values) != len(self.lower):
-            raise ValueError('the period is not positive, or the curves differ in length')
+    @model_validator(mode='after')
+    def _are_equally_long(self) -> Self:
+        if len(self.values) != len(self.lower):
+            raise ValueError('values and lower differ in length')
+        return self
 
     def trusted_seconds(self, level: float) -> float:
         """Returns the time until which J is expected to stay at least `level` [s].
@@ -161,19 +165,9 @@ def load_horizon(folder: Path) -> HorizonCurve | None:
     return _load(Path(folder) / HORIZON, HorizonCurve)
 
 
-def _save(path: Path, record: Any, what: str) -> Path:
-    """Writes a dataclass into a checkpoint.
-
-    Args:
-        path: the file.
-        record: the dataclass.
-        what: what it is, for the error's text.
-
-    Raises:
-        CheckpointError: the folder cannot be written to.
-    """
+def _save(path: Path, record: Schema, what: str) -> Path:
     try:
-        write_whole(path, json.dumps(asdict(record), indent=1) + '\n')
+        write_whole(path, json.dumps(record.model_dump(), indent=1) + '\n')
     except OSError as error:
         raise CheckpointError(
             f"the {what} cannot be stored in the checkpoint '{path.parent}' ({error}); copy the "
@@ -182,33 +176,13 @@ def _save(path: Path, record: Any, what: str) -> Path:
     return path
 
 
-def _load(path: Path, kind: type[Record]) -> Record | None:
-    """Returns a dataclass of a checkpoint, its lists as tuples; None = there is no such file.
-
-    Args:
-        path: the file.
-        kind: the dataclass; it raises ValueError where its values do not fit each other.
-
-    Raises:
-        CheckpointError: the file is not what `mtv-world calibrate` writes.
-    """
+def _load(path: Path, kind: type[Model]) -> Model | None:
     if not path.is_file():
         return None
     try:
-        values = read_json(path)
-        _check_keys(values, kind)
-        return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-    except (OSError, ValueError, TypeError) as error:
+        return kind(**read_json(path))
+    except (OSError, ValueError, TypeError, ConfigError) as error:
         raise CheckpointError(
             f"'{path}' cannot be used: {error}; run 'mtv-world calibrate {path.parent} DATASET "
             "--out DIR' again, or delete the file"
         ) from error
-
-
-def _check_keys(values: Any, kind: Any) -> None:
-    known = [item.name for item in fields(kind)]
-    if not isinstance(values, dict):
-        raise ValueError('expected keys and values')
-    for key in values:
-        if key not in known:
-            raise ValueError(f"unknown key '{key}'{nearest(key, known)}")

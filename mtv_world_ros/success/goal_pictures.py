@@ -9,9 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pydantic import ValidationInfo
 
+from mtv_world_ros.config import wrong
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, ObjectMasks
-from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.segmenters.segmenter import resize_masks, Segmenter
 
@@ -58,38 +59,41 @@ class Picture:
         return resize_masks(self.pixels.mean(-1) >= _WHITE, camera.width, camera.height)
 
 
-def load_pictures(data: Any, folder: Path, where: str) -> dict[str, Picture]:
-    """Reads the picture files of a mapping from views to names, relative to a folder.
+def load_pictures(data: Any, info: ValidationInfo) -> Any:
+    """Validator: reads the picture files of a mapping from views to names.
+
+    The context's `folder` is what names are relative to; without it, `data` are pictures already.
 
     Raises:
-        ConfigError: it is no such mapping, or a file is no picture.
+        ValueError: it is no such mapping, or a file is no picture.
     """
+    if not info.context:
+        return data
     if not isinstance(data, Mapping) or not data:
-        raise ConfigError(f'{where} is {data!r}; expected picture files by view, {{low: FILE}}')
+        raise wrong('picture files by view, {low: FILE}', '; expected')
     found = {}
     for view, name in data.items():
-        path = folder / str(name)
+        path = info.context['folder'] / str(name)
         if not path.is_file():
-            raise ConfigError(f"{where}: picture '{path}' of view '{view}' does not exist")
+            raise ValueError(f"picture '{path}' of view '{view}' does not exist")
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
         if pixels is None:
-            raise ConfigError(f"{where}: '{path}' of view '{view}' is no picture; use PNG or JPEG")
+            raise ValueError(f"'{path}' of view '{view}' is no picture; use PNG or JPEG")
         found[str(view)] = Picture(path, np.asarray(pixels[..., ::-1], np.uint8))
     return found
 
 
-def load_regions(data: Any, folder: Path, where: str) -> dict[str, Picture]:
-    """Reads pictures whose white part is a region.
+def load_regions(data: Any, info: ValidationInfo) -> Any:
+    """Validator: reads pictures whose white part is a region.
 
     Raises:
-        ConfigError: as `load_pictures`, or a region is empty.
+        ValueError: as `load_pictures`, or a region is empty.
     """
-    found = load_pictures(data, folder, where)
+    found = load_pictures(data, info)
     for view, picture in found.items():
         if not (picture.pixels.mean(-1) >= _WHITE).any():
-            raise ConfigError(
-                f"{where}: '{picture.path}' of view '{view}' is black all over; paint the region "
-                'white'
+            raise ValueError(
+                f"'{picture.path}' of view '{view}' is black all over; paint the region white"
             )
     return found
 

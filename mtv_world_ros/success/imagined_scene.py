@@ -35,7 +35,7 @@ class ImaginedScene:
     views: Views
     bound: Mapping[str, str]
     picture_masks: PictureMasks
-    sizes: Mapping[str, FloatArray] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
     sigmas: dict[str, float] = field(default_factory=dict)
     _ends: dict[str, Location] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class ImaginedScene:
     def size(self, role: str) -> FloatArray:
         """See `Situation`; a cube is measured where it was last seen whole."""
         if role in self.sizes:
-            return self.sizes[role]
+            return np.asarray(self.sizes[role])
         memory, footage, item = self.views.memory, self.views.footage, self.item(role)
         areas = memory.seen_masks[:, item].sum((-2, -1)).astype(np.float64)
         point = memory.seen_points[item]

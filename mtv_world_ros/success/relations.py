@@ -6,14 +6,16 @@ right, y away from the robot, z up. A distance in the plane is that of the centr
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
 
+from mtv_world_ros.config import expected, Schema, wrong
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.success.goal_pictures import Picture
+from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.situation import Situation
 
 #: thickness of the floor of plates and containers [m]
@@ -56,13 +58,68 @@ def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.norm((np.asarray(a) - np.asarray(b))[..., :2], axis=-1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Beside:
+def _share(value: float) -> float:
+    if not 0 < value <= 1:
+        raise wrong('(0, 1]', '; it must be in')
+    return value
+
+
+#: stands between a wrong value and what is valid
+EXPECTED = '; expected'
+_Positive = Annotated[float, Field(gt=0, lt=1e3)]
+_Signed = Annotated[float, Field(gt=-1e3, lt=1e3)]
+_Share = Annotated[float, AfterValidator(_share)]
+_Angle = Annotated[_Positive, expected('a positive angle in radians', EXPECTED)]
+Length = Annotated[_Positive, expected('1 positive length(s) in metres', EXPECTED)]
+_Lengths2 = Annotated[
+    tuple[_Positive, _Positive],
+    Strict(False),
+    expected('2 positive length(s) in metres', EXPECTED),
+]
+Lengths3 = Annotated[
+    tuple[_Positive, _Positive, _Positive],
+    Strict(False),
+    expected('3 positive length(s) in metres', EXPECTED),
+]
+_Heights = Annotated[
+    tuple[_Signed, _Signed], Strict(False), expected('2 length(s) in metres', EXPECTED)
+]
+_Offset = Annotated[
+    tuple[_Signed, _Signed, _Signed], Strict(False), expected('3 length(s) in metres', EXPECTED)
+]
+
+
+class Relation(Schema):
+    """What must hold between objects at the end of a task, or of one object.
+
+    Attributes:
+        kind: its name in task files, a key of `KINDS`.
+        subject: placeholder of the object that moves.
+        target: placeholder of the object that it is placed by, where there is one.
+    """
+
+    kind: str
+    subject: str
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Placeholders that the relation is about, the one that moves first."""
+        return tuple(getattr(self, key) for key in ('subject', 'target') if hasattr(self, key))
+
+    def goal(self, at: Situation) -> Goal | None:
+        """Returns where the subject's centre should be (3,) [m]; None if that is not one place."""
+        del at
+        return None
+
+    @abstractmethod
+    def margins(self, at: Situation) -> list[Margin]:
+        """Returns by how much each condition holds."""
+
+
+class Beside(Relation):
     """The subject stands on the table to the left (-x) or right (+x) of the target.
 
     Attributes:
-        kind: `left_of` or `right_of`.
-        subject: placeholder of the object that moves.
         target: placeholder of the object it is placed by.
         distance_m: smallest and largest distance of the centres in the plane.
         max_across_m: largest |dy| of the centres.
@@ -71,13 +128,11 @@ class Beside:
         goal_distance_m: dx at which the goal mask is drawn.
     """
 
-    kind: str
-    subject: str
     target: str
-    distance_m: tuple[float, float] = (0.08, 0.20)
-    max_across_m: float = 0.05
-    max_rise_m: float = 0.03
-    goal_distance_m: float = 0.13
+    distance_m: _Lengths2 = (0.08, 0.20)
+    max_across_m: Length = 0.05
+    max_rise_m: Length = 0.03
+    goal_distance_m: Length = 0.13
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
@@ -100,21 +155,16 @@ class Beside:
         return -1.0 if self.kind == 'left_of' else 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnTop:
+class OnTop(Relation):
     """The subject stands on the target, both blocks.
 
     Attributes:
-        kind: `on_top_of` (plain `on` is a truth value in YAML).
-        subject: placeholder of the object that moves.
         target: placeholder of the object below.
         max_offset_m: largest |dx|, |dy|, |dz| from the place right above the target.
     """
 
-    kind: str
-    subject: str
     target: str
-    max_offset_m: tuple[float, float, float] = (0.025, 0.025, 0.012)
+    max_offset_m: Lengths3 = (0.025, 0.025, 0.012)
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
@@ -132,23 +182,18 @@ class OnTop:
         return np.array([0.0, 0.0, rise])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServedOn:
+class ServedOn(Relation):
     """The subject stands on the floor of a plate, near its middle.
 
     Attributes:
-        kind: `served_on`.
-        subject: placeholder of the object that moves.
         target: placeholder of the plate.
         max_distance_m: largest distance of the centres in the plane.
         max_rise_m: largest difference in height from where it stands on the floor.
     """
 
-    kind: str
-    subject: str
     target: str
-    max_distance_m: float = 0.035
-    max_rise_m: float = 0.015
+    max_distance_m: Length = 0.035
+    max_rise_m: Length = 0.015
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
@@ -170,30 +215,25 @@ class ServedOn:
         return float((at.size(self.subject)[2] - at.size(self.target)[2]) / 2 + FLOOR_M)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NestedOn(ServedOn):
     """The subject, a plate, lies in or on the target, another plate.
 
     Attributes:
-        kind: `nested_on`.
         max_distance_m: largest distance of the centres in the plane.
         max_rise_m: largest difference in height from halfway between lying in it and on it.
     """
 
-    max_distance_m: float = 0.04
-    max_rise_m: float = 0.02
+    max_distance_m: Length = 0.04
+    max_rise_m: Length = 0.02
 
     def _rise(self, at: Situation) -> float:
         return float(at.size(self.target)[2] / 2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Within:
+class Within(Relation):
     """The subject is in or on a container (basket, tray), near its middle.
 
     Attributes:
-        kind: `within`.
-        subject: placeholder of the object that moves.
         target: placeholder of the container.
         max_distance_m: largest distance of the centres in the plane.
         rise_m: lowest and highest height of the subject's centre over the target's; not given =
@@ -202,12 +242,10 @@ class Within:
             no goal mask, as where several things share the middle.
     """
 
-    kind: str
-    subject: str
     target: str
-    max_distance_m: float = 0.05
-    rise_m: tuple[float, float] | None = None
-    goal_rise_m: float | None = None
+    max_distance_m: Length = 0.05
+    rise_m: _Heights | None = None
+    goal_rise_m: Length | None = None
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m], if that is one place."""
@@ -225,13 +263,10 @@ class Within:
         ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Inside:
+class Inside(Relation):
     """The subject is inside a container's rectangle.
 
     Attributes:
-        kind: `inside`.
-        subject: placeholder of the object that moves.
         target: placeholder of the container.
         half_size_m: how far the subject's centre may be from the target's along the target's
             sides; not given = half the target's size.
@@ -239,17 +274,10 @@ class Inside:
         rise_m: as in `Within`.
     """
 
-    kind: str
-    subject: str
     target: str
-    half_size_m: tuple[float, float] | None = None
-    whole: bool = False
-    rise_m: tuple[float, float] | None = None
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: it may be anywhere inside."""
-        del at
-        return None
+    half_size_m: _Lengths2 | None = None
+    whole: Annotated[bool, expected('true or false', EXPECTED)] = False
+    rise_m: _Heights | None = None
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds."""
@@ -281,26 +309,16 @@ def _height_margins(
     return [Margin('not below it', rise - low), Margin('not above it', high - rise)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Apart:
+class Apart(Relation):
     """Two objects stand apart.
 
     Attributes:
-        kind: `apart`.
-        subject: placeholder of the one.
         target: placeholder of the other.
         min_distance_m: of their centres in the plane.
     """
 
-    kind: str
-    subject: str
     target: str
-    min_distance_m: float = 0.06
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: there is no one place for it."""
-        del at
-        return None
+    min_distance_m: Length = 0.06
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
@@ -308,24 +326,14 @@ class Apart:
         return [Margin('apart', distance - self.min_distance_m)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Moved:
+class Moved(Relation):
     """The subject is away from where it started.
 
     Attributes:
-        kind: `moved`.
-        subject: placeholder of the object that moves.
         min_distance_m: in the plane.
     """
 
-    kind: str
-    subject: str
-    min_distance_m: float = 0.1
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: there is no one place for it."""
-        del at
-        return None
+    min_distance_m: Length = 0.1
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
@@ -333,21 +341,16 @@ class Moved:
         return [Margin('moved away', way - self.min_distance_m)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AtGoal:
+class AtGoal(Relation):
     """The subject stands where the scene wants it.
 
     Attributes:
-        kind: `at_goal`.
-        subject: placeholder of the object that moves.
         max_distance_m: largest distance from the goal in the plane.
         max_rise_m: largest |dz| from the goal.
     """
 
-    kind: str
-    subject: str
-    max_distance_m: float = 0.03
-    max_rise_m: float = 0.03
+    max_distance_m: Length = 0.03
+    max_rise_m: Length = 0.03
 
     def goal(self, at: Situation) -> Goal | None:
         """Returns where the subject's centre should be (3,) [m]."""
@@ -365,43 +368,31 @@ class AtGoal:
         return at.goal(self.subject)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Shifted(AtGoal):
     """The subject stands at a given offset from where it started.
 
     Attributes:
-        kind: `shifted`.
         offset_m: x, y, z of the goal from the start.
     """
 
-    offset_m: tuple[float, float, float]
+    offset_m: _Offset
 
     def _goal(self, at: Situation) -> FloatArray:
         return at.start(self.subject) + np.asarray(self.offset_m)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shaken:
+class Shaken(Relation):
     """The subject was lifted and, up there, swung to and fro; that stays true from then on.
 
     Attributes:
-        kind: `shaken`.
-        subject: placeholder of the object that is shaken.
         min_lift_m: height of its lowest point over the table.
         num_reversals: how often its lean turns back while it is lifted.
         min_swing_rad: smaller turns do not count.
     """
 
-    kind: str
-    subject: str
-    min_lift_m: float = 0.06
-    num_reversals: int = 2
-    min_swing_rad: float = 0.15
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: where it ends does not matter."""
-        del at
-        return None
+    min_lift_m: Length = 0.06
+    num_reversals: Annotated[int, Field(ge=1), expected('a count of at least 1', EXPECTED)] = 2
+    min_swing_rad: _Angle = 0.15
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much each condition holds; a reversal more or less counts as two."""
@@ -414,26 +405,16 @@ class Shaken:
         ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AsPictured:
+class AsPictured(Relation):
     """The subject lies as in pictures of the task done; its mask in them is the goal mask.
 
     Attributes:
-        kind: `as_pictured`.
-        subject: placeholder of the object that moves.
         pictures: view -> picture of the task done, by the calibrated camera; one view will do.
         min_jaccard: J of the subject's mask with that in the pictures, mean over the views.
     """
 
-    kind: str
-    subject: str
-    pictures: Mapping[str, Picture]
-    min_jaccard: float = 0.5
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: the place is known in the pictures alone."""
-        del at
-        return None
+    pictures: Annotated[Mapping[str, InstanceOf[Picture]], BeforeValidator(load_pictures)]
+    min_jaccard: _Share = 0.5
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
@@ -441,26 +422,16 @@ class AsPictured:
         return [Margin('as in the goal picture', np.array([reached]), 'J', _SOFT_SHARE)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InRegion:
+class InRegion(Relation):
     """The subject is seen within a region of the views that was painted.
 
     Attributes:
-        kind: `in_region`.
-        subject: placeholder of the object that moves.
         regions: view -> picture, white where the subject belongs, black elsewhere.
         min_share: of the subject's mask that is in the region, in every one of these views.
     """
 
-    kind: str
-    subject: str
-    regions: Mapping[str, Picture]
-    min_share: float = 0.8
-
-    def goal(self, at: Situation) -> Goal | None:
-        """Nothing: it may be anywhere in the region."""
-        del at
-        return None
+    regions: Annotated[Mapping[str, InstanceOf[Picture]], BeforeValidator(load_regions)]
+    min_share: _Share = 0.8
 
     def margins(self, at: Situation) -> list[Margin]:
         """Returns by how much the condition holds."""
@@ -468,19 +439,6 @@ class InRegion:
         return [Margin('in the painted region', np.array([inside]), 'of its area', _SOFT_SHARE)]
 
 
-Relation = (
-    Beside
-    | OnTop
-    | ServedOn
-    | Within
-    | Inside
-    | Apart
-    | Moved
-    | AtGoal
-    | Shaken
-    | AsPictured
-    | InRegion
-)
 KINDS: dict[str, type[Relation]] = {
     'left_of': Beside,
     'right_of': Beside,
@@ -497,9 +455,3 @@ KINDS: dict[str, type[Relation]] = {
     'as_pictured': AsPictured,
     'in_region': InRegion,
 }
-
-
-def roles_of(relation: Relation) -> tuple[str, ...]:
-    """Returns the placeholders that a relation is about, the one that moves first."""
-    target = getattr(relation, 'target', None)
-    return (relation.subject,) if target is None else (relation.subject, target)

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, NAMES, path, POSES, RED, STACK
 import numpy as np
 import pytest
@@ -202,7 +200,7 @@ class Named(ColourSegmenter):
 def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, words):
     estimator = SuccessEstimator(
         load_tasks(share_path('config', 'tasks')),
-        calibration=replace(CALIBRATION, tasks=(task,)),
+        calibration=CALIBRATION.replace(tasks=(task,)),
         segmenter=Named(segmenter),
     )
     end = (BLUE[0] - 0.13, BLUE[1], 0.025)
@@ -219,7 +217,7 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
     ('views', 'word'), [(('low',), 'not used by the task'), (('top',), 'top')]
 )
 def test_views_that_a_task_leaves_out_do_not_count(views, word):
-    tasks = [replace(t, views=views) for t in load_tasks(share_path('config', 'tasks'))]
+    tasks = [t.replace(views=views) for t in load_tasks(share_path('config', 'tasks'))]
     end = (BLUE[0] - 0.13, BLUE[1], 0.025)
     shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
     assert_abstains(SuccessEstimator(tasks).estimate(shown, LEFT).estimate, word)

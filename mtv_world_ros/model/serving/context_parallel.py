@@ -8,7 +8,6 @@ one that predicts sees them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from datetime import timedelta
 import inspect
 import json
@@ -222,7 +221,7 @@ def _start(
     start = {
         'rank': rank,
         'size': serving.context_parallel,
-        'serving': asdict(serving),
+        'serving': dict(serving),
         'port': port,
         'device': str(device),
         'dtype': str(transformer.dtype).removeprefix('torch.'),

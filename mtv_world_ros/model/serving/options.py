@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
 import shlex
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
+from pydantic import AfterValidator, model_validator
+
+from mtv_world_ros.config import expected, Schema, validated, wrong
 from mtv_world_ros.errors import ConfigError, nearest
 
-WEIGHTS = ('same', 'float8')
 #: an offloaded block is elsewhere each time, which a graph or compiled code does not expect
 _APART = {
     'offload': ('compile', 'cuda_graphs', 'context_parallel'),
@@ -17,8 +17,13 @@ _APART = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServingOptions:
+def _positive(value: int) -> int:
+    if value < 1:
+        raise wrong('1 or more')
+    return value
+
+
+class ServingOptions(Schema):
     """Ways to serve a checkpoint; the defaults are the plain one.
 
     Attributes:
@@ -34,38 +39,34 @@ class ServingOptions:
         context_parallel: processes that share the token sequence, each on a device of its own.
     """
 
+    section = ''
+
     fuse_lora: bool = True
     compile: bool = False
     cuda_graphs: bool = False
     attention: str = ''
-    weights: str = 'same'
+    weights: Annotated[Literal['same', 'float8'], expected('one of same, float8')] = 'same'
     offload: bool = False
     tiny_decoder: str = ''
     tiny_encoder: bool = False
-    context_parallel: int = 1
+    context_parallel: Annotated[int, AfterValidator(_positive)] = 1
 
-    def __post_init__(self) -> None:
-        if self.context_parallel < 1:
-            raise ConfigError(
-                f'serving: context_parallel is {self.context_parallel}; it must be 1 or more'
-            )
-        if self.weights not in WEIGHTS:
-            raise ConfigError(
-                f"serving: weights is '{self.weights}'; it must be one of {', '.join(WEIGHTS)}"
-            )
+    @model_validator(mode='after')
+    def _go_together(self) -> Self:
         for one, others in _APART.items():
             for other in others:
                 if self._is_on(one) and self._is_on(other):
-                    raise ConfigError(f'serving: {one} and {other} exclude each other')
+                    raise ValueError(f'{one} and {other} exclude each other')
         fixed = self.context_parallel > 1 or self.cuda_graphs or self.offload
         if not self.fuse_lora and (fixed or self.weights == 'float8'):
-            raise ConfigError(
-                'serving: context_parallel, cuda_graphs, offload and weights=float8 need '
+            raise ValueError(
+                'context_parallel, cuda_graphs, offload and weights=float8 need '
                 'fuse_lora=true: they know the weights alone, no adapter that is exchanged beside '
                 'them'
             )
         if self.tiny_encoder and not self.tiny_decoder:
-            raise ConfigError("serving: tiny_encoder=true needs tiny_decoder, the weights' file")
+            raise ValueError("tiny_encoder=true needs tiny_decoder, the weights' file")
+        return self
 
     def _is_on(self, name: str) -> bool:
         value: bool | int = getattr(self, name)
@@ -80,35 +81,23 @@ class ServingOptions:
         Raises:
             ConfigError: an unknown name or a value that is not one.
         """
-        values: dict[str, Any] = {}
-        kinds = {field.name: type(field.default) for field in fields(cls)}
+        values = {}
         for part in _words(text):
             name, _, value = part.partition('=')
-            if name not in kinds:
+            if name not in cls.model_fields:
+                known = list(cls.model_fields)
                 raise ConfigError(
-                    f"serving: '{name}' is not one of {', '.join(kinds)}{nearest(name, kinds)}"
+                    f"serving: '{name}' is not one of {', '.join(known)}{nearest(name, known)}"
                 )
-            values[name] = _PARSERS[kinds[name]](name, value)
-        return cls(**values)
+            is_text = isinstance(cls.model_fields[name].default, str)
+            values[name] = value if is_text else _plain(value)
+        return validated(cls, values, 'serving')
 
 
-def _number(name: str, value: str) -> int:
-    if not value.isdecimal():
-        raise ConfigError(f"serving: {name} is '{value}'; it must be a whole number")
-    return int(value)
-
-
-def _truth(name: str, value: str) -> bool:
-    if value not in ('true', 'false'):
-        raise ConfigError(f"serving: {name} is '{value}'; it must be true or false")
-    return value == 'true'
-
-
-def _text(_: str, value: str) -> str:
-    return value
-
-
-_PARSERS: Mapping[type, Callable[[str, str], Any]] = {int: _number, bool: _truth, str: _text}
+def _plain(value: str) -> Any:
+    if value.isdecimal():
+        return int(value)
+    return {'true': True, 'false': False}.get(value, value)
 
 
 def _words(text: str) -> list[str]:

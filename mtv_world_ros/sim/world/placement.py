@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mtv_world_ros.sim.shapes import FLOOR_M, RIM_M, SHAPES
+from mtv_world_ros.sim.shapes import RIM_M, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, START, Task
 from mtv_world_ros.sim.world.arm import BASE_POSITIONS
 from mtv_world_ros.sim.world.scene import Place, SceneObject
+from mtv_world_ros.success.relations import FLOOR_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

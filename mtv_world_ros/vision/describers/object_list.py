@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mtv_world_ros.config import check_keys, read_yaml
+from pydantic import AfterValidator
+
+from mtv_world_ros.config import read_yaml, Schema, validated
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.vision.describers.scene_objects import check_objects, SceneObject
-
-_KEYS = ('objects', 'instructions')
 
 
 class ObjectList:
@@ -52,6 +52,27 @@ class ObjectList:
         return found
 
 
+def _checked(items: Any, where: str = '') -> tuple[SceneObject, ...]:
+    try:
+        return check_objects(items, complete=False)
+    except DescriptionError as error:
+        raise ValueError(f'{where}{error}') from error
+
+
+def _by_instruction(listed: Any) -> dict[str, tuple[SceneObject, ...]]:
+    if not isinstance(listed or {}, Mapping):
+        raise ValueError("'instructions' has to map each instruction to its objects")
+    return {
+        str(key): _checked(items, f"instruction '{key}': ")
+        for key, items in (listed or {}).items()
+    }
+
+
+class _Lists(Schema):
+    objects: Annotated[Any, AfterValidator(_checked)] = None
+    instructions: Annotated[Any, AfterValidator(_by_instruction)] = {}
+
+
 def load_object_list(path: Path) -> ObjectList:
     """Reads `objects` (for all instructions) and `instructions` (each with its own objects).
 
@@ -64,23 +85,8 @@ def load_object_list(path: Path) -> ObjectList:
     values = read_yaml(path, 'object list', 'list')
     if not isinstance(values, Mapping) or not values:
         raise ConfigError(f"{source} needs the key 'objects' or 'instructions'")
-    check_keys(values, _KEYS, (), source)
-    listed = values.get('instructions') or {}
-    if not isinstance(listed, Mapping):
-        raise ConfigError(f"{source}: 'instructions' has to map each instruction to its objects")
-    by_instruction = {
-        str(key): _checked(items, f"{source}: instruction '{key}'")
-        for key, items in listed.items()
-    }
-    others = _checked(values['objects'], source) if 'objects' in values else None
-    return ObjectList(by_instruction, others, source)
-
-
-def _checked(items: Any, where: str) -> tuple[SceneObject, ...]:
-    try:
-        return check_objects(items, complete=False)
-    except DescriptionError as error:
-        raise ConfigError(f'{where}: {error}') from error
+    lists = validated(_Lists, values, source)
+    return ObjectList(lists.instructions, lists.objects, source)
 
 
 def _plain(instruction: str) -> str:
