@@ -87,6 +87,11 @@ class RolloutPreempted(MtvWorldError):
     """A newer trajectory arrived; the running rollout was given up."""
 
 
+def masked(text: str, key: str) -> str:
+    """Returns the text without an API key; servers may quote it, and it belongs into no log."""
+    return text.replace(key, '***') if key else text
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Returns ` (did you mean 'x'?)` for the known name nearest to `name`, else an empty text."""
     close = get_close_matches(name, list(known), n=1)

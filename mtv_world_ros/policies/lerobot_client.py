@@ -2,27 +2,24 @@
 
 Messages are those of LeRobot's `transport/services.proto`, `transport/utils.py` and
 `async_inference/helpers.py`: protobuf frames with pickled contents. Outgoing contents are written
-as pickles; from incoming ones only the few names that a list of actions is made of are looked up
-or called, and tensors are read with `weights_only`.
+as pickles; incoming ones are read by `timed_actions`, never by `pickle`.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-import io
 import pickle
 import time
 from typing import Annotated, Any, Literal, Self
-import warnings
 
-import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from mtv_world_ros.bounded_input import limits
 from mtv_world_ros.config import Count, Positive, Schema
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.policies.server_mapping import ServerMapping
+from mtv_world_ros.policies.timed_actions import read_timed_actions
 
 _SERVICE = '/transport.AsyncInference/'
 
@@ -47,6 +44,9 @@ class LeRobotConfig(ServerMapping):
     timeout_s: Positive = Field(default=60.0, description='longest wait for an answer [s]')
     setup_timeout_s: Positive = Field(
         default=600.0, description='longest wait until the server has loaded the policy [s]'
+    )
+    tls: bool = Field(
+        default=False, description='encrypt, and check the certificate of the server'
     )
     policy: LeRobotPolicySettings
 
@@ -170,8 +170,13 @@ class LeRobotPolicy:
         import grpc
 
         if self._channel is None:
-            unlimited = [('grpc.max_receive_message_length', -1)]
-            self._channel = grpc.insecure_channel(self._config.server, options=unlimited)
+            options = [('grpc.max_receive_message_length', limits().answer_bytes)]
+            server = self._config.server
+            if self._config.tls:
+                credentials = grpc.ssl_channel_credentials()
+                self._channel = grpc.secure_channel(server, credentials, options=options)
+            else:
+                self._channel = grpc.insecure_channel(server, options=options)
         return self._channel
 
     def _guarded(self, call: Any) -> Any:
@@ -221,13 +226,7 @@ def read_actions(message: bytes) -> FloatArray:
             "the policy server gave no actions; its log says why (LeRobot's server answers "
             'failures with an empty message)'
         )
-    try:
-        actions = _ActionReader(io.BytesIO(data)).load()
-        return np.stack([np.asarray(action.action, np.float64).ravel() for action in actions])
-    except PolicyError:
-        raise
-    except Exception as error:  # whatever bytes that are no such pickle make it raise
-        raise PolicyError(f'the answer is no list of timed actions: {error}') from error
+    return read_timed_actions(data)
 
 
 def _pickled(name: str, values: Mapping[str, Any]) -> bytes:
@@ -240,50 +239,6 @@ def _pickled(name: str, values: Mapping[str, Any]) -> bytes:
     header, body = fields[:2], fields[2:-1]
     made = f'c{_HELPERS}\n{name}\n'.encode() + b')\x81'
     return header + made + body + b'b.'
-
-
-class _TimedAction:
-    """What a `TimedAction` is read into."""
-
-    action: Any
-
-
-class _ActionReader(pickle.Unpickler):
-    """Reads lists of `TimedAction` with tensors, and refuses all other names."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if name == 'TimedAction' and module.startswith('lerobot.'):
-            return _TimedAction
-        allowed = {
-            ('torch._utils', '_rebuild_tensor_v2'): _tensor,
-            ('torch.storage', '_load_from_bytes'): _storage,
-            ('collections', 'OrderedDict'): OrderedDict,
-        }
-        if (module, name) not in allowed:
-            raise PolicyError(
-                f"the answer names '{module}.{name}', which does not belong into a list of "
-                'actions; it was not looked up'
-            )
-        return allowed[module, name]
-
-
-def _storage(data: bytes) -> FloatArray:
-    import torch
-
-    storage = torch.load(io.BytesIO(data), weights_only=True, map_location='cpu')
-    with warnings.catch_warnings():  # typed storages are deprecated, pickles of tensors have them
-        warnings.simplefilter('ignore', UserWarning)
-        values = torch.tensor([], dtype=storage.dtype).set_(storage.untyped())
-    return values.double().numpy()
-
-
-def _tensor(
-    storage: FloatArray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
-) -> FloatArray:
-    index = np.array(offset)
-    for length, step in zip(size, stride, strict=True):
-        index = index[..., None] + step * np.arange(length)
-    return storage[index]
 
 
 def _tagged(field: int, data: bytes) -> bytes:
@@ -321,4 +276,6 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
         if not data[at - 1] & 0x80:
             return value, at
         shift += 7
-    raise PolicyError('the answer is cut off')
+        if shift > 63:
+            break
+    raise PolicyError('the answer is cut off or damaged')

@@ -14,9 +14,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from mtv_world_ros.bounded_input import limits
 from mtv_world_ros.config import Positive
 from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.errors import ConfigError, masked, PolicyError
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
 
 
@@ -91,6 +92,7 @@ class OpenPiPolicy:
         self._config = config
         self._connection: Any = None
         self._opened = ExitStack()
+        self._key = ''
         self.metadata: dict[str, Any] = {}
 
     @property
@@ -137,7 +139,7 @@ class OpenPiPolicy:
             connecting = connect(
                 config.server,
                 compression=None,
-                max_size=None,
+                max_size=limits().answer_bytes,
                 open_timeout=config.timeout_s,
                 # a server that thinks does not answer pings
                 ping_interval=None,
@@ -146,8 +148,10 @@ class OpenPiPolicy:
             self._connection = self._opened.enter_context(connecting)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
             raise PolicyError(
-                f"no connection to the policy server '{config.server}': {error}; is it running?"
-            ) from error
+                f"no connection to the policy server '{config.server}': "
+                f'{masked(str(error), key)}; is it running?'
+            ) from (None if key and key in str(error) else error)
+        self._key = key
         self.metadata = self._receive()
 
     def _exchange(self, request: bytes) -> Any:
@@ -177,7 +181,7 @@ class OpenPiPolicy:
         if isinstance(message, str):  # a traceback; the server closes the connection after it
             self.close()
             last = message.strip().splitlines()[-1] if message.strip() else 'no reason given'
-            raise PolicyError(f'the policy server failed: {last}')
+            raise PolicyError(f'the policy server failed: {masked(last, self._key)}')
         return unpack(message)
 
     def _gone(self, error: Exception) -> PolicyError:
@@ -186,6 +190,7 @@ class OpenPiPolicy:
 
 #: kinds of dtype that have no plain bytes: structures, objects, complex numbers
 _REFUSED = 'VOc'
+_LONGEST_DTYPE = 16
 
 
 def pack(value: Any) -> bytes:
@@ -207,7 +212,10 @@ def unpack(data: bytes) -> Any:
 
     try:
         return msgpack.unpackb(data, object_hook=_decode)
-    except (ValueError, TypeError, KeyError, msgpack.UnpackException) as error:
+    except (
+        ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError,
+        RecursionError, msgpack.UnpackException,
+    ) as error:  # fmt: skip
         raise PolicyError(f'the answer is not msgpack as openpi writes it: {error}') from error
 
 
@@ -231,7 +239,10 @@ def _decode(value: dict[Any, Any]) -> Any:
 
 
 def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
-    dtype = np.dtype(value[b'dtype'])
+    text = value[b'dtype']
+    if not isinstance(text, str) or len(text) > _LONGEST_DTYPE:
+        raise ValueError('a dtype is a short text')
+    dtype = np.dtype(text)
     if dtype.kind in _REFUSED:
         raise ValueError(f'arrays of {dtype} are not read')
     return dtype

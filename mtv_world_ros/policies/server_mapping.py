@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.config import expected, ListOf, Positive, Schema
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
@@ -114,6 +115,10 @@ class ActionOutput(JointTable):
             raise PolicyError(f'the actions are no table of numbers: {error}') from error
         if values.ndim != 2 or not values.size:
             raise PolicyError(f'the actions have shape {values.shape}; expected (time, column)')
+        try:
+            check_limit('trajectory_points', len(values), 'the answer')
+        except LimitError as error:
+            raise PolicyError(str(error)) from error
         if not np.isfinite(values).all():
             row, column = np.argwhere(~np.isfinite(values))[0]
             raise PolicyError(f'action {row} has {values[row, column]} in column {column}')

@@ -12,6 +12,8 @@ from datetime import timedelta
 import inspect
 import json
 import logging
+import os
+import socket
 import subprocess
 import sys
 from typing import Any
@@ -31,6 +33,7 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 #: how long a process that does not answer is waited for; the first pass may compile
 _TIMEOUT = timedelta(minutes=5)
 _HOST = '127.0.0.1'
+_LOOPBACK = 'lo'
 #: where the sequence is split and gathered: by the names that the stock class has, too
 _PLAN: Mapping[str, Any] = {
     'rope': {
@@ -46,9 +49,21 @@ _PLAN: Mapping[str, Any] = {
 
 
 def open_store(port: int = 0) -> distributed.TCPStore:
-    """Returns where the processes meet: made by the first one on a free port, then found."""
+    """Returns where the processes meet: made by the first one on a free port, then found.
+
+    It listens on the loopback alone: by itself it would listen on every interface.
+    """
+    if port:
+        return distributed.TCPStore(_HOST, port, timeout=_TIMEOUT, wait_for_workers=False)
+    listening = socket.create_server((_HOST, 0))
+    port, descriptor = listening.getsockname()[1], listening.detach()
     return distributed.TCPStore(
-        _HOST, port, is_master=port == 0, timeout=_TIMEOUT, wait_for_workers=False
+        _HOST,
+        port,
+        is_master=True,
+        timeout=_TIMEOUT,
+        wait_for_workers=False,
+        master_listen_fd=descriptor,
     )
 
 
@@ -56,6 +71,8 @@ def join(store: distributed.TCPStore, rank: int, size: int, device: torch.device
     """Waits until all processes are there; rank 0 is the one that predicts."""
     if device.type == 'cuda':
         torch.cuda.set_device(device)
+    for variable in ('GLOO_SOCKET_IFNAME', 'NCCL_SOCKET_IFNAME'):
+        os.environ.setdefault(variable, _LOOPBACK)
     # diffusers exchanges sizes on the CPU where it can
     backend = 'gloo' if device.type == 'cpu' else f'cpu:gloo,{device.type}:nccl'
     distributed.init_process_group(

@@ -6,7 +6,6 @@ import base64
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, UTC
 from email.utils import parsedate_to_datetime
-import json
 from math import isfinite
 import os
 import time
@@ -16,9 +15,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.config import expected, Positive, Schema
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, DescriptionError
+from mtv_world_ros.errors import ConfigError, DescriptionError, masked
 from mtv_world_ros.vision.describers.vlm import Answer, ANSWER_SCHEMA, excerpt
 
 #: from the strictest to none; a server that refuses one is asked with the next
@@ -81,7 +81,16 @@ class OpenAIChat:
         return f'{self.config.model} at {self.config.base_url}'
 
     def ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
-        """Returns the answer to the last turn; see `Chat`."""
+        """Returns the answer to the last turn; see `Chat`. No error quotes the key."""
+        try:
+            return self._ask(frame, turns)
+        except DescriptionError as error:
+            text = masked(str(error), self._key)
+            if text == str(error):
+                raise
+            raise DescriptionError(text, error.status) from None
+
+    def _ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
         messages = _messages(frame, turns)
         for index in range(self._format, len(_FORMATS)):
             try:
@@ -107,7 +116,7 @@ class OpenAIChat:
         except openai.OpenAIError as error:
             cause = f'{error} {error.__cause__ or ""}'
             raise DescriptionError(
-                f'{self.identity} cannot be reached ({self._hide_key(cause)}); is the server '
+                f'{self.identity} cannot be reached ({cause}); is the server '
                 "up, and the describer's 'base_url' right?",
                 'unreachable',
             ) from error
@@ -141,7 +150,7 @@ class OpenAIChat:
     def _answer(self, body: bytes) -> Answer:
         """What a completion says; nothing is taken for granted about its form."""
         try:
-            completion = json.loads(body)
+            completion = parse_json(body, 'the answer')
             choice = completion['choices'][0]
             message = choice['message']
             reason = choice.get('finish_reason')
@@ -174,7 +183,7 @@ class OpenAIChat:
 
     def _failed(self, status: int, text: str) -> DescriptionError:
         """The error for an HTTP status that is final."""
-        said = f'{self.identity} answers with status {status}: {self._hide_key(excerpt(text))}'
+        said = f'{self.identity} answers with status {status}: {excerpt(text)}'
         budget = f"'retry_budget_s' ({self.config.retry_budget_s:g} s)"
         if status == 429:
             return DescriptionError(
@@ -188,10 +197,6 @@ class OpenAIChat:
             404: "check the describer's 'model' and 'base_url'",
         }.get(status, "check that 'model' takes images")
         return DescriptionError(f'{said}; {where}', 'rejected')
-
-    def _hide_key(self, text: str) -> str:
-        """Servers may quote the key; it does not belong into logs and reports."""
-        return text.replace(self._key, '***') if self._key else text
 
 
 class _FormatRefused(Exception):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from small_transformer import build
@@ -11,7 +12,7 @@ from torch import Tensor
 from wan_files import TRANSFORMER
 
 from mtv_world_ros.errors import ConfigError, ModelError
-from mtv_world_ros.model.serving.context_parallel import Followers
+from mtv_world_ros.model.serving.context_parallel import Followers, open_store
 from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
@@ -69,6 +70,20 @@ def test_two_processes_compute_what_one_does(pair, views, batch, size) -> None:
     assert seen == [-(-tokens // 2)]  # the blocks here saw half of the tokens of all views
     assert out.std() > 0.1
     torch.testing.assert_close(out, alone(**values), rtol=0, atol=1e-5)
+
+
+def test_the_meeting_point_listens_on_the_loopback_alone() -> None:
+    store = open_store()
+    store.set('key', 'value')
+    assert open_store(store.port).get('key') == b'value'
+    sockets = [
+        line.split()
+        for table in ('tcp', 'tcp6')
+        for line in Path(f'/proc/net/{table}').read_text().splitlines()[1:]
+    ]
+    listening = [row[1] for row in sockets if row[3] == '0A']
+    mine = [address for address in listening if int(address[-4:], 16) == store.port]
+    assert [address[:-5] for address in mine] == ['0100007F']  # 127.0.0.1
 
 
 @torch.inference_mode()
