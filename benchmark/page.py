@@ -1,4 +1,11 @@
-"""Result pages: what ran, where and when, and a Markdown table."""
+"""Result pages: what ran, where, when and at which commit, and a Markdown table.
+
+    python benchmark/page.py
+
+lists the pages of benchmark/results that are older than what they describe; with the kind of a
+page (see `DESCRIBES`; any other is about the bundled checkpoint) it prints the line that such a
+page has to end with.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +15,48 @@ from datetime import date
 import os
 from pathlib import Path
 import platform
+import re
+import subprocess
+import sys
 import time
 
 import numpy as np
+
+from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.files import content_digest
+
+ROOT = Path(__file__).resolve().parents[1]
+#: kind of page -> what it describes: other numbers may come out once that has changed
+DESCRIBES = {
+    'collect': ('mtv_world_ros/sim',),
+    'control_representations': ('mtv_world_ros/training', 'mtv_world_ros/model'),
+    'denoising_steps': ('mtv_world_ros/model/sampler.py',),
+    'distillation': ('mtv_world_ros/training', 'mtv_world_ros/model'),
+    'evaluation': ('mtv_world_ros/evaluation',),
+    'forward_kinematics': ('mtv_world_ros/geometry',),
+    'long_rollouts': ('mtv_world_ros/model',),
+    'policy_in_the_loop': ('mtv_world_ros/ros',),
+    'ros_overhead': ('mtv_world_ros/ros',),
+    'ros_publishing': ('mtv_world_ros/ros',),
+    'segmenter': ('mtv_world_ros/vision/segmenters',),
+    'self_rollout': ('mtv_world_ros/training',),
+    'serving': ('mtv_world_ros/model',),
+    'sim_tasks': ('mtv_world_ros/sim',),
+    'task_agreement': ('mtv_world_ros/success', 'mtv_world_ros/sim'),
+    'training_speed': ('mtv_world_ros/training',),
+    'trajectory_video': ('mtv_world_ros/rendering',),
+    'wan': ('mtv_world_ros/model',),
+    'wan_training_speed': ('mtv_world_ros/training', 'mtv_world_ros/model'),
+}
+#: kinds of pages whose numbers are a checkpoint's; by default the bundled one's
+OF_A_CHECKPOINT = (
+    'denoising_steps', 'evaluation', 'policy_in_the_loop', 'ros_overhead', 'serving',
+)  # fmt: skip
+_MADE = re.compile(
+    r'^Made at commit `(\w+)(\+?)`, (?:no checkpoint|(\w+) checkpoint `(\w+)`)\. '
+    r'Describes: (.+)\.$',
+    re.M,
+)
 
 
 def parse_arguments(
@@ -78,7 +124,8 @@ def publish(
     today = date.today().isoformat()
     page = (
         f'# {title}\n\n`{command}`, machine `{options.machine}` ({machine_line()}, {versions}), '
-        f'{today}, seed {options.seed}, n = {options.repeats}.\n\n{body}\n'
+        f'{today}, seed {options.seed}, n = {options.repeats}.\n\n{body}\n\n'
+        f'{made_line(what, getattr(options, "checkpoint", None))}\n'
     )
     print(page)
     if options.out is not None:
@@ -88,3 +135,75 @@ def publish(
         beside.write_text(page, encoding='utf-8')
         beside.replace(path)
         print(f'written: {path}')
+
+
+def made_line(what: str, checkpoint: str | Path | None = None) -> str:
+    """The line of a page with commit (+ = with changes on top), checkpoint and what it is about.
+
+    Args:
+        what: kind of page; the longest beginning of it in `DESCRIBES` counts.
+        checkpoint: folder or `bundled`; None = as `OF_A_CHECKPOINT` says.
+    """
+    kind = max((name for name in DESCRIBES if what.startswith(name)), key=len, default='')
+    commit = _git(ROOT, 'rev-parse', '--short', 'HEAD') or 'unknown'
+    changed = '+' if _git(ROOT, 'status', '--porcelain', '--untracked-files=no') else ''
+    held = 'no checkpoint'
+    if checkpoint is None and kind in ('', *OF_A_CHECKPOINT):
+        checkpoint = 'bundled'
+    if checkpoint is not None:
+        digest = content_digest(checkpoint_path(checkpoint))[:8]
+        held = f'{"bundled" if str(checkpoint) == "bundled" else "other"} checkpoint `{digest}`'
+    parts = ', '.join(f'`{path}`' for path in DESCRIBES.get(kind, ())) or 'the checkpoint'
+    return f'Made at commit `{commit}{changed}`, {held}. Describes: {parts}.'
+
+
+def why_stale(page: Path, root: Path = ROOT, bundled: str = '') -> list[str]:
+    """Returns why a page is older than what it describes; empty = it is not, as far as is known.
+
+    Args:
+        page: its path.
+        root: of the repository; without its history, commits are not looked at.
+        bundled: first 8 digits of the bundled checkpoint's hash.
+
+    Raises:
+        ValueError: the page does not say at which commit and with which checkpoint it was made.
+    """
+    found = _MADE.search(page.read_text(encoding='utf-8'))
+    if found is None:
+        raise ValueError(
+            f'{page.name} has no line "Made at commit ..., checkpoint ..."; '
+            'python benchmark/page.py KIND prints it'
+        )
+    commit, _, kind, digest, about = found.groups()
+    reasons = []
+    if kind == 'bundled' and digest != bundled:
+        reasons.append(f'of checkpoint {digest}, the bundled one is {bundled}')
+    for path in re.findall('`(.+?)`', about):
+        later = _git(root, 'rev-list', '--count', f'{commit}..HEAD', '--', path)
+        if later not in ('', '0'):
+            reasons.append(f'{later} commits changed {path} after {commit}')
+    return reasons
+
+
+def _git(folder: Path, *words: str) -> str:
+    """What git prints; empty where there is no git, no history or no such commit."""
+    try:
+        done = subprocess.run(['git', *words], cwd=folder, capture_output=True, text=True)
+    except OSError:
+        return ''
+    return done.stdout.strip() if done.returncode == 0 else ''
+
+
+def main() -> None:
+    """Prints what the command line asks for."""
+    if sys.argv[1:]:
+        print(made_line(sys.argv[1]))
+        return
+    current = content_digest(checkpoint_path('bundled'))[:8]
+    for path in sorted((ROOT / 'benchmark' / 'results').glob('*.md')):
+        for reason in why_stale(path, bundled=current):
+            print(f'{path.name}: {reason}')
+
+
+if __name__ == '__main__':
+    main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from math import isfinite
 from typing import Any
@@ -15,6 +15,8 @@ from mtv_world_ros.files import share_path
 
 #: instead of a number that was not measured
 DASH = '–'
+#: characters of a line on a console
+MAX_WIDTH = 100
 #: suffix of templates whose values are escaped
 _HTML = '.html.j2'
 
@@ -34,6 +36,39 @@ class Table:
     rows: Sequence[Sequence[object]]
     caption: str = ''
     num_labels: int = 1
+
+    def narrow(self, width: int = MAX_WIDTH) -> list[Table]:
+        """Returns the table in parts that fit a width of text, without columns of dashes alone.
+
+        Every part has the columns of labels, and as many of the others as fit, at least one.
+        """
+        columns = list(zip(self.head, *self.rows, strict=True))
+        shown = [
+            column
+            for number, column in enumerate(columns)
+            if number < self.num_labels or not {str(cell) for cell in column[1:]} <= {DASH, ''}
+        ]
+        widths = [max(len(str(cell)) for cell in column) + 3 for column in shown]
+        labels, used = shown[: self.num_labels], sum(widths[: self.num_labels]) + 1
+        parts: list[list[tuple[object, ...]]] = [[]]
+        room = width - used
+        for column, needed in zip(
+            shown[self.num_labels :], widths[self.num_labels :], strict=True
+        ):
+            if parts[-1] and needed > room:
+                parts.append([])
+                room = width - used
+            parts[-1].append(column)
+            room -= needed
+        return [
+            replace(self, head=[str(head) for head in heads], rows=rows)
+            for part in parts
+            for heads, *rows in [list(zip(*labels, *part, strict=True))]
+        ]
+
+    def text(self, width: int = MAX_WIDTH) -> str:
+        """Returns it as Markdown that fits a console, see `narrow`."""
+        return '\n\n'.join(part.markdown() for part in self.narrow(width))
 
     def markdown(self, *, aligned: bool = True) -> str:
         """Returns the table without its caption.

@@ -75,6 +75,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--width', type=int, default=384, help='of the images [px]')
     parser.add_argument('--height', type=int, default=288)
     parser.add_argument(
+        '--fps', type=float, default=10.0, help='frames a second, at most 50; 16 for Wan'
+    )
+    parser.add_argument(
         '--sheets', action='store_true', help='also write a larger contact sheet of every task'
     )
     parser.set_defaults(handler=_collect)
@@ -102,8 +105,18 @@ def _collect(arguments: argparse.Namespace) -> int:
             policies=arguments.policies,
             kinds=kinds_named(arguments.faults) if arguments.faults else (),
             siblings=arguments.siblings,
-            record=RecordConfig(pictures=arguments.pictures),
+            record=RecordConfig(
+                pictures=arguments.pictures, frame_period_s=_period(arguments.fps)
+            ),
         ),
         sheets=arguments.sheets,
     )
     return 0
+
+
+def _period(fps: float) -> float:
+    from mtv_world_ros.errors import ConfigError
+
+    if not 0 < fps <= 50:
+        raise ConfigError(f'--fps is {fps:g}; it must be above 0 and at most 50')
+    return 1 / fps

@@ -69,9 +69,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         '--truth',
-        choices=('segmenter', 'simulator'),
-        default='segmenter',
-        help='segmenter whose masks of the recorded frames count as ground truth',
+        choices=('simulator', 'segmenter'),
+        default='simulator',
+        help="ground truth: the simulator's masks, where an episode has them, or the segmenter's "
+        'masks of the recorded frames',
     )
     parser.add_argument(
         '--quality', type=names, default=(), metavar='LIST', help='of psnr,ssim,lpips'

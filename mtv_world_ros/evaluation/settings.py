@@ -23,8 +23,8 @@ class EvaluationConfig:
         num_inference_steps: denoising steps; 0 = those the model is made for.
         actions: of `controls.ACTIONS`: everything is imagined once with each.
         ceiling: score the recorded frames too, as they are and through the autoencoder.
-        use_ids: score against the recorded identities instead of the segmenter's masks of the
-            recorded frames.
+        use_ids: score against the recorded identities, where an episode has them, instead of the
+            segmenter's masks of the recorded frames.
         quality: of `image_quality.MEASURES`.
         fid_weights: Inception-v3 state dict; None = no FID.
         fvd_weights: I3D state dict or VideoMAE folder; None = no FVD.
@@ -36,7 +36,7 @@ class EvaluationConfig:
     num_inference_steps: int = 0
     actions: tuple[str, ...] = ('true', 'shuffled')
     ceiling: bool = True
-    use_ids: bool = False
+    use_ids: bool = True
     quality: tuple[str, ...] = ()
     fid_weights: Path | None = None
     fvd_weights: Path | None = None

@@ -234,7 +234,7 @@ def console(summary: Summary) -> str:
         _powered(summary),
         _speed(summary),
     ]
-    parts = [f'{found.caption}\n\n{found.markdown()}' for found in tables]
+    parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
     return '\n\n'.join([*parts, *remarks(summary)[2:]])
 
 

@@ -1,13 +1,16 @@
-"""Jaccard index of masks by the conventions of DAVIS 2017, per view, object and frame.
+"""Jaccard index J and boundary measure F of masks as in DAVIS 2017, per view, object and frame.
 
-Frame 0 is the condition, not a prediction: pass frames 1..T.
+Frame 0 is the condition, not a prediction: pass frames 1..T. DAVIS leaves out the last frame,
+too; here it counts, since an episode's outcome shows in it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil, hypot
 import warnings
 
+import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray, ObjectMasks
@@ -43,6 +46,49 @@ def jaccard(pred: BoolArray, true: BoolArray, void: BoolArray | None = None) -> 
     return np.where(union == 0, 1.0, intersection / np.maximum(union, 1))
 
 
+#: how far boundaries may lie apart and still match, as a share of the image's diagonal
+BOUNDARY_SHARE = 0.008
+
+
+def boundary_f(pred: BoolArray, true: BoolArray) -> FloatArray:
+    """Returns F of the boundaries of masks: the harmonic mean of their precision and recall.
+
+    A pixel of one boundary counts where the other boundary is at most `BOUNDARY_SHARE` of the
+    image's diagonal away. Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_boundary`).
+
+    Args:
+        pred: (..., H, W) bool.
+        true: the same shape.
+    """
+    height, width = true.shape[-2:]
+    reach = ceil(BOUNDARY_SHARE * hypot(height, width))
+    offsets = np.arange(-reach, reach + 1)
+    disk = (offsets[:, None] ** 2 + offsets**2 <= reach**2).astype(np.uint8)
+    pairs = zip(pred.reshape(-1, height, width), true.reshape(-1, height, width), strict=True)
+    values = [_boundary_f(one, other, disk) for one, other in pairs]
+    return np.array(values, np.float64).reshape(true.shape[:-2])
+
+
+def _boundary_f(pred: BoolArray, true: BoolArray, disk: np.ndarray) -> float:
+    edges = [_boundary(mask) for mask in (pred, true)]
+    counts = [int(edge.sum()) for edge in edges]
+    if not all(counts):
+        return float(counts == [0, 0])
+    near = [cv2.dilate(edge.astype(np.uint8), disk).astype(bool) for edge in edges]
+    precision, recall = ((edges[k] & near[1 - k]).sum() / counts[k] for k in (0, 1))
+    return float(2 * precision * recall / (precision + recall)) if precision + recall else 0.0
+
+
+def _boundary(mask: BoolArray) -> BoolArray:
+    """The pixels that differ from the one to the right, below, or both (DAVIS, `seg2bmap`)."""
+    right, below, corner = mask.copy(), mask.copy(), mask.copy()
+    right[:, :-1], below[:-1], corner[:-1, :-1] = mask[:, 1:], mask[1:], mask[1:, 1:]
+    found = (mask ^ right) | (mask ^ below) | (mask ^ corner)
+    found[-1], found[:, -1] = mask[-1] ^ right[-1], mask[:, -1] ^ below[:, -1]
+    found[-1, -1] = False
+    return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectScores:
     """J of one video against another; NaN is 'not scored', with the reason in `status`.
@@ -52,6 +98,7 @@ class ObjectScores:
         frames: (V, O, T) J per frame.
         visible: (V, O) mean J over the frames in which the true mask is not empty.
         objects: (V, O) mean J over frames, both-empty frames counted as 1 (DAVIS).
+        boundary: (V, O) mean F over frames.
         union: (V,) mean J of the union of the scored objects (the paper's formula).
         status: V tuples of O words: `ok`, or why there is no score, or why to doubt it.
     """
@@ -60,6 +107,7 @@ class ObjectScores:
     frames: FloatArray
     visible: FloatArray
     objects: FloatArray
+    boundary: FloatArray
     union: FloatArray
     status: tuple[tuple[str, ...], ...]
 
@@ -100,11 +148,14 @@ def object_scores(
     frames = jaccard(pred.masks, true.masks, blank)
     frames = np.where(scored[:, :, None], frames, np.nan)
     shown = true.masks.any((-2, -1))
+    edges = np.full(frames.shape, np.nan)
+    edges[scored] = boundary_f(pred.masks[scored], true.masks[scored])
     return ObjectScores(
         names=true.names,
         frames=frames,
         visible=mean_of_known(np.where(shown, frames, np.nan), axis=2),
         objects=mean_of_known(frames, axis=2),
+        boundary=mean_of_known(edges, axis=2),
         union=_union(pred.masks, true.masks, scored, void),
         status=status,
     )

@@ -59,8 +59,14 @@ def test_what_is_not_measured_is_null(make_pipeline, episodes, tmp_path):
 def test_scores_against_true_masks_need_no_perfect_segmenter(
     make_pipeline, episodes, blurred_oracle, tmp_path
 ):
-    metrics, _ = run(make_pipeline(blurred_oracle), episodes, tmp_path, use_ids=True)
+    metrics, text = run(make_pipeline(blurred_oracle), episodes, tmp_path)
     assert 0.7 < metrics['overall']['j_object_mean'] < 1.0
+    assert metrics['num_episodes_with_true_masks'] == 3 and "the simulator's masks" in text
+    own, text = run(make_pipeline(blurred_oracle), episodes, tmp_path, use_ids=False)
+    assert own['num_episodes_with_true_masks'] == 0 and "segmenter's own masks" in text
+    assert own['overall']['j_self'] == 1.0 > metrics['overall']['j_self']
+    both = metrics['overall']
+    assert both['jf_moving'] == pytest.approx((both['j_moving'] + both['f_moving']) / 2, abs=1e-5)
     assert "simulator's" in metrics['moving_rule']
 
 
@@ -79,10 +85,11 @@ def test_object_outside_the_palette_is_not_scored_and_says_so(
     make_pipeline, make_episode, tmp_path
 ):
     path = make_episode(tmp_path / 'episode', objects=('red block', 'wooden spoon'))
-    metrics, _ = run(make_pipeline(), [path], tmp_path / 'out')
-    low = metrics['views']['low']
-    assert low['num_not_scored'] == 2
-    assert low['status']['true: out_of_palette'] == 2
+    for use_ids, status in ((True, 'predicted'), (False, 'true')):
+        metrics, _ = run(make_pipeline(), [path], tmp_path / status, use_ids=use_ids)
+        low = metrics['views']['low']
+        assert low['num_not_scored'] == 2
+        assert low['status'][f'{status}: out_of_palette'] == 2
 
 
 def test_object_that_the_model_loses_scores_0_and_says_so(make_pipeline, episodes, tmp_path):
@@ -238,7 +245,7 @@ def test_quality_of_pictures_is_measured_by_view(make_pipeline, episodes, oracle
 
 def test_statuses_are_counted_in_the_tables(make_pipeline, make_episode, tmp_path):
     path = make_episode(tmp_path / 'episode', objects=('red block', 'wooden spoon'))
-    _, table = run(make_pipeline(), [path], tmp_path / 'out')
+    _, table = run(make_pipeline(), [path], tmp_path / 'out', use_ids=False)
     assert '| true: out_of_palette | 2   | 2    |' in table
 
 

@@ -6,6 +6,7 @@ import pytest
 from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.vision.jaccard import (
+    boundary_f,
     jaccard,
     mean_of_known,
     moves,
@@ -193,3 +194,47 @@ def test_hiding_an_object_is_no_motion_but_displacing_it_is():
 def test_mean_of_nothing_known_is_nan_without_warning(recwarn):
     assert np.isnan(mean_of_known(np.array([np.nan, np.nan])))
     assert not recwarn
+
+
+def counted_f(pred, true):
+    """DAVIS' `db_eval_boundary`, pixel by pixel: its `seg2bmap`, matched within the disk."""
+    height, width = true.shape
+    reach = int(np.ceil(0.008 * np.linalg.norm(true.shape)))
+
+    def edge(mask):
+        found = []
+        for y in range(height):
+            for x in range(width):
+                right, below = min(x + 1, width - 1), min(y + 1, height - 1)
+                others = (mask[y, right], mask[below, x], mask[below, right])
+                if any(mask[y, x] != other for other in others):
+                    found.append((y, x))
+        return found
+
+    def share(these, those):
+        near = [any((y - v) ** 2 + (x - u) ** 2 <= reach**2 for v, u in those) for y, x in these]
+        return np.mean(near)
+
+    here, there = edge(pred), edge(true)
+    if not here or not there:
+        return float(not here and not there)
+    precision, recall = share(here, there), share(there, here)
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_boundaries_score_as_counted_pixel_by_pixel(seed):
+    rng = np.random.default_rng(seed)
+    shape = (40, 130)  # a diagonal of 136: 2 px apart still match
+    pred, true = (square(*rng.integers(0, 20, 2), int(rng.integers(5, 25)), shape) for _ in '12')
+    true[5:9, 100:130] = pred[30:40, 60] = True  # at the border; a line
+    assert boundary_f(pred, true) == pytest.approx(counted_f(pred, true), abs=1e-12)
+
+
+def test_boundaries_a_pixel_apart_match_and_empty_ones_follow_davis():
+    here, aside, far = square(10, 10), square(11, 10), square(50, 20)
+    empty = np.zeros_like(here)
+    stacked = boundary_f(np.stack([here, here, empty, here]), np.stack([aside, far, empty, empty]))
+    np.testing.assert_array_equal(stacked, [1.0, 0.0, 1.0, 0.0])
+    scores = object_scores(objects([[[here, here]]]), objects([[[aside, far]]]))
+    assert scores.boundary[0, 0] == 0.5

@@ -52,6 +52,9 @@ class ScoreRow:
         j_copy_frames: the same of the first frame held.
         j_shuffled_frames: the same with the actions of another episode; empty = not imagined.
         moving_imagined: whether it moves in the predicted frames, by the same rule.
+        f: mean boundary F over frames.
+        f_copy: the same of the first frame held.
+        f_self: the same of the recorded frames themselves.
     """
 
     stretch: int
@@ -72,6 +75,9 @@ class ScoreRow:
     j_copy_frames: tuple[float, ...]
     j_shuffled_frames: tuple[float, ...]
     moving_imagined: bool = False
+    f: float = np.nan
+    f_copy: float = np.nan
+    f_self: float = np.nan
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values, None for NaN."""
@@ -213,6 +219,9 @@ def score_rows(
                     j_copy_frames=_frames(scores['copy'], v, o),
                     j_shuffled_frames=_frames(scores.get('shuffled'), v, o),
                     moving_imagined=bool(imagined[v, o]),
+                    f=float(predicted.boundary[v, o]),
+                    f_copy=float(scores['copy'].boundary[v, o]),
+                    f_self=float(scores['self'].boundary[v, o]) if 'self' in scores else np.nan,
                     **_values(scores, lambda found, v=v, o=o: found.objects[v, o]),
                 )
             )
@@ -271,6 +280,17 @@ MEANS = {
     'j_mirrored_moving': ('j_mirrored', 'moving'),
     'j_ceiling_moving': ('j_ceiling', 'moving'),
     'j_self_moving': ('j_self', 'moving'),
+    'f_moving': ('f', 'moving'),
+    'f_copy_moving': ('f_copy', 'moving'),
+    'f_self_moving': ('f_self', 'moving'),
+    'f_object_mean': ('f', 'object'),
+}
+#: J&F of DAVIS: the mean of a J and an F
+BOTH = {
+    'jf_moving': ('j_moving', 'f_moving'),
+    'jf_copy_moving': ('j_copy_moving', 'f_copy_moving'),
+    'jf_self_moving': ('j_self_moving', 'f_self_moving'),
+    'jf_object_mean': ('j_object_mean', 'f_object_mean'),
 }
 #: means over frames of one episode that are not of objects
 QUALITY = ('psnr', 'ssim', 'lpips')
@@ -299,6 +319,8 @@ def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float
         'moving_either': [row for row in kept if row.name and (row.moving or row.moving_imagined)],
     }
     means = {name: _mean(chosen[which], field) for name, (field, which) in MEANS.items()}
+    for name, (area, edge) in BOTH.items():
+        means[name] = (means[area] + means[edge]) / 2
     for name, (minuend, subtrahend) in MARGINS.items():
         means[name] = means[minuend] - means[subtrahend]
     return means

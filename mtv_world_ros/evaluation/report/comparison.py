@@ -79,7 +79,7 @@ def method_table(summaries: Sequence[Summary]) -> str:
             cells += [tables.cell(found.get(name), 1) for name in ('fid', 'fvd')]
             cells += [tables.cell(found.get(name)) for name in ('j_union', 'j_moving')]
         body.append(cells)
-    return Table(head=head, rows=body).markdown()
+    return Table(head=head, rows=body).text()
 
 
 def task_tables(summaries: Sequence[Summary]) -> str:
@@ -97,7 +97,7 @@ def task_tables(summaries: Sequence[Summary]) -> str:
             [row.label, *(tables.cell(row.numbers(v, t).get('j_union')) for t, v in columns)]
             for row in rows
         ]
-        parts.append(Table(head=head, rows=body).markdown())
+        parts.append(Table(head=head, rows=body).text())
     return '\n\n'.join(parts)
 
 

@@ -127,6 +127,7 @@ class Summary:
             'notes': {r.episode: r.notes for r in self.results if r.notes},
             **self.settings,
             'model': asdict(self.spec),
+            'num_episodes_with_true_masks': self.num_true,
             'moving_rule': MOVING_RULE.format(source=source),
             'interval': f'{METHOD}; of FID and FVD jackknife over groups of episodes',
             **self._numbers(ALL),
@@ -155,6 +156,7 @@ class Summary:
                    for task in self.tasks for view in views]  # fmt: skip
         parts = [
             f'# {self.name or "Evaluation"}\n\n{len(self.results)} episodes: {counts}.',
+            self._truth(),
             BRACKETS,
             tables.markdown_table([*by_view, ('all views', self.estimates(None))], 'view'),
             tables.markdown_table(sets, 'zero-shot set · view') if sets else '',
@@ -168,6 +170,25 @@ class Summary:
         ]
         return '\n\n'.join(part for part in parts if part) + '\n'
 
+    @property
+    def num_true(self) -> int:
+        """Episodes that were scored against the simulator's masks."""
+        return sum(r.has_ids for r in self.results) if self.settings.get('use_ids') else 0
+
+    def _truth(self) -> str:
+        """What the predictions were scored against."""
+        others = len(self.results) - self.num_true
+        if not others:
+            return (
+                "Ground truth: the simulator's masks. 'Segmenter alone' is the segmenter's own J "
+                'on the recorded frames; no prediction can be expected to exceed it.'
+            )
+        where = f' in {others} of {len(self.results)} episodes' if self.num_true else ''
+        return (
+            f"Ground truth: the segmenter's own masks of the recorded frames{where}. Its errors "
+            'there do not show in the numbers, and a ceiling of 1 says nothing.'
+        )
+
     def _chunks_table(self) -> str:
         """J against the number of the chunk; empty where no rollout has two."""
         if self.num_chunks < 2:
@@ -178,7 +199,7 @@ class Summary:
             [str(k + 1), *(tables.point(c.values, c.band, k) for c in curves.values())]
             for k in range(self.num_chunks)
         ]
-        return Table(head=head, rows=rows).markdown()
+        return Table(head=head, rows=rows).text()
 
     def _numbers(self, group: Group) -> dict[str, Any]:
         return {

@@ -18,21 +18,26 @@ COLUMNS = {
     'j_union': 'J union',
     'j_moving': 'J moving',
     'j_moving_either': 'J moving in truth or imagination',
+    'jf_moving': 'J&F moving',
     'j_copy_moving': 'persistence',
     'j_shuffled_moving': 'shuffled actions',
     'margin_moving': 'margin over persistence',
     'skill': 'skill',
-    'j_ceiling': 'ceiling',
+    'j_self_moving': 'segmenter alone',
+    'j_ceiling_moving': 'ceiling',
 }
 #: rows of the table that shows whether the model obeys, and what could be reached at all
 CONTROLS = {
-    'j_self_moving': 'recorded frames',
+    'j_self_moving': 'recorded frames: what the segmenter leaves',
+    'jf_self_moving': 'the same, J&F',
     'j_ceiling_moving': 'recorded frames through the autoencoder',
     'j_moving': 'imagined, true actions',
+    'jf_moving': 'the same, J&F',
     'j_shuffled_moving': "imagined, another episode's actions",
     'j_zero_moving': 'imagined, joints held',
     'j_mirrored_moving': 'imagined, mirrored actions',
     'j_copy_moving': 'first frame held (persistence)',
+    'jf_copy_moving': 'the same, J&F',
     'margin_of_shuffled': 'shuffled actions - persistence',
 }
 NOT_MEASURED = Estimate(value=nan, interval=(nan, nan), num_episodes=0)
@@ -71,7 +76,7 @@ def rows_csv(rows: Iterable[tuple[str, str, ScoreRow]]) -> str:
 def markdown_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]], first: str) -> str:
     """Returns a table of (label, estimates) with 95 % intervals in brackets."""
     rows = [[label, *(cell(found.get(key)) for key in COLUMNS)] for label, found in lines]
-    return Table(head=[first, *COLUMNS.values()], rows=rows).markdown()
+    return Table(head=[first, *COLUMNS.values()], rows=rows).text()
 
 
 def controls_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
@@ -81,7 +86,7 @@ def controls_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
         [words, *(cell(found.get(key)) for _, found in lines)] for key, words in CONTROLS.items()
     ]
     rows = [row for row in body if set(row[1:]) != {DASH}]
-    return Table(head=head, rows=rows).markdown()
+    return Table(head=head, rows=rows).text()
 
 
 def quality_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
@@ -90,14 +95,14 @@ def quality_table(lines: Sequence[tuple[str, Mapping[str, Estimate]]]) -> str:
     if not measured:
         return ''
     body = [[view, *(cell(found.get(key)) for key in measured)] for view, found in lines]
-    return Table(head=['view', *(QUALITY[key] for key in measured)], rows=body).markdown()
+    return Table(head=['view', *(QUALITY[key] for key in measured)], rows=body).text()
 
 
 def status_table(views: Mapping[str, Mapping[str, int]]) -> str:
     """Returns how often each status of an object in a stretch was met, by view."""
     words = sorted({word for counts in views.values() for word in counts})
     body = [[word, *(str(counts.get(word, 0)) for counts in views.values())] for word in words]
-    return Table(head=['objects by status', *views], rows=body).markdown()
+    return Table(head=['objects by status', *views], rows=body).text()
 
 
 def point(values: Sequence[float], band: Sequence[tuple[float, float]], index: int) -> str:

@@ -72,6 +72,9 @@ def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[s
         for side in ('width', 'height')
         if size[side] != getattr(plain, side)
     )
+    period = card['config']['record']['frame_period_s']
+    if period != CollectConfig().record.frame_period_s:
+        options += f' --fps {1 / period:g}'
     if share := card['config']['moved_share']:
         options += f' --moved-cameras {share}'
     if policies := card['config']['policies']:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 import time
 
@@ -39,7 +40,8 @@ class RecordConfig:
 
     Attributes:
         hold_s: from the end of the commands to the last frame, at least [s].
-        frame_period_s: between frames [s]; a multiple of 0.02.
+        frame_period_s: between frames [s], at least 0.02; each is taken at the nearest multiple of
+            0.02 s, and stamped with it.
         chunk_s: the policy publishes an action chunk this often, of this horizon [s].
         point_period_s: between the points of a chunk [s]; a multiple of 0.02.
         jpeg_quality: of the recorded frames, 1 to 100.
@@ -56,13 +58,22 @@ class RecordConfig:
     pictures: str = 'all'
 
     def __post_init__(self) -> None:
-        for field in ('hold_s', 'frame_period_s', 'chunk_s', 'point_period_s'):
+        if not self.frame_period_s >= CONTROL_PERIOD_S:
+            raise SimulatorError(
+                f'frame_period_s is {self.frame_period_s}; the simulator has at most '
+                f'{1 / CONTROL_PERIOD_S:g} frames a second'
+            )
+        for field in ('hold_s', 'chunk_s', 'point_period_s'):
             value = getattr(self, field)
             periods = value / CONTROL_PERIOD_S
             if value <= 0 or abs(periods - round(periods)) > 1e-6:
                 raise SimulatorError(
                     f'{field} is {value}; it must be a positive multiple of {CONTROL_PERIOD_S} s'
                 )
+
+    def frame_at(self, number: int) -> int:
+        """Returns the control period at which a frame is taken."""
+        return round(number * self.frame_period_s / CONTROL_PERIOD_S)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,13 +155,13 @@ def simulate(
         policy.reset(seed=seed)
         commands = policy.plan
     measured = [sim.positions()]
-    every = round(config.frame_period_s / CONTROL_PERIOD_S)
     last = len(commands.times) - 1
-    num_frames = -(-(last + round(config.hold_s / CONTROL_PERIOD_S)) // every)
-    for k in range(1, num_frames * every + 1):
+    least = last + round(config.hold_s / CONTROL_PERIOD_S)
+    num_frames = next(n for n in count(1) if config.frame_at(n) >= least)
+    for k in range(1, config.frame_at(num_frames) + 1):
         sim.advance(commands.positions[min(k, last)])
         measured.append(sim.positions())
-        if k % every == 0:
+        if k == config.frame_at(len(observations)):
             before = time.process_time()
             observations.append(sim.observe(rendering=config.pictures == 'all'))
             rendering += time.process_time() - before
@@ -222,17 +233,17 @@ def write_take(
     ) as writer:
         writer.outcome = 'success' if take.ever and take.final else 'failure'
         writer.write_instruction(START_NS)
-        frame_every = round(config.frame_period_s / CONTROL_PERIOD_S)
         chunk_every = round(config.chunk_s / CONTROL_PERIOD_S)
         names = sim.robot.joint_names
         velocities = np.gradient(take.control_positions, CONTROL_PERIOD_S, axis=0)
-        last = len(take.control_positions) - 1
+        last, frame = len(take.control_positions) - 1, 0
         for k, positions in enumerate(take.control_positions):
             stamp = _stamp(k * CONTROL_PERIOD_S)
             writer.write_joint_states(stamp, names, positions, velocities[k])
-            if k % frame_every == 0:
-                writer.write_object_poses(stamp, take.object_poses[k // frame_every])
-                _write_frame(writer, sim, take.observations[k // frame_every], stamp)
+            if k == config.frame_at(frame):
+                writer.write_object_poses(stamp, take.object_poses[frame])
+                _write_frame(writer, sim, take.observations[frame], stamp)
+                frame += 1
             if k % chunk_every == 0 and k < last:
                 commands = chunk(take.commands, k * CONTROL_PERIOD_S, config)
                 writer.write_trajectory(stamp, commands)

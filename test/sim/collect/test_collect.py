@@ -316,3 +316,25 @@ def test_poses_of_an_episode_whose_seed_draws_another_scene_are_refused(data_set
         true_poses(other, robot)
     with pytest.raises(EpisodeError, match='no object poses'):
         true_poses(replace(episode, object_poses=None), robot)
+
+
+def test_81_frames_at_16_fps_and_288x384_can_be_cut(tmp_path, data_set):
+    """Clips of the paper's model; stamps are those of the control periods, at most 10 ms off."""
+    from mtv_world_ros.data.recording import clip_starts, load_recording
+    from mtv_world_ros.files import share_path
+    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.training.config import load_training_config
+
+    del data_set  # skips without OpenGL
+    words = ['collect', '--task', 'stack_blocks_two', '--episodes', '1', '--fps', '16']
+    assert main([*words, '--seed', '3', '--out', str(tmp_path)]) == 0
+    (path,) = (folder for folder in tmp_path.iterdir() if (folder / 'metadata.yaml').is_file())
+    spec = load_training_config('wan-1.3b').spec
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    recording = load_recording(path, spec, robot)
+    assert recording.frames.shape[2:] == (288, 384, 3)
+    ideal = np.arange(len(recording.times)) / 16
+    assert np.abs(recording.times - ideal).max() <= 0.01 + 1e-6
+    assert len(clip_starts(recording, spec)) > 0
+    assert '--fps 16' in (tmp_path / 'README.md').read_text()
+    assert main([*words[:-1], '60', '--out', str(tmp_path / 'x')]) == 1

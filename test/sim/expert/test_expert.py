@@ -145,4 +145,4 @@ def test_closed_loop_policy_sees_time_pass_and_joints_move(sim, expert):
 
 def test_sampling_off_the_control_clock_is_refused():
     with pytest.raises(SimulatorError, match='multiple of 0.02'):
-        RecordConfig(frame_period_s=0.033)
+        RecordConfig(hold_s=0.033)
