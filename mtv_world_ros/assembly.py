@@ -203,6 +203,25 @@ def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
     return (*(spec for spec in known if spec.name != given.name), given), given.name
 
 
+def recorded_robot(episode: Path, name: str) -> Path:
+    """Returns the YAML of the robot that an episode shows.
+
+    Args:
+        episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
+        name: of the robot, by the episode's metadata.
+
+    Raises:
+        ConfigError: there is no file of that name.
+    """
+    for folder in (episode, *list(episode.resolve().parents)[:2]):
+        file = folder / ROBOT_FOLDER / ROBOT_YAML
+        if file.is_file() and load_robot(file).name == name:
+            return file
+    if not name:
+        raise ConfigError(f"'{episode}' does not say which robot it shows; name it with --robot")
+    return robot_path(name)
+
+
 def checkpoint_robot(checkpoint: str | Path, robot: str | Path | None = None) -> RobotModel:
     """Returns the robot that a checkpoint carries or, older ones, names.
 

@@ -25,7 +25,12 @@ ByteArray = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
 
 #: distortion models of sensor_msgs/CameraInfo and how many coefficients OpenCV reads for each
-DISTORTION_MODELS = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14)}
+DISTORTION_MODELS = {
+    'none': (0,),
+    'plumb_bob': (4, 5),
+    'rational_polynomial': (8, 12, 14),
+    'equidistant': (4,),
+}
 
 
 def _freeze(
@@ -57,8 +62,9 @@ class CameraModel:
         width: image width [px].
         height: image height [px].
         K: (3, 3) intrinsic matrix [px].
-        distortion_model: `none`, `plumb_bob` or `rational_polynomial`.
-        distortion: coefficients in OpenCV order (k1 k2 p1 p2 k3 ...); empty for `none`.
+        distortion_model: `none`, `plumb_bob`, `rational_polynomial` or `equidistant` (fisheye).
+        distortion: coefficients in OpenCV order (k1 k2 p1 p2 k3 ..., equidistant k1 k2 k3 k4);
+            empty for `none`.
         mount_link: robot link that carries the camera; the base link for a fixed camera.
         T_mount_camera: (4, 4) pose of the optical frame (x right, y down, z ahead) [m].
     """

@@ -8,6 +8,7 @@ import sys
 import tempfile
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.options import add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--seconds', type=float, default=10.0, help='with --live: how long to record'
     )
     parser.add_argument('--views', help='comma-separated; default: all; needed with --live')
-    parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
+    add_source(parser)
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
     parser.set_defaults(handler=_doctor)
@@ -60,18 +61,24 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
-    from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.data.episode_reader import read_episode
+    from mtv_world_ros.assembly import recorded_robot, robot_path
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.episode_reader import read_episode, read_info
     from mtv_world_ros.inspection.inspect import load_inspector
     from mtv_world_ros.inspection.report import to_text
 
+    source = load_source(arguments.topics, arguments.calibration)
+    robot = arguments.robot or (source.mapping.robot if source.mapping else '')
+    file = robot_path(robot) if robot else recorded_robot(path, read_info(path).robot)
+    inspector = load_inspector(file)
     episode = read_episode(
-        path, views=_views(arguments), calibration=arguments.calibration, with_masks=False
+        path,
+        views=_views(arguments),
+        calibration=source.calibration,
+        with_masks=False,
+        mapping=source.mapping,
+        robot=inspector.robot,
     )
-    robot = arguments.robot or episode.info.robot
-    if not robot:
-        raise ConfigError(f"'{path}' does not say which robot it shows; name it with --robot")
-    inspector = load_inspector(robot_path(robot))
     inspection = inspector.inspect(episode)
     out = arguments.out or Path('out/doctor') / name
     _write(inspector, episode, inspection, out)

@@ -15,6 +15,7 @@ from mtv_world_ros.cli.options import (
     add_seeds,
     add_segmenter,
     add_serving,
+    add_source,
     add_task,
     names,
     pipeline_choices,
@@ -92,6 +93,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_serving(parser)
     add_seeds(parser)
     add_segmenter(parser)
+    add_source(parser)
     add_task(parser)
     parser.set_defaults(handler=_evaluate)
 
@@ -184,6 +186,7 @@ def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, out: Path
 ) -> Summary:
     from mtv_world_ros.assembly import assemble_describer, fingerprint, load_pipeline
+    from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
 
     load = partial(
@@ -221,4 +224,5 @@ def _score(
         quality=arguments.quality,
         fid_weights=arguments.fid_weights,
         fvd_weights=arguments.fvd_weights,
+        source=load_source(arguments.topics, arguments.calibration),
     )

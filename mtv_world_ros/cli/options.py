@@ -53,6 +53,23 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """Adds `--topics` and `--calibration`."""
+    parser.add_argument(
+        '--topics',
+        type=Path,
+        metavar='FILE',
+        help="mapping of a robot's own bags (see config/datasets/bag.yaml); default: the names of "
+        'this package',
+    )
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        metavar='FILE',
+        help="of the cameras; default: calibration.yaml beside each bag, or the bag's TF",
+    )
+
+
 def names(text: str) -> tuple[str, ...]:
     """Returns the names of a comma-separated list, as an option's type."""
     return tuple(name.strip() for name in text.split(',') if name.strip())

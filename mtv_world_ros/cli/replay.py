@@ -13,6 +13,7 @@ from mtv_world_ros.cli.options import (
     add_overwrite,
     add_segmenter,
     add_serving,
+    add_source,
     add_task,
     pipeline_of,
 )
@@ -32,8 +33,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('episode', type=Path)
     parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
-    parser.add_argument('--calibration', type=Path, help='default: the one in the episode')
     add_overwrite(parser)
+    add_source(parser)
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
@@ -48,6 +49,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         return _play(arguments)
     if not arguments.episode.exists():
         raise EpisodeError(f"there is no episode '{arguments.episode}'")
+    from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.replay.offline import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
@@ -56,7 +58,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         pipeline_of(arguments),
         arguments.episode,
         out,
-        calibration=arguments.calibration,
+        source=load_source(arguments.topics, arguments.calibration),
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
         overwrite=arguments.overwrite,

@@ -10,12 +10,13 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype
+from mtv_world_ros.cli.options import add_dtype, add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     import torch
 
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.evaluation.results import StoredRollout
     from mtv_world_ros.training.config import TrainingConfig
     from mtv_world_ros.training.run import HeldOut, Judge
@@ -69,6 +70,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
         'share it',
     )
+    add_source(parser)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
     add_dtype(parser)
@@ -135,11 +137,13 @@ def _train(arguments: argparse.Namespace) -> int:
         read_card(checkpoint_path(arguments.init))
     import torch
 
+    from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.run import train
 
+    source = load_source(arguments.topics, arguments.calibration)
     dtype = choose_dtype(arguments.dtype, arguments.device)
     paths = select(arguments.dataset, arguments.split, default='train').paths
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
@@ -160,10 +164,11 @@ def _train(arguments: argparse.Namespace) -> int:
         num_episodes=arguments.episodes,
         initial=arguments.init and checkpoint_path(arguments.init),
         cache=arguments.cache,
-        held_out=held_out(arguments, paths, dtype),
+        held_out=held_out(arguments, paths, dtype, source),
         data_workers=arguments.data_workers,
         peak_flops=arguments.peak_tflops * 1e12,
         latent_cache=arguments.latent_cache,
+        source_of_episodes=source,
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
@@ -254,7 +259,10 @@ def add_held_out(parser: argparse.ArgumentParser) -> None:
 
 
 def held_out(
-    arguments: argparse.Namespace, trained_on: Sequence[Path], dtype: torch.dtype
+    arguments: argparse.Namespace,
+    trained_on: Sequence[Path],
+    dtype: torch.dtype,
+    source: EpisodeSource,
 ) -> HeldOut | None:
     """Returns the scorer of held-out episodes; None if it is off.
 
@@ -273,7 +281,12 @@ def held_out(
             '--held-out another folder, or --split train'
         )
     judge = make_judge(
-        paths, arguments.out / 'held_out', arguments.device, dtype, base=arguments.init
+        paths,
+        arguments.out / 'held_out',
+        arguments.device,
+        dtype,
+        base=arguments.init,
+        source=source,
     )
     return HeldOut(judge, arguments.sample_every)
 
@@ -295,7 +308,12 @@ def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
 
 
 def make_judge(
-    paths: Sequence[Path], out: Path, device: str, dtype: torch.dtype, base: str | None = None
+    paths: Sequence[Path],
+    out: Path,
+    device: str,
+    dtype: torch.dtype,
+    base: str | None = None,
+    source: EpisodeSource | None = None,
 ) -> Judge:
     """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
@@ -305,10 +323,12 @@ def make_judge(
         device: where to imagine.
         dtype: of the model.
         base: checkpoint that adapters are used on.
+        source: how the episodes are read; None = they are this package's own.
     """
     import torch
 
     from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.evaluation.evaluate import evaluate
     from mtv_world_ros.evaluation.results import load_rollout, rollout_path
     from mtv_world_ros.model.lora import ADAPTER
@@ -325,7 +345,13 @@ def make_judge(
             num_threads=torch.get_num_threads(),  # keep the training's threads
         )
         summary = evaluate(
-            pipeline, paths, folder, actions=('true',), ceiling=False, show_progress=False
+            pipeline,
+            paths,
+            folder,
+            actions=('true',),
+            ceiling=False,
+            show_progress=False,
+            source=source or EpisodeSource(),
         )
         for result in summary.results:
             show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)

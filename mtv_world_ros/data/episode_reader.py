@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import os
 from pathlib import Path
 import re
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from mtv_world_ros.data.bag.images import (
 )
 from mtv_world_ros.data.bag.messages import COMPRESSED_IMAGE, IMAGE
 from mtv_world_ros.data.bag.reader import BagReader, iter_messages
+from mtv_world_ros.data.bag_mapping import BagMapping, STATE
 from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
     Episode,
@@ -36,10 +38,12 @@ from mtv_world_ros.data.episode import (
     parse_info,
     Track,
 )
-from mtv_world_ros.data_types import ByteArray, CameraModel
+from mtv_world_ros.data.transform_tree import read_tree, TransformTree
+from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled, with_camera_info
+from mtv_world_ros.geometry.robot import RobotModel
 
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 
@@ -51,6 +55,7 @@ STREAMS = {
     'instruction': INSTRUCTION,
     'object_poses': OBJECT_POSES,
 }
+TF_TOPICS = ('/tf', '/tf_static')
 _PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed)?')
 Item = TypeVar('Item')
 
@@ -63,6 +68,8 @@ def read_episode(
     with_cameras: bool = True,
     with_masks: bool = True,
     topics: Mapping[str, str] | None = None,
+    mapping: BagMapping | None = None,
+    robot: RobotModel | None = None,
 ) -> Episode:
     """Reads an episode; frames are decoded later, when asked for.
 
@@ -72,20 +79,22 @@ def read_episode(
     Args:
         path: rosbag2 folder, also one that was cut off, or .mcap file.
         views: views to read; None = all.
-        calibration: camera calibration; None = calibration.yaml in the folder.
+        calibration: camera calibration; None = calibration.yaml in the folder, or else poses of
+            /tf and /tf_static with the intrinsics of CameraInfo.
         with_cameras: whether the cameras are needed.
         with_masks: whether to read object masks where there are any.
         topics: topics that differ from the default names, by view or by `joint_states`,
             `joint_trajectory`, `instruction`, `object_poses`, e.g.
             `{'low': '/camera_low/color/image_raw'}`.
+        mapping: what the topics of a robot's own bag are; `topics` goes before it.
+        robot: its links may carry cameras whose poses are from TF; None = any frame may.
 
     Raises:
         EpisodeError: no bag, a view is missing, or none of its images can be used.
         CalibrationError: a view's calibration is missing or does not fit its CameraInfo.
     """
-    return _EpisodeReader(Path(path), views, topics or {}, with_masks).read(
-        calibration, with_cameras
-    )
+    reader = _EpisodeReader(Path(path), views, topics or {}, with_masks, mapping, robot)
+    return reader.read(calibration, with_cameras)
 
 
 def read_info(path: Path | str) -> EpisodeInfo:
@@ -105,9 +114,17 @@ def read_info(path: Path | str) -> EpisodeInfo:
 
 
 def list_episodes(folder: Path | str) -> list[Path]:
-    """Episode folders anywhere in a folder, by path; unfinished (hidden) ones are left out."""
-    found = Path(folder).rglob('metadata.yaml')
-    return sorted(file.parent for file in found if not file.parent.name.startswith('.'))
+    """Episode folders anywhere in a folder, by path, links followed; hidden ones are left out."""
+    found, seen = [], set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:  # links may lead in a circle
+            folders.clear()
+            continue
+        seen.add(real)
+        if 'metadata.yaml' in names and not Path(place).name.startswith('.'):
+            found.append(Path(place))
+    return sorted(found)
 
 
 class _EpisodeReader:
@@ -117,11 +134,16 @@ class _EpisodeReader:
         views: Sequence[str] | None,
         named: Mapping[str, str],
         with_masks: bool,
+        mapping: BagMapping | None,
+        robot: RobotModel | None,
     ) -> None:
-        self.path = path
+        self.path, self.robot = path, robot
+        self.mapping = mapping or BagMapping()
+        named = {**(mapping.streams() if mapping else {}), **named}
         self.bag = BagReader(path)
         self.warnings: list[str] = []
         found = self.bag.topics()
+        self.types = found
         try:
             self.topics: EpisodeTopics = find_topics(path, found, views, named)
         except EpisodeError as error:
@@ -138,15 +160,15 @@ class _EpisodeReader:
         images = {view: self._images(view, names) for view, names in topics.views.items()}
         masks = {view: self._masks(names) for view, names in topics.views.items()}
         instructions = [(s, m.data) for s, m in self._take(topics.instruction, messages.STRING)]
-        states = self._take(topics.joint_states, messages.JOINT_STATE)
+        states = self._states()
         episode_info = _info(self.bag, instructions)
         return Episode(
             info=episode_info,
             views=tuple(topics.views),
             cameras=self._cameras(calibration, images) if with_cameras else {},
             images=images,
-            joint_states=merge_joint_states(topics.joint_states, states, self.warnings),
-            trajectories=self._trajectories(),
+            joint_states=states,
+            trajectories=self._trajectories(states),
             masks={view: track for view, track in masks.items() if track} or None,
             instructions=instructions,
             object_poses=self._object_poses(len(episode_info.objects)),
@@ -155,7 +177,9 @@ class _EpisodeReader:
         )
 
     def _receive(self) -> None:
-        for message in self.bag.messages(self.topics.names(with_masks=self.with_masks)):
+        wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
+        wanted |= {self._camera_info(view, names) for view, names in self.topics.views.items()}
+        for message in self.bag.messages(wanted):
             try:
                 parsed = messages.deserialize(message.msgtype, message.data)
             except EpisodeError as error:
@@ -203,12 +227,40 @@ class _EpisodeReader:
                 self._refuse(topic, EpisodeError(f'it holds {kind}, expected {msgtype}'))
         return taken
 
-    def _trajectories(self) -> Stamped:
+    def _states(self) -> JointStates | None:
+        topic = self.topics.joint_states
+        taken = self._take(topic, messages.JOINT_STATE)
+        states = merge_joint_states(topic, taken, self.warnings)
+        if states is None:
+            others = [name for name, kind in self.types.items() if kind == messages.JOINT_STATE]
+            if others and topic not in others:
+                self._warn_once(
+                    f"no joint states at '{topic}'; there are some at {_listed(others)}: name "
+                    'the topic in `joint_states`'
+                )
+            return None
+        return replace(states, joint_names=self._renamed(states.joint_names))
+
+    def _renamed(self, names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(self.mapping.joints.get(name, name) for name in names)
+
+    def _trajectories(self, states: JointStates | None) -> Stamped:
         topic = self.topics.joint_trajectory
+        if self.mapping.action == STATE:
+            return [] if states is None else following(states, self.mapping.chunk_s)
+        if self.types.get(topic) == messages.JOINT_STATE:
+            taken = self._take(topic, messages.JOINT_STATE)
+            leader = merge_joint_states(topic, taken, self.warnings)
+            if leader is None:
+                return []
+            named = replace(leader, joint_names=self._renamed(leader.joint_names))
+            return following(named, self.mapping.chunk_s)
         good: Stamped = []
         for stamp, message in self._take(topic, messages.JOINT_TRAJECTORY):
             try:
-                good.append((stamp, messages.parse_joint_trajectory(message)))
+                parsed = messages.parse_joint_trajectory(message)
+                names = self._renamed(parsed.joint_names)
+                good.append((stamp, replace(parsed, joint_names=names)))
             except MtvWorldError as error:
                 self._refuse(topic, error)
         return in_order(topic, good, self.warnings)
@@ -235,27 +287,71 @@ class _EpisodeReader:
     ) -> dict[str, CameraModel]:
         folder = self.path if self.path.is_dir() else self.path.parent
         file = Path(calibration) if calibration else folder / CALIBRATION_FILE
+        tree = None
         if not file.is_file():
-            raise CalibrationError(
-                f"'{file}' is not there: an episode needs the cameras' poses; put a "
-                f'{CALIBRATION_FILE} into its folder or name one in `calibration`'
-            )
-        known = load_calibration(file)
+            tree = self._tree()
+            if calibration or not tree.frames:
+                raise CalibrationError(
+                    f"'{file}' is not there: an episode needs the cameras' poses; put a "
+                    f'{CALIBRATION_FILE} into its folder or name one in `calibration` (the bag '
+                    'has no /tf_static either)'
+                )
+        known = load_calibration(file) if tree is None else {}
         cameras = {}
         for view, names in self.topics.views.items():
+            if tree is not None:
+                known[view] = self._from_tree(tree, view, names)
             if view not in known:
                 raise CalibrationError(
                     f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}"
                 )
-            camera = self._with_intrinsics(known[view], names.camera_info)
+            camera = self._with_intrinsics(known[view], view, names)
             height, width = images[view].frames[0].shape[:2]
             cameras[view] = scaled(camera, width, height)
         return cameras
 
-    def _with_intrinsics(self, camera: CameraModel, topic: str) -> CameraModel:
+    def _tree(self) -> TransformTree:
+        taken = [m for topic in TF_TOPICS for _, m in self._take(topic, messages.TF_MESSAGE)]
+        tree = read_tree(taken, self.mapping.tf_prefix)
+        self.warnings += tree.problems
+        return tree
+
+    def _from_tree(self, tree: TransformTree, view: str, names: ViewTopics) -> CameraModel:
+        """The camera's pose by TF; its intrinsics come from CameraInfo."""
+        topic = self._camera_info(view, names)
+        infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
+        if not infos:
+            raise CalibrationError(
+                f"'{self.path}', view '{view}': '{topic}' has no CameraInfo, which intrinsics "
+                'come from where there is no calibration file'
+            )
+        of_images = self.received[names.image][0][1][1].header.frame_id
+        of_info = infos[0].header.frame_id
+        if of_images and of_info and of_images != of_info:
+            self._warn_once(
+                f"view '{view}': its images are of frame '{of_images}', its CameraInfo of "
+                f"'{of_info}', which is used"
+            )
+        row = self.mapping.views.get(view)
+        frame = (row.frame if row else '') or of_info or of_images
+        links = () if self.robot is None else self.robot.link_names
+        link, T = tree.mount(frame, links)
+        return CameraModel(
+            view=view, width=1, height=1, K=np.eye(3), mount_link=link, T_mount_camera=T
+        )
+
+    def _camera_info(self, view: str, names: ViewTopics) -> str:
+        row = self.mapping.views.get(view)
+        given = row.camera_info if row else ''
+        return self.mapping.topic(given) if given else names.camera_info
+
+    def _with_intrinsics(self, camera: CameraModel, view: str, names: ViewTopics) -> CameraModel:
+        topic = self._camera_info(view, names)
         infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
         if not infos:
             return camera
+        rectified = '/image_rect' in names.image
+        infos = [_rectified(info) for info in infos] if rectified else infos
         first = _intrinsics(infos[0])
         for index, info in enumerate(infos):
             if _intrinsics(info) != first:
@@ -297,6 +393,11 @@ def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInf
 def _intrinsics(info: Any) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...]]:
     k, d = tuple(info.k.tolist()), tuple(info.d.tolist())
     return info.width, info.height, k, info.distortion_model, d
+
+
+def _rectified(info: Any) -> Any:
+    """The CameraInfo of rectified images: K is P's, without distortion."""
+    return replace(info, k=np.asarray(info.p).reshape(3, 4)[:, :3].ravel(), d=np.zeros(0))
 
 
 def _is_raw(message: Any) -> bool:
@@ -477,6 +578,34 @@ def in_order(
     return list(kept.items())
 
 
+def following(states: JointStates, chunk_s: float) -> Stamped:
+    """Positions as commands: each is reached at its own stamp.
+
+    Args:
+        states: positions over time.
+        chunk_s: length of a trajectory [s].
+
+    Returns:
+        (start stamp [ns], trajectory), each of which ends where the next one starts.
+    """
+    stamps = states.stamps_ns
+    seconds = (stamps - stamps[0]) * 1e-9
+    chunks: Stamped = []
+    first = 0
+    while first < len(stamps) - 1:
+        last = int(np.searchsorted(seconds, seconds[first] + chunk_s))
+        last = min(max(last, first + 1), len(stamps) - 1)
+        part = slice(first + 1, last + 1)
+        trajectory = JointTrajectory(
+            joint_names=states.joint_names,
+            times=np.asarray(seconds[part] - seconds[first], np.float64),
+            positions=states.positions[part],
+        )
+        chunks.append((int(stamps[first]), trajectory))
+        first = last
+    return chunks
+
+
 def merge_joint_states(
     topic: str, messages: Sequence[tuple[int, Any]], warnings: list[str]
 ) -> JointStates | None:
@@ -489,7 +618,11 @@ def merge_joint_states(
         None where no row is left.
     """
     ordered = sorted(messages, key=lambda item: item[0])
-    whole = [(s, m) for s, m in ordered if len(m.name) == len(m.position) > 0]
+    whole = [
+        (s, m)
+        for s, m in ordered
+        if len(m.name) == len(m.position) > 0 and np.isfinite(m.position).all()
+    ]
     if len(whole) < len(ordered):
         count = len(ordered) - len(whole)
         warnings.append(f"'{topic}': {count} messages without a position per joint were left out")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import (
@@ -28,6 +29,7 @@ from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.resize import resize_frames, resize_labels
 
+DEFAULT = EpisodeSource()
 #: largest distance of a frame from the wanted time, as a share of the model's period
 MAX_FRAME_OFFSET = 0.3
 
@@ -146,7 +148,7 @@ def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) 
 
 
 def load_recording(
-    path: Path, spec: WorldModelSpec, robot: RobotModel, *, calibration: Path | None = None
+    path: Path, spec: WorldModelSpec, robot: RobotModel, *, source: EpisodeSource = DEFAULT
 ) -> Recording:
     """Reads an episode at the model's size.
 
@@ -154,7 +156,13 @@ def load_recording(
         EpisodeError: it lacks a view, joint states or commands.
         TrajectoryError: its joints are not the robot's.
     """
-    episode = read_episode(path, views=spec.views, calibration=calibration)
+    episode = read_episode(
+        path,
+        views=spec.views,
+        calibration=source.calibration,
+        mapping=source.mapping,
+        robot=robot,
+    )
     stamps = episode.images[spec.views[0]][0]
     if len(stamps) == 0:
         raise EpisodeError(f"episode '{path}' has no frames of view '{spec.views[0]}'")
@@ -341,17 +349,21 @@ _VERSION = 2
 
 
 def cached_recording(
-    path: Path, spec: WorldModelSpec, robot: RobotModel, cache: Path
+    path: Path,
+    spec: WorldModelSpec,
+    robot: RobotModel,
+    cache: Path,
+    source: EpisodeSource = DEFAULT,
 ) -> Recording:
     """Returns `load_recording`'s result, from the cache where it is current.
 
     The key holds the bag's files (name, size, time), views, size, and robot: a changed episode
     or setting misses the cache instead of using stale data.
     """
-    stored = cache / f'{_key(path, spec, robot)}.npz'
+    stored = cache / f'{_key(path, spec, robot, source)}.npz'
     if stored.is_file():
         return _load(stored, path)
-    recording = load_recording(path, spec, robot)
+    recording = load_recording(path, spec, robot, source=source)
     cache.mkdir(parents=True, exist_ok=True)
     partial = stored.with_suffix('.partial.npz')
     _save(partial, recording)
@@ -359,10 +371,16 @@ def cached_recording(
     return recording
 
 
-def _key(path: Path, spec: WorldModelSpec, robot: RobotModel) -> str:
+def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSource) -> str:
     files = sorted((f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in path.iterdir())
     parts = [_VERSION, str(path.resolve()), files, spec.views, spec.width, spec.height,
              robot.name, robot.joint_names]  # fmt: skip
+    if source != DEFAULT:
+        calibration = source.calibration
+        parts += [
+            source.mapping.model_dump() if source.mapping else None,
+            calibration.read_text() if calibration else None,
+        ]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 

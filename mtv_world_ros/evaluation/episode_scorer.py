@@ -160,7 +160,8 @@ class EpisodeScorer:
         )
 
     def _read(self, path: Path) -> Recording:
-        return load_recording(path, self.pipeline.spec, self.pipeline.robot)
+        pipeline = self.pipeline
+        return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
 
     def _donor(self, job: Job) -> Recording | None:
         """The episode that lends its actions; None if there is none that can be read."""

@@ -251,7 +251,8 @@ class _Run:
         if self.describer is None:
             return job
         try:
-            episode = read_episode(job.path)
+            source = self.config.source
+            episode = read_episode(job.path, with_cameras=False, mapping=source.mapping)
             frame = np.asarray(episode.images[self.pipeline.spec.views[0]].frames[0])
             found = self.describer.describe(frame, episode.info.instruction)
         except DescriptionError as error:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from mtv_world_ros.data.bag_mapping import EpisodeSource
+from mtv_world_ros.data.recording import DEFAULT
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.references import check_actions
 from mtv_world_ros.evaluation.rollouts import check_mode
@@ -28,6 +30,7 @@ class EvaluationConfig:
         quality: of `image_quality.MEASURES`.
         fid_weights: Inception-v3 state dict; None = no FID.
         fvd_weights: I3D state dict or VideoMAE folder; None = no FVD.
+        source: how episodes are read that are not this package's own.
     """
 
     mode: str = 'observe'
@@ -40,6 +43,7 @@ class EvaluationConfig:
     quality: tuple[str, ...] = ()
     fid_weights: Path | None = None
     fvd_weights: Path | None = None
+    source: EpisodeSource = DEFAULT
 
     def __post_init__(self) -> None:
         check_mode(self.mode)
@@ -49,7 +53,12 @@ class EvaluationConfig:
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""
-        values = {key: str(v) if isinstance(v, Path) else v for key, v in asdict(self).items()}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'source'}
+        values = {key: str(v) if isinstance(v, Path) else v for key, v in values.items()}
+        if self.source != DEFAULT:
+            mapping = self.source.mapping
+            values['topics'] = mapping.model_dump(mode='json') if mapping else None
+            values['calibration'] = str(self.source.calibration or '')
         return {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
 
 

@@ -2,7 +2,7 @@
 
 Distortion models `plumb_bob` and `rational_polynomial` by the formula of OpenCV's calib3d page,
 which sensor_msgs/CameraInfo refers to; its 14 coefficients are k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4
-tau_x tau_y; missing ones are 0.
+tau_x tau_y; missing ones are 0. `equidistant` is OpenCV's fisheye model, k1 k2 k3 k4.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def project(
     local = local + T_camera_base[..., :3, 3]
     depth = local[..., 2]
     xy = local[..., :2] / np.where(depth > MIN_DEPTH_M, depth, np.nan)[..., None]
-    if camera.distortion.any():
+    if camera.distortion_model == 'equidistant':
+        xy = fisheye(camera.distortion, xy)
+    elif camera.distortion.any():
         xy = distort(camera.distortion, xy)
     return xy @ camera.K[:2, :2].T + camera.K[:2, 2], depth
 
@@ -69,7 +71,9 @@ def unproject(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     """
     offset = np.asarray(pixels, dtype=float) - camera.K[:2, 2]
     xy = offset @ np.linalg.inv(camera.K[:2, :2]).T
-    if camera.distortion.any():
+    if camera.distortion_model == 'equidistant':
+        xy = unfisheye(camera.distortion, xy)
+    elif camera.distortion.any():
         xy = undistort(camera.distortion, xy)
     rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -104,7 +108,8 @@ def with_camera_info(
         width: of the images that the CameraInfo is for [px].
         height: of the images [px].
         K: (3, 3) [px].
-        distortion_model: as in CameraInfo; ignored if all coefficients are zero.
+        distortion_model: as in CameraInfo; ignored if all coefficients are zero, unless it is
+            `equidistant`.
         distortion: coefficients.
 
     Raises:
@@ -112,7 +117,8 @@ def with_camera_info(
             itself (principal point outside the image).
     """
     coefficients = np.asarray(distortion, dtype=float)
-    if not coefficients.any():
+    distortion_model = _SAME_MODEL.get(distortion_model, distortion_model)
+    if not coefficients.any() and distortion_model != 'equidistant':
         distortion_model, coefficients = 'none', np.zeros(0)
     informed = replace(
         camera,
@@ -217,6 +223,8 @@ def triangulate(
     return point, residual
 
 
+#: other names of distortion models in CameraInfo
+_SAME_MODEL = {'fisheye': 'equidistant', 'kannala_brandt4': 'equidistant'}
 #: no lens of these models sees farther from its axis than this at depth 1: 76 degrees
 _WIDEST = 4.0
 _NEWTON_STEPS = 12
@@ -232,6 +240,48 @@ def distort(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
     k = _padded(coefficients)
     within = (xy**2).sum(-1) < _largest_r2(tuple(k))
     return np.where(within[..., None], _apply(k, xy), np.nan)
+
+
+def fisheye(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
+    """Returns where ideal points (..., 2) appear by the equidistant model; NaN beyond its reach.
+
+    The distance from the axis is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
+    """
+    radius = np.linalg.norm(xy, axis=-1)
+    theta = np.arctan(radius)
+    within = theta < _largest_angle(tuple(coefficients))
+    scale = np.where(radius > 1e-12, _bent(coefficients, theta) / np.maximum(radius, 1e-12), 1.0)
+    return np.where(within[..., None], xy * scale[..., None], np.nan)
+
+
+def unfisheye(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:
+    """Returns the ideal points (..., 2) that appear at the distorted ones; NaN where none does."""
+    radius = np.linalg.norm(distorted, axis=-1)
+    angles = np.linspace(0.0, _largest_angle(tuple(coefficients)), 4001)
+    theta = np.interp(radius, _bent(coefficients, angles), angles, right=np.nan)
+    for _ in range(_NEWTON_STEPS):
+        rise = np.polynomial.Polynomial(_odd(coefficients)).deriv()(theta)
+        theta = theta - (_bent(coefficients, theta) - radius) / rise
+    seen = theta < min(np.pi / 2 - 1e-3, angles[-1] + 1e-9)
+    scale = np.where(radius > 1e-12, np.tan(theta) / np.maximum(radius, 1e-12), 1.0)
+    return np.where(seen[..., None], distorted * scale[..., None], np.nan)
+
+
+def _odd(coefficients: Sequence[float] | FloatArray) -> FloatArray:
+    k1, k2, k3, k4 = coefficients
+    return np.array([0, 1, 0, k1, 0, k2, 0, k3, 0, k4], float)
+
+
+def _bent(coefficients: FloatArray, theta: FloatArray) -> FloatArray:
+    return np.asarray(np.polynomial.Polynomial(_odd(coefficients))(theta), np.float64)
+
+
+@lru_cache(maxsize=64)
+def _largest_angle(coefficients: tuple[float, ...]) -> float:
+    """Angle up to which the distorted radius grows with it [rad]."""
+    theta = np.linspace(0.0, np.pi / 2, 4001)
+    grows = np.diff(np.polynomial.Polynomial(_odd(coefficients))(theta)) > 0
+    return float(theta[-1] if grows.all() else theta[np.argmin(grows)])
 
 
 def undistort(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:

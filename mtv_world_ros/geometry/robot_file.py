@@ -129,7 +129,7 @@ def load_robot(path: Path | str) -> RobotModel:
     file = validated(RobotFile, read_yaml(path, 'robot file', 'robot_file'), str(path))
     mimics = [Mimic(**dict(entry)) for entry in file.mimic]
     if file.urdf:
-        model, own_mimics, base = _from_urdf(path.parent / file.urdf)
+        model, own_mimics, base = read_urdf(path.parent / file.urdf)
         mimics += own_mimics
         base = file.base_link or base
     else:
@@ -212,8 +212,13 @@ def _tool(entry: ToolEntry) -> Tool:
     return Tool(T_link_tool=entry.matrix(), **values)
 
 
-def _from_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
-    """The model, its mimic joints (kept as joints of their own), and the root link."""
+def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
+    """Returns a URDF's model, its mimic joints (kept as joints of their own), and the root link.
+
+    Raises:
+        ConfigError: there is no such file.
+        RobotError: it is not a URDF that can be used.
+    """
     if not path.is_file():
         raise ConfigError(f"URDF file '{path}' does not exist; 'urdf' is relative to the YAML")
     try:

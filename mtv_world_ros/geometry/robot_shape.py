@@ -79,7 +79,7 @@ def load_shape(robot: RobotModel) -> RobotShape:
         return rods(robot, 'the robot is given by a table')
     path = robot.file.parent / str(urdf)
     links = {link.attrib['name']: link for link in ElementTree.parse(path).iter('link')}
-    found = {name: _link_shapes(link, path) for name, link in links.items()}
+    found = {name: link_shapes(link, path) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
     missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
@@ -136,8 +136,8 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
     return LinkShape(link=link, points=_moved(T, _cylinder(ROD_RADIUS_M, length)))
 
 
-def _link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape], list[str]]:
-    """A link's shapes, and why there are none; those of its collisions where visuals lack."""
+def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape], list[str]]:
+    """Returns a link's shapes, and why there are none; collisions stand in for visuals."""
     missing: list[str] = []
     for kind in ('visual', 'collision'):
         try:

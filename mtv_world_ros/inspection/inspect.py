@@ -223,7 +223,7 @@ class Inspector:
     def _better_fit(self, residual: MotionResidual) -> list[Finding]:
         """A roll or a focal length with which the drawn robot fits clearly better."""
         name, match = residual.best_change
-        if not match > residual.match * (1 + self._config.better_match):
+        if not self.shape.is_known or match <= residual.match * (1 + self._config.better_match):
             return []
         text = (
             f'the drawn robot fits the moving pixels better with {name} (match {match:.2f}, as it '

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import DEFAULT
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.geometry.resample import match_joints
@@ -86,7 +88,7 @@ def replay_offline(
     episode_path: Path | str,
     out: Path | str,
     *,
-    calibration: Path | None = None,
+    source: EpisodeSource = DEFAULT,
     seed: int = 0,
     num_inference_steps: int = 0,
     limits: ReplayLimits | None = None,
@@ -105,7 +107,7 @@ def replay_offline(
         pipeline: imagines.
         episode_path: rosbag2 folder or .mcap file, also one that was cut off.
         out: folder for the predictions; appears only when all is written.
-        calibration: camera calibration; default: the one in the episode's folder.
+        source: how the episode is read if it is not this package's own.
         seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         limits: what is too old or out of sync.
@@ -118,7 +120,12 @@ def replay_offline(
     """
     spec = pipeline.spec
     episode = read_episode(
-        episode_path, views=spec.views, calibration=calibration, with_masks=False
+        episode_path,
+        views=spec.views,
+        calibration=source.calibration,
+        with_masks=False,
+        mapping=source.mapping,
+        robot=pipeline.robot,
     )
     if not episode.trajectories:
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes
-from mtv_world_ros.data.recording import cached_recording, clip_starts, Recording
+from mtv_world_ros.data.recording import cached_recording, clip_starts, DEFAULT, Recording
 from mtv_world_ros.data_types import CameraModel, WorldModelSpec
 from mtv_world_ros.errors import (
     ConfigError,
@@ -67,7 +68,11 @@ def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
 
 
 def load_recordings(
-    paths: Sequence[Path], spec: WorldModelSpec, robot: RobotModel, cache: Path
+    paths: Sequence[Path],
+    spec: WorldModelSpec,
+    robot: RobotModel,
+    cache: Path,
+    source: EpisodeSource = DEFAULT,
 ) -> tuple[list[Recording], dict[str, str]]:
     """Returns the usable recordings, and the reason for each one left out, by path.
 
@@ -79,7 +84,7 @@ def load_recordings(
     for path in tqdm(paths, desc='reading episodes', unit='ep'):
         try:
             with disk_errors_named(cache):
-                recording = cached_recording(path, spec, robot, cache)
+                recording = cached_recording(path, spec, robot, cache, source)
             check_clips(recording, spec)
         except DiskError:
             raise
@@ -112,6 +117,7 @@ def train(
     peak_flops: float | None = None,
     data_workers: int = 0,
     latent_cache: Path | None = None,
+    source_of_episodes: EpisodeSource = DEFAULT,
 ) -> Path:
     """Trains, resuming what `out` holds, and returns the folder of the result.
 
@@ -141,6 +147,7 @@ def train(
             0 = measure it, None = log no utilisation.
         data_workers: processes that prepare clips; 0 = a thread of this one.
         latent_cache: keeps what the encoders make of the clips; None = encode in every step.
+        source_of_episodes: how episodes are read that are not this package's own.
 
     Raises:
         ConfigError: the device is not there.
@@ -157,7 +164,11 @@ def train(
     paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
     with processes.main_first():
         recordings, skipped = load_recordings(
-            spread(paths, num_episodes), config.spec, robot, cache or out / 'cache'
+            spread(paths, num_episodes),
+            config.spec,
+            robot,
+            cache or out / 'cache',
+            source_of_episodes,
         )
         actions = kept_actions(
             out, config.video.control, recordings, config.spec, robot, initial=initial

@@ -82,6 +82,32 @@ def test_projection_equals_opencv(model):
         np.testing.assert_allclose(depth, local[:, 2], atol=1e-9)
 
 
+FISHEYE = (-0.02, 0.01, -0.004, 0.001)
+
+
+@pytest.mark.parametrize('coefficients', [FISHEYE, (0.0, 0.0, 0.0, 0.0)])
+def test_equidistant_projection_equals_opencv_and_can_be_undone(coefficients):
+    camera = make_camera(distortion_model='equidistant', distortion=np.array(coefficients))
+    generator = np.random.default_rng(4)
+    angle, turn = generator.uniform(0, 1.4, 300), generator.uniform(0, 2 * np.pi, 300)
+    points = np.stack(
+        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], 1
+    )
+    pixels, _ = project(camera, np.eye(4), points)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.K.copy(), np.array(coefficients)
+    )
+    np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-6)
+    np.testing.assert_allclose(unproject(camera, pixels), points, atol=1e-7)
+
+
+def test_a_fisheye_of_camera_info_stays_one_without_coefficients():
+    info = {'width': 384, 'height': 288, 'K': make_camera().K, 'distortion': [0.0] * 4}
+    for name in ('equidistant', 'fisheye'):
+        camera = with_camera_info(make_camera(), distortion_model=name, **info)
+        assert camera.distortion_model == 'equidistant'
+
+
 def test_points_behind_the_camera_have_no_pixel_but_a_depth():
     points = np.array([[0.1, 0.1, 1], [0.1, 0.1, -1], [0.1, 0.1, 0.0], [0, 0, 0.001]])
     pixels, depth = project(make_camera(), np.eye(4), points)
@@ -256,7 +282,7 @@ def test_camera_info_without_distortion_may_name_any_model():
     ('changes', 'message'),
     [
         ({'K': np.zeros((3, 3))}, 'not calibrated'),
-        ({'distortion_model': 'equidistant', 'distortion': [0.1] * 4}, "'equidistant'; known are"),
+        ({'distortion_model': 'ftheta', 'distortion': [0.1] * 4}, "'ftheta'; known are"),
         ({'distortion': [0.1] * 3, 'distortion_model': 'plumb_bob'}, '3 coefficients'),
         ({'K': make_camera().K * [[2], [2], [1]]}, 'contradicts itself'),
         ({'width': 96, 'height': 72}, 'contradicts itself'),

@@ -15,7 +15,6 @@ from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.robot_shape import load_shape, project_part
-from mtv_world_ros.geometry.transforms import pose
 
 START_NS = 1_700_000_000_000_000_000
 WIDTH, HEIGHT, FPS = 320, 240, 10
@@ -105,7 +104,7 @@ def make_cameras() -> dict[str, CameraModel]:
     poses = {
         'door': ('plinth', looking_at((1.5, 0.5, 0.9), (0.1, 0.0, 0.4))),
         'window': ('plinth', looking_at((0.3, -1.6, 0.7), (0.1, 0.0, 0.4))),
-        'palm': ('hand', pose((0.08, 0.0, 0.0), (0.0, 0.13, 0.7, 0.7))),
+        'palm': ('hand', looking_at((0.09, 0.0, -0.02), (0.0, 0.0, 0.2))),
     }
     return {
         view: CameraModel(

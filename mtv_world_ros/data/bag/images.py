@@ -15,14 +15,29 @@ from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ObservationError
 
-#: encodings of sensor_msgs/Image: number of channels, conversion to RGB (None = is RGB)
+#: encodings of sensor_msgs/Image: bytes a pixel in a row, conversion to RGB (None = is RGB).
+#: OpenCV names a Bayer pattern by its second row, and `yuv422` is ROS' older name of `uyvy`
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     'rgb8': (3, None),
     'bgr8': (3, cv2.COLOR_BGR2RGB),
     'rgba8': (4, cv2.COLOR_RGBA2RGB),
     'bgra8': (4, cv2.COLOR_BGRA2RGB),
     'mono8': (1, cv2.COLOR_GRAY2RGB),
+    '8UC1': (1, cv2.COLOR_GRAY2RGB),
+    '8UC3': (3, cv2.COLOR_BGR2RGB),
+    'bayer_rggb8': (1, cv2.COLOR_BayerBG2RGB),
+    'bayer_bggr8': (1, cv2.COLOR_BayerRG2RGB),
+    'bayer_gbrg8': (1, cv2.COLOR_BayerGR2RGB),
+    'bayer_grbg8': (1, cv2.COLOR_BayerGB2RGB),
+    'uyvy': (2, cv2.COLOR_YUV2RGB_UYVY),
+    'yuv422': (2, cv2.COLOR_YUV2RGB_UYVY),
+    'yuyv': (2, cv2.COLOR_YUV2RGB_YUY2),
+    'yuv422_yuy2': (2, cv2.COLOR_YUV2RGB_YUY2),
+    'nv12': (1, cv2.COLOR_YUV2RGB_NV12),
+    'nv21': (1, cv2.COLOR_YUV2RGB_NV21),
 }
+#: these have half as many rows again, of colours, below those of brightness
+_PLANAR = ('nv12', 'nv21')
 #: signatures at start and end of JPEG and PNG; decoders fill the rest of a cut file with grey
 _PNG = b'\x89PNG'
 _SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', _PNG: b'IEND'}
@@ -55,11 +70,17 @@ def check_raw(*, encoding: str, height: int, width: int, step: int, num_bytes: i
             f'image of {width}x{height} {encoding} has a step of {step} bytes, expected at least '
             f'{channels * width}'
         )
-    needed = step * (height - 1) + channels * width
+    if encoding in (*_PLANAR, 'uyvy', 'yuv422', 'yuyv', 'yuv422_yuy2') and width % 2:
+        raise ObservationError(f'image of {width}x{height} {encoding} needs an even width')
+    needed = step * (_data_rows(encoding, height) - 1) + channels * width
     if num_bytes < needed:
         raise ObservationError(
             f'image of {width}x{height} {encoding} has {num_bytes} bytes, expected {needed}'
         )
+
+
+def _data_rows(encoding: str, height: int) -> int:
+    return height + (height + 1) // 2 if encoding in _PLANAR else height
 
 
 def raw_to_rgb(
@@ -72,10 +93,11 @@ def raw_to_rgb(
     """
     check_raw(encoding=encoding, height=height, width=width, step=step, num_bytes=len(data))
     channels, conversion = ENCODINGS[encoding]
+    num_rows = _data_rows(encoding, height)
     rows = np.lib.stride_tricks.as_strided(
-        data, (height, width * channels), (step, 1), writeable=False
+        data, (num_rows, width * channels), (step, 1), writeable=False
     )
-    image = np.array(rows).reshape(height, width, channels)
+    image = np.array(rows).reshape(num_rows, width, channels)
     return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
 
 

@@ -25,6 +25,7 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 JOINT_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 STRING = 'std_msgs/msg/String'
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
+TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
 
 NANO = 1_000_000_000
 #: what the reader of generated code raises for bytes that are no such message

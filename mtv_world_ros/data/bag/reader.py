@@ -1,11 +1,14 @@
-"""Reads the raw messages of rosbag2 MCAP bags, including bags that were cut off."""
+"""Reads the raw messages of rosbag2 bags (MCAP, SQLite), including bags that were cut off."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import closing, contextmanager
 import io
 from pathlib import Path
+import sqlite3
 import struct
+import tempfile
 from typing import Any, BinaryIO, NamedTuple
 import zlib
 
@@ -21,6 +24,7 @@ from mtv_world_ros.bounded_input import limits, parse_yaml, PREFIX, read_bytes
 from mtv_world_ros.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<QQQII')
@@ -55,9 +59,10 @@ class _Cut(Exception):
 
 
 class BagReader:
-    """A rosbag2 folder of MCAP files, or one MCAP file.
+    """A rosbag2 folder of MCAP or SQLite files, or one such file.
 
-    A bag that is cut off or damaged is read up to there; `truncated` then says where.
+    Compression by file or by message (zstd) is undone. A bag that is cut off or damaged is read up
+    to there; `truncated` then says where.
 
     Attributes:
         truncated: why the record ends early; empty where it does not. Known after a pass.
@@ -66,7 +71,7 @@ class BagReader:
         custom_data: `custom_data` of metadata.yaml.
 
     Raises:
-        EpisodeError: there is no such bag, or it is not stored as MCAP.
+        EpisodeError: there is no such bag, or it is stored as something else.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -90,14 +95,16 @@ class BagReader:
         Messages that are not in CDR are skipped and named in `problems`.
 
         Raises:
-            EpisodeError: a file is not MCAP or uses an unknown compression.
+            EpisodeError: a file is neither MCAP nor SQLite, or uses an unknown compression.
         """
         self.truncated, self.metadata = '', {}
         for file in self._files:
             self._schemas, self._channels = {}, {}
             try:
-                with file.open('rb') as stream:
-                    yield from self._file_messages(stream, file, topics)
+                with _decompressed(file) as plain:
+                    read = self._sqlite if plain.suffix == '.db3' else self._mcap
+                    for message in read(plain, file, topics):
+                        yield _unpacked(message)
             except _Cut as cut:
                 self.truncated = f"'{file}' is cut off or damaged: {cut}"
                 return
@@ -117,7 +124,7 @@ class BagReader:
 
     def _find_files(self) -> list[Path]:
         if self.path.is_file():
-            return [_check_storage(self.path)]
+            return [self.path]
         if not self.path.is_dir():
             raise EpisodeError(f"there is no episode '{self.path}'")
         information = self._read_information()
@@ -130,11 +137,11 @@ class BagReader:
             if not file.is_file():
                 self._problem(f"'{file}' is named in metadata.yaml but is not there")
         files = [file for file in named if file.is_file()] or [
-            file for file in sorted(self.path.glob('*.mcap')) if file.is_file()
+            file for file in sorted(self.path.iterdir()) if file.is_file() and _is_storage(file)
         ]
         if not files:
-            self._raise_no_files()
-        return [_check_storage(file) for file in files]
+            raise EpisodeError(f"'{self.path}' is not a bag: it holds no .mcap or .db3 file")
+        return files
 
     def _read_information(self) -> Mapping[str, Any]:
         file = self.path / 'metadata.yaml'
@@ -149,20 +156,47 @@ class BagReader:
             self._problem(f"'{file}' is not rosbag2 metadata and was ignored ({reason})")
             return {}
 
-    def _raise_no_files(self) -> None:
-        for other in sorted(self.path.glob('*')):
-            if other.suffix in ('.db3', '.zstd'):
-                _check_storage(other)
-        raise EpisodeError(f"'{self.path}' is not a bag: it holds no .mcap file")
-
     def _problem(self, text: str) -> None:
         if text not in self.problems:
             self.problems.append(text)
 
-    def _file_messages(
-        self, stream: BinaryIO, file: Path, topics: Collection[str] | None
+    def _sqlite(
+        self, plain: Path, file: Path, topics: Collection[str] | None
     ) -> Iterator[BagMessage]:
-        size = file.stat().st_size
+        """Messages of a rosbag2_storage_sqlite3 file, read in the order they were recorded."""
+        if not plain.read_bytes()[:16].startswith(b'SQLite format 3\0'):
+            raise EpisodeError(f"'{file}' is not an SQLite file")
+        try:
+            with closing(_open_sqlite(plain)) as database:
+                declared = database.execute(
+                    'SELECT id, name, type, serialization_format FROM topics'
+                ).fetchall()
+                known = {}
+                for number, name, msgtype, encoding in declared:
+                    if encoding not in ('', 'cdr'):
+                        self._problem(f"'{name}' was left out: it is encoded as '{encoding}'")
+                    elif topics is None or name in topics:
+                        known[number] = name, msgtype
+                wanted = ', '.join(str(int(number)) for number in known)
+                rows = database.execute(
+                    'SELECT topic_id, timestamp, data FROM messages '
+                    f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
+                )
+                for number, stamp, data in rows:
+                    name, msgtype = known[number]
+                    yield BagMessage(name, msgtype, stamp, bytes(data))
+        except sqlite3.DatabaseError as error:
+            raise _Cut(str(error)) from error
+
+    def _mcap(
+        self, plain: Path, file: Path, topics: Collection[str] | None
+    ) -> Iterator[BagMessage]:
+        with plain.open('rb') as stream:
+            yield from self._mcap_messages(stream, file, plain.stat().st_size, topics)
+
+    def _mcap_messages(
+        self, stream: BinaryIO, file: Path, size: int, topics: Collection[str] | None
+    ) -> Iterator[BagMessage]:
         magic = stream.read(len(MAGIC))
         if not MAGIC.startswith(magic):
             raise EpisodeError(f"'{file}' is not an MCAP file: it starts with {magic!r}")
@@ -267,14 +301,42 @@ def iter_messages(
         raise EpisodeError(reader.truncated)
 
 
-def _check_storage(file: Path) -> Path:
-    if file.suffix in ('.db3', '.zstd'):
-        kind = 'an SQLite bag' if file.suffix == '.db3' else 'a bag compressed as a whole'
-        raise EpisodeError(
-            f"'{file}' is {kind}; convert it with `ros2 bag convert` to storage_id mcap without "
-            'compression_mode'
-        )
-    return file
+def _is_storage(file: Path) -> bool:
+    return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
+
+
+def _open_sqlite(file: Path) -> sqlite3.Connection:
+    """Opens it without writing beside it, unless a recorder that was killed left its journal."""
+    journal = file.with_name(f'{file.name}-wal')
+    mode = 'ro' if journal.is_file() and journal.stat().st_size else 'ro&immutable=1'
+    return sqlite3.connect(f'{file.resolve().as_uri()}?mode={mode}', uri=True)
+
+
+@contextmanager
+def _decompressed(file: Path) -> Iterator[Path]:
+    """The file, or where it is compressed as a whole a temporary copy that is not."""
+    if file.suffix != '.zstd':
+        yield file
+        return
+    with tempfile.TemporaryDirectory(prefix='mtv_world_bag_') as folder:
+        plain = Path(folder) / file.stem
+        try:
+            with file.open('rb') as packed, plain.open('wb') as unpacked:
+                zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
+        except zstandard.ZstdError as error:
+            raise _Cut(f'it cannot be decompressed ({error})') from error
+        yield plain
+
+
+def _unpacked(message: BagMessage) -> BagMessage:
+    """Undoes `compression_mode: message`; CDR never begins like a zstd frame."""
+    if not message.data.startswith(_ZSTD_MAGIC):
+        return message
+    try:
+        data = zstandard.ZstdDecompressor().decompressobj().decompress(message.data)
+    except zstandard.ZstdError as error:
+        raise _Cut(f"a message of '{message.topic}' cannot be decompressed") from error
+    return message._replace(data=data)
 
 
 def _split(records: bytes) -> Iterator[tuple[int, bytes]]:

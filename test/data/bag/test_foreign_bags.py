@@ -109,8 +109,8 @@ def test_the_frames_before_a_cut_are_all_there(tmp_path) -> None:
 
 
 def test_an_unknown_encoding_is_named_with_its_topic(foreign_bag) -> None:
-    path = foreign_bag(('/low/image_raw', IMAGE, 5, image(5, encoding='yuv422_yuy2')))
-    with pytest.raises(EpisodeError, match=r"view 'low'.*/low/image_raw.*yuv422_yuy2.*rgb8"):
+    path = foreign_bag(('/low/image_raw', IMAGE, 5, image(5, encoding='32FC1')))
+    with pytest.raises(EpisodeError, match=r"view 'low'.*/low/image_raw.*32FC1.*rgb8"):
         read(path)
 
 

@@ -33,6 +33,67 @@ def test_grey_becomes_rgb() -> None:
     assert image.tolist() == [[[1, 1, 1], [2, 2, 2]], [[3, 3, 3], [4, 4, 4]]]
 
 
+def picture() -> np.ndarray:
+    """(24, 32, 3) RGB with a colour in each quarter; edges are where sampling blurs."""
+    rgb = np.zeros((24, 32, 3), np.uint8)
+    rgb[:12, :16], rgb[:12, 16:] = RED, GREEN
+    rgb[12:, :16], rgb[12:, 16:] = (20, 40, 210), (180, 170, 30)
+    return rgb
+
+
+INSIDE = np.s_[3:9, 4:12], np.s_[3:9, 20:28], np.s_[15:21, 4:12], np.s_[15:21, 20:28]
+
+
+def agrees(image: np.ndarray, tolerance: int) -> bool:
+    """Whether colours agree inside the quarters."""
+    apart = np.abs(image.astype(int) - picture())
+    return all(apart[part].max() <= tolerance for part in INSIDE)
+
+
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_patterns_become_rgb(pattern) -> None:
+    rgb = picture()
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for place, letter in enumerate(pattern):
+        rows, columns = np.s_[place // 2 :: 2], np.s_[place % 2 :: 2]
+        mosaic[rows, columns] = rgb[rows, columns, 'rgb'.index(letter)]
+    data = np.pad(mosaic, ((0, 0), (0, 5))).ravel()
+    image = raw_to_rgb(data, encoding=f'bayer_{pattern}8', height=24, width=32, step=37)
+    assert agrees(image, 0)
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'order'), [('uyvy', 'uyvy'), ('yuv422', 'uyvy'), ('yuyv', 'yuyv'),
+                            ('yuv422_yuy2', 'yuyv')]
+)  # fmt: skip
+def test_packed_yuv_becomes_rgb(encoding, order) -> None:
+    y, u, v = luma_and_colours()
+    packed = np.zeros((24, 16, 4), np.uint8)
+    lumas = iter((y[:, ::2], y[:, 1::2]))
+    for place, letter in enumerate(order):
+        packed[..., place] = next(lumas) if letter == 'y' else {'u': u, 'v': v}[letter][:, ::2]
+    data = np.pad(packed.reshape(24, 64), ((0, 0), (0, 3))).ravel()
+    assert agrees(raw_to_rgb(data, encoding=encoding, height=24, width=32, step=67), 3)
+
+
+@pytest.mark.parametrize(('encoding', 'order'), [('nv12', 'uv'), ('nv21', 'vu')])
+def test_planar_yuv_becomes_rgb(encoding, order) -> None:
+    y, u, v = luma_and_colours()
+    colours = [{'u': u, 'v': v}[letter][::2, ::2] for letter in order]
+    data = np.concatenate([y, np.stack(colours, -1).reshape(12, 32)])
+    padded = np.pad(data, ((0, 0), (0, 8))).ravel()
+    assert agrees(raw_to_rgb(padded, encoding=encoding, height=24, width=32, step=40), 3)
+
+
+def luma_and_colours() -> list[np.ndarray]:
+    """Y, U, V (24, 32) of the picture by the formula of BT.601, limited range."""
+    r, g, b = np.moveaxis(picture().astype(float), -1, 0)
+    y = 16 + (65.481 * r + 128.553 * g + 24.966 * b) / 255
+    u = 128 + (-37.797 * r - 74.203 * g + 112.0 * b) / 255
+    v = 128 + (112.0 * r - 93.786 * g - 18.214 * b) / 255
+    return [plane.round().astype(np.uint8) for plane in (y, u, v)]
+
+
 def test_the_last_row_needs_no_padding() -> None:
     data = np.array([1, 2, 0, 3, 4], np.uint8)
     image = raw_to_rgb(data, encoding='mono8', height=2, width=2, step=3)
@@ -49,7 +110,9 @@ def test_the_image_does_not_hang_on_the_message() -> None:
 @pytest.mark.parametrize(
     ('fields', 'reason'),
     [
-        ({'encoding': 'yuv422_yuy2'}, "'yuv422_yuy2' is not supported; supported are rgb8, bgr8"),
+        ({'encoding': '32FC1'}, "'32FC1' is not supported; supported are rgb8, bgr8"),
+        ({'encoding': 'nv12', 'width': 3}, 'needs an even width'),
+        ({'encoding': 'nv12', 'step': 6}, 'has 18 bytes, expected 26'),
         ({'encoding': ''}, "encoding '' is not supported"),
         ({'step': 5}, 'step of 5 bytes, expected at least 6'),
         ({'height': 4}, 'has 18 bytes, expected 24'),

@@ -202,8 +202,9 @@ def test_a_folder_is_read_without_usable_metadata_yaml(content, noise, tmp_path)
     [
         ('a.mcap', b'this is text, not MCAP', "not an MCAP file: it starts with b'this is "),
         ('a.mcap', b'\x89MCAP\r\n\0\0', 'not an MCAP file'),
-        ('a.db3', b'SQLite format 3\0', 'SQLite bag; convert it with `ros2 bag convert`'),
-        ('a.mcap.zstd', b'(\xb5/\xfd', 'compressed as a whole; convert it'),
+        ('a.db3', b'this is text, not SQLite', 'not an SQLite file'),
+        ('a.db3', b'SQLite format 3\0', 'cut off or damaged: file is not a database'),
+        ('a.mcap.zstd', b'(\xb5/\xfd', 'not an MCAP file|cut off'),
     ],
 )
 @pytest.mark.parametrize('in_folder', [True, False])
@@ -217,7 +218,7 @@ def test_other_files_are_refused_by_name(name, content, reason, in_folder, tmp_p
 def test_what_is_no_bag_is_refused(tmp_path) -> None:
     with pytest.raises(EpisodeError, match='there is no episode'):
         BagReader(tmp_path / 'missing')
-    with pytest.raises(EpisodeError, match='holds no .mcap file'):
+    with pytest.raises(EpisodeError, match='holds no .mcap or .db3 file'):
         BagReader(tmp_path)
 
 

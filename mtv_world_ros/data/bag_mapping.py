@@ -1,0 +1,137 @@
+"""What the topics of a robot's own bags are: views, joints, commands, namespaces."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.data.episode import check_outcome
+
+STATE = 'state'
+#: parts of an image topic's name that say nothing of the view
+_NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
+               'rgb', 'compressed', 'camera', 'image_rect_raw'}  # fmt: skip
+#: no pictures of the scene
+_NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
+
+
+class ViewTopics(Schema):
+    """Where a view is from."""
+
+    image: str = Field(description='topic of Image or CompressedImage')
+    camera_info: str = Field(default='', description='default: beside the images')
+    frame: str = Field(
+        default='', description="optical frame in TF; default: the CameraInfo's, or the images'"
+    )
+
+
+def _view(value: Any) -> Any:
+    return {'image': value} if isinstance(value, str) else value
+
+
+class BagMapping(Schema):
+    """A mapping file of bags; topics without a leading slash are in the namespace."""
+
+    robot: str = Field(
+        default='',
+        description="name of a bundled robot or a robot's YAML relative to this file; empty = "
+        'the one of `/robot_description`',
+    )
+    namespace: str = Field(default='', description='of the robot, e.g. `left_arm`')
+    views: dict[str, Annotated[ViewTopics, BeforeValidator(_view)]] = Field(
+        default={}, description='topic of the images by view; empty = `<view>/image_raw`'
+    )
+    joint_states: str = 'joint_states'
+    joints: dict[str, str] = Field(
+        default={}, description="the robot's name of a joint, by the recorded one"
+    )
+    action: str = Field(
+        default='joint_trajectory',
+        description='topic of the commanded positions (JointTrajectory or JointState); `state` = '
+        'the measured ones that follow',
+    )
+    robot_description: str = 'robot_description'
+    tf_prefix: str = Field(default='', description='of frame names in TF, removed')
+    instruction_topic: str = 'instruction'
+    instruction: str = Field(default='', description='what the robot is told; empty = the topic')
+    task: str = ''
+    outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
+    objects: ListOf[str] = ()
+    chunk_s: Positive = Field(default=3.2, description='length of a joint trajectory message [s]')
+    limit_tolerance: Positive = Field(
+        default=0.05, description='positions further outside the limits fail [rad or m]'
+    )
+    jpeg_quality: int = Field(default=95, ge=1, le=100)
+
+    def topic(self, name: str) -> str:
+        """The absolute name of a topic."""
+        if name.startswith('/'):
+            return name
+        return '/'.join(['', *filter(None, self.namespace.strip('/').split('/')), name])
+
+    def streams(self) -> dict[str, str]:
+        """Topics by view and by stream, as `read_episode` takes them."""
+        return {
+            **{view: self.topic(row.image) for view, row in self.views.items()},
+            'joint_states': self.topic(self.joint_states),
+            'joint_trajectory': self.topic(
+                'joint_trajectory' if self.action == STATE else self.action
+            ),
+            'instruction': self.topic(self.instruction_topic),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeSource:
+    """How recordings are read that are not episodes of this package's own.
+
+    Attributes:
+        mapping: what their topics are; None = the default names.
+        calibration: camera calibration; None = `calibration.yaml` beside each, or TF.
+    """
+
+    mapping: BagMapping | None = None
+    calibration: Path | None = None
+
+
+def load_source(topics: Path | None, calibration: Path | None) -> EpisodeSource:
+    """Returns the source that `--topics` and `--calibration` name.
+
+    Raises:
+        ConfigError: the mapping file is missing or wrong.
+    """
+    mapping = None if topics is None else load_bag_mapping(topics)
+    return EpisodeSource(mapping=mapping, calibration=calibration)
+
+
+def load_bag_mapping(path: Path) -> BagMapping:
+    """Reads a mapping file; `config/datasets/bag.yaml` describes its keys.
+
+    Raises:
+        ConfigError: the file is missing, not YAML, or has unknown or wrong values.
+    """
+    mapping = validated(BagMapping, read_yaml(path, 'mapping file', '--topics'), str(path))
+    if Path(mapping.robot).suffix in ('.yaml', '.yml'):
+        mapping = mapping.replace(robot=str(path.parent / mapping.robot))
+    return mapping
+
+
+def guess_views(topics: Collection[str]) -> dict[str, str]:
+    """Returns image topics by a view's name: the last part of the topic that says which it is.
+
+    Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
+    are taken.
+    """
+    found: dict[str, str] = {}
+    for topic in sorted(topics):
+        plain = topic.removesuffix('/compressed')
+        if any(word in plain for word in _NO_COLOURS):
+            continue
+        parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]
+        found.setdefault(parts[-1] if parts else 'camera', plain)
+    return found

@@ -1,0 +1,330 @@
+"""Imports rosbag2 recordings of a robot's own topics: each bag becomes an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+import hashlib
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
+from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import (
+    EpisodeError,
+    MtvWorldError,
+    RobotError,
+    TrajectoryError,
+)
+from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML, save_robot
+from mtv_world_ros.geometry.robot_guess import guess_robot
+from mtv_world_ros.importing.convert import MAPPING_KEY
+
+#: a command this many times faster than the joint's limit is a jump
+_JUMP = 2.0
+
+
+@dataclass(slots=True, kw_only=True)
+class BagSummary:
+    """What became of the bags, by their paths.
+
+    Attributes:
+        robot: the robot's file.
+        made: episodes written now.
+        kept: episodes that were there already.
+        failed: why.
+        warnings: what was odd and how it was handled.
+    """
+
+    robot: Path
+    made: list[Path] = field(default_factory=list)
+    kept: list[Path] = field(default_factory=list)
+    failed: dict[Path, str] = field(default_factory=dict)
+    warnings: dict[Path, tuple[str, ...]] = field(default_factory=dict)
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Returns bags: files as they are, folders that are bags, and the bags in other folders.
+
+    Raises:
+        EpisodeError: a path is not there, or there is no bag.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise EpisodeError(f"there is no bag '{path}'")
+        holds_files = path.is_dir() and any(path.glob('*.mcap*')) or any(path.glob('*.db3*'))
+        found += [path] if path.is_file() or holds_files else list_episodes(path)
+    if not found:
+        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}')
+    return found
+
+
+def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
+    """Returns the mapping with the bag's image topics as views, where it names none.
+
+    Raises:
+        EpisodeError: the bag has no images.
+    """
+    if mapping.views:
+        return mapping
+    kinds = (messages.IMAGE, messages.COMPRESSED_IMAGE)
+    topics = [name for name, kind in BagReader(bag).topics().items() if kind in kinds]
+    inside = [t for t in topics if t.startswith(mapping.topic(''))] or topics
+    views = guess_views(inside)
+    if not views:
+        raise EpisodeError(f"'{bag}' has no images (topics of Image or CompressedImage)")
+    return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
+
+
+def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:
+    """Writes the robot of a bag's `/robot_description` into a folder; fingers and tools guessed.
+
+    Returns:
+        The robot's YAML, and what was guessed.
+
+    Raises:
+        RobotError: the bag has no description, or no robot can be made of it.
+    """
+    text = robot_description(bag, mapping)
+    with tempfile.TemporaryDirectory(prefix='mtv_world_robot_') as place:
+        urdf = Path(place) / 'robot.urdf'
+        urdf.write_text(text, encoding='utf-8')
+        guessed = guess_robot(urdf)
+        file = Path(place) / ROBOT_YAML
+        file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
+        return save_robot(file, folder), guessed.notes
+
+
+def robot_description(bag: Path, mapping: BagMapping) -> str:
+    """Returns the URDF that a bag holds.
+
+    Raises:
+        RobotError: it holds none.
+    """
+    topics = {mapping.topic(mapping.robot_description), '/robot_description'}
+    for message in BagReader(bag).messages(topics):
+        if message.msgtype == messages.STRING:
+            return str(messages.deserialize(messages.STRING, message.data).data)
+    raise RobotError(
+        f"'{bag}' has no '{mapping.topic(mapping.robot_description)}'; name the robot's file with "
+        "--robot or as 'robot' in the mapping"
+    )
+
+
+def import_bags(
+    bags: Sequence[Path],
+    out: Path,
+    mapping: BagMapping,
+    robot_file: Path,
+    *,
+    calibration: Path | None = None,
+    progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
+) -> BagSummary:
+    """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
+
+    Args:
+        bags: rosbag2 folders or files.
+        out: folder of the episodes.
+        mapping: what the topics are, with views.
+        robot_file: the robot's YAML.
+        calibration: of the cameras; None = the bags' own.
+        progress: wraps the bags, e.g. in a progress bar.
+
+    Raises:
+        ConfigError, RobotError: the robot cannot be used at all.
+    """
+    robot = load_robot(robot_file)
+    inside = out / 'robot'
+    if robot_file.parent.resolve() != inside.resolve():
+        save_robot(robot_file, inside)
+    summary = BagSummary(robot=inside / ROBOT_YAML)
+    key = _key(mapping, robot_file, calibration)
+    for bag in progress(bags):
+        path = out / _name(bag)
+        try:
+            if path.exists():
+                _check_made_with(path, key)
+                summary.kept.append(path)
+                continue
+            summary.warnings[bag] = convert_bag(bag, path, mapping, robot, calibration, key)
+            summary.made.append(path)
+        except MtvWorldError as error:
+            summary.failed[bag] = str(error)
+    return summary
+
+
+def _name(bag: Path) -> str:
+    return bag.name.split('.')[0] if bag.is_file() else bag.name
+
+
+def _key(mapping: BagMapping, *files: Path | None) -> str:
+    digest = hashlib.sha256(mapping.model_dump_json().encode())
+    for file in files:
+        digest.update(b'' if file is None else file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _check_made_with(path: Path, key: str) -> None:
+    if read_info(path).metadata.get(MAPPING_KEY, '') != key:
+        raise EpisodeError(
+            f"'{path}' was imported with another mapping, calibration or robot; remove it or "
+            'choose another --out'
+        )
+
+
+def convert_bag(
+    bag: Path,
+    out: Path,
+    mapping: BagMapping,
+    robot: RobotModel,
+    calibration: Path | None,
+    key: str = '',
+) -> tuple[str, ...]:
+    """Writes a bag as an episode; nothing is there before it is complete.
+
+    Returns:
+        What was odd and how it was handled.
+
+    Raises:
+        MtvWorldError: the bag cannot be converted; nothing is left behind.
+    """
+    episode = read_episode(
+        bag, views=list(mapping.views), calibration=calibration, mapping=mapping, robot=robot
+    )
+    for camera in episode.cameras.values():  # names a mount_link that is not there
+        camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
+    stamps, positions = _measured(episode, robot, mapping)
+    commands = _commands(episode, robot, mapping)
+    warnings = [*episode.warnings, *_jumps(commands, robot)]
+    with EpisodeWriter(
+        out,
+        task=mapping.task or episode.info.task,
+        instruction=mapping.instruction or episode.info.instruction,
+        robot=robot.name,
+        cameras=[episode.cameras[view] for view in episode.views],
+        objects=mapping.objects or episode.info.objects,
+        metadata={'source': bag.name, MAPPING_KEY: key},
+        jpeg_quality=mapping.jpeg_quality,
+    ) as writer:
+        writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
+        for write in _in_order(episode, writer, robot, stamps, positions, commands, mapping):
+            write()
+    return tuple(warnings)
+
+
+def _measured(
+    episode: Episode, robot: RobotModel, mapping: BagMapping
+) -> tuple[np.ndarray, FloatArray]:
+    """Stamps (N,) and positions (N, J) in the robot's order."""
+    states = episode.joint_states
+    if states is None:
+        hints = [text for text in episode.warnings if 'joint states' in text]
+        raise EpisodeError(f"'{episode.info.path}' has no joint states{': '.join(['', *hints])}")
+    seconds = (states.stamps_ns - states.stamps_ns[0]) * 1e-9
+    table = JointTrajectory(
+        joint_names=states.joint_names,
+        times=np.asarray(seconds, np.float64),
+        positions=states.positions,
+    )
+    positions = match_joints(table, robot).positions
+    _check(robot, positions, mapping, 'joint states')
+    return states.stamps_ns, positions
+
+
+def _commands(
+    episode: Episode, robot: RobotModel, mapping: BagMapping
+) -> list[tuple[int, JointTrajectory]]:
+    if not episode.trajectories:
+        raise EpisodeError(
+            f"'{episode.info.path}' has no commands at '{mapping.topic(mapping.action)}'; name "
+            "their topic in 'action', or set 'action: state' to take the measured positions"
+        )
+    matched = [(stamp, match_joints(t, robot)) for stamp, t in episode.trajectories]
+    for _, trajectory in matched:
+        _check(robot, trajectory.positions, mapping, 'commands')
+    return matched
+
+
+def _check(robot: RobotModel, positions: FloatArray, mapping: BagMapping, what: str) -> None:
+    try:
+        check_positions(robot, positions, tolerance=mapping.limit_tolerance)
+    except TrajectoryError as error:
+        raise TrajectoryError(
+            f"{what}: {error}; are the joints' names, units and the gripper's range those of the "
+            'robot? (limit_tolerance in the mapping says how far outside is accepted)'
+        ) from error
+
+
+def _jumps(commands: Sequence[tuple[int, JointTrajectory]], robot: RobotModel) -> list[str]:
+    """Joints whose commands are faster than they can move, and how often."""
+    counts = np.zeros(len(robot.joint_names), int)
+    for _, trajectory in commands:
+        if len(trajectory.times) > 1:
+            speeds = np.diff(trajectory.positions, axis=0) / np.diff(trajectory.times)[:, None]
+            counts += (np.abs(speeds) > _JUMP * robot.velocity_limits).sum(axis=0)
+    return [
+        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times its speed limit)"
+        for name, count in zip(robot.joint_names, counts, strict=True)
+        if count
+    ]
+
+
+def _in_order(
+    episode: Episode,
+    writer: EpisodeWriter,
+    robot: RobotModel,
+    stamps: np.ndarray,
+    positions: FloatArray,
+    commands: Sequence[tuple[int, JointTrajectory]],
+    mapping: BagMapping,
+) -> list[Callable[[], Any]]:
+    """What is to be written, by stamp."""
+    entries: list[tuple[int, int, Callable[[], Any]]] = []
+
+    def add(stamp: int, rank: int, write: Callable[..., Any], *values: Any) -> None:
+        entries.append((stamp, rank, lambda: write(*values)))
+
+    for stamp, words in _told(episode, mapping, int(stamps[0])):
+        add(stamp, 0, writer.write_instruction, stamp, words)
+    for stamp, row in zip(stamps.tolist(), positions, strict=True):
+        add(stamp, 1, writer.write_joint_states, stamp, robot.joint_names, row)
+    for stamp, trajectory in commands:
+        add(stamp, 2, writer.write_trajectory, stamp, trajectory)
+    frames = [(v, s, i) for v in episode.views for i, s in enumerate(episode.images[v].stamps_ns)]
+    for view, stamp_ns, index in frames:
+        stamp = int(stamp_ns)
+        add(stamp, 3, writer.write_camera_info, view, stamp, episode.cameras[view])
+        add(stamp, 4, _write_frame, writer, episode, view, index)
+    masks = episode.masks or {}
+    for view, stamp, index in ((v, s, i) for v in masks for i, s in enumerate(masks[v].stamps_ns)):
+        add(int(stamp), 5, _write_mask, writer, view, int(stamp), masks[view].frames, index)
+    return [write for _, _, write in sorted(entries, key=lambda entry: entry[:2])]
+
+
+def _told(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[int, str]]:
+    """Instructions by stamp, at least one."""
+    if mapping.instruction or not episode.instructions:
+        return [(start_ns, mapping.instruction or episode.info.instruction)]
+    return list(episode.instructions)
+
+
+def _write_frame(writer: EpisodeWriter, episode: Episode, view: str, index: int) -> None:
+    track = episode.images[view]
+    writer.write_image(view, int(track.stamps_ns[index]), track.frames[index])
+
+
+def _write_mask(writer: EpisodeWriter, view: str, stamp: int, frames: Any, index: int) -> None:
+    writer.write_mask(view, stamp, frames[index])

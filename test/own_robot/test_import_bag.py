@@ -1,0 +1,142 @@
+"""`mtv-world import-bag`: a robot's own bags, with TF, its description and no commands."""
+
+from dataclasses import replace
+
+from bags import record
+from crane import FPS, load, make_cameras, make_positions, render
+import numpy as np
+import pytest
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.bag_mapping import guess_views, load_bag_mapping
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.geometry.robot_file import load_robot
+
+MAPPING = {
+    'namespace': 'cell',
+    'action': 'state',
+    'joints': {f'lab_{name}': name for name in ('yaw', 'shoulder', 'elbow', 'roll', 'nod')}
+    | {'lab_jaw_left': 'jaw_left'},
+    'instruction': 'wave',
+}  # fmt: skip
+NUM = 25
+
+
+@pytest.fixture(scope='module')
+def robot(tmp_path_factory):
+    return load(tmp_path_factory.mktemp('robot'))
+
+
+@pytest.fixture(scope='module')
+def scene(robot):
+    """Cameras, positions, and what the cameras see."""
+    cameras = make_cameras()
+    del cameras['window']
+    positions = make_positions(NUM / FPS)
+    return cameras, positions, {v: render(robot, c, positions) for v, c in cameras.items()}
+
+
+def run(folder, *bags, mapping=MAPPING, more=()):
+    (folder / 'bag.yaml').write_text(yaml.safe_dump(mapping))
+    command = ['import-bag', *map(str, bags), '--topics', str(folder / 'bag.yaml')]
+    return main([*command, '--out', str(folder / 'out'), *more])
+
+
+@pytest.mark.parametrize(
+    ('sqlite', 'compression'),
+    [(True, 'none'), (True, 'file'), (True, 'message'), (False, 'file'), (False, 'message')],
+)
+def test_views_joints_cameras_and_robot_come_from_the_bag(
+    robot, scene, tmp_path, capsys, sqlite, compression
+):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, sqlite=sqlite, frames=frames,
+                 compression=compression)  # fmt: skip
+    assert run(tmp_path, bag) == 0, capsys.readouterr().err
+    episode = read_episode(tmp_path / 'out' / 'wave')
+    assert episode.info.robot == 'crane' and episode.info.instruction == 'wave'
+    assert episode.joint_states.joint_names == robot.joint_names
+    np.testing.assert_allclose(episode.joint_states.positions, positions)
+    assert set(episode.views) == {'door', 'palm'}
+    for view, link in (('door', 'plinth'), ('palm', 'hand')):
+        camera = episode.cameras[view]
+        assert camera.mount_link == link
+        np.testing.assert_allclose(camera.T_mount_camera, cameras[view].T_mount_camera, atol=1e-6)
+        np.testing.assert_allclose(camera.K, cameras[view].K)
+        apart = np.abs(np.asarray(episode.images[view].frames)[3].astype(int) - frames[view][3])
+        assert apart.mean() < 12
+    commanded = np.concatenate([t.positions for _, t in episode.trajectories])
+    np.testing.assert_allclose(commanded, positions[1:], atol=1e-9)
+    guessed = load_robot(tmp_path / 'out' / 'robot' / 'robot.yaml')
+    assert guessed.tools[0].gripper_joint == 'jaw_left' and guessed.base_link == 'plinth'
+
+
+def test_again_keeps_what_is_there_and_another_mapping_is_named(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    assert run(tmp_path, bag) == 0
+    assert run(tmp_path, bag) == 0
+    assert '0 made, 1 kept, 0 failed' in capsys.readouterr().out
+    assert run(tmp_path, bag, mapping=MAPPING | {'task': 'other'}) == 1
+    assert 'imported with another mapping' in capsys.readouterr().err
+
+
+def test_what_is_wrong_with_a_bag_is_named_and_the_others_are_imported(
+    robot, scene, tmp_path, capsys
+):
+    cameras, positions, frames = scene
+    good = record(tmp_path / 'good', robot, cameras, positions, frames=frames)
+    degrees = record(tmp_path / 'degrees', robot, cameras, np.degrees(positions), frames=frames)
+    other = record(tmp_path / 'other', robot, cameras, positions, frames=frames, prefix='ur_')
+    cut = record(tmp_path / 'cut', robot, cameras, positions, frames=frames, sqlite=False)
+    file = next(cut.glob('*.mcap'))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+    assert run(tmp_path, good, degrees, other, cut) == 1
+    printed = capsys.readouterr()
+    assert '2 made, 0 kept, 2 failed' in printed.out
+    assert 'its limits are' in printed.err and 'ur_yaw' in printed.err
+    assert f'{cut}' in printed.err and 'cut off' in printed.err
+    assert 5 < len(read_episode(tmp_path / 'out' / 'cut').images['door'].frames) < NUM
+
+
+def test_a_bag_without_commands_says_how_to_take_the_measured_ones(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    assert run(tmp_path, bag, mapping={**MAPPING, 'action': 'joint_trajectory'}) == 1
+    assert "set 'action: state'" in capsys.readouterr().err
+
+
+def test_bags_are_read_as_they_are_with_the_mapping(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    assert run(tmp_path, bag) == 0
+    mapping = tmp_path / 'out' / 'mapping.yaml'
+    assert load_bag_mapping(mapping).robot == str(tmp_path / 'out' / 'robot' / 'robot.yaml')
+    status = main(
+        ['doctor', str(bag), '--topics', str(mapping), '--out', str(tmp_path / 'doctor')]
+    )
+    printed = capsys.readouterr().out
+    assert status == 3, printed  # the description has a mesh that no bag carries
+    assert 'not checked' in printed and 'hand.stl' in printed
+
+
+def test_a_fisheye_and_a_moving_mount_are_told_apart(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+    bent = replace(
+        cameras['door'], distortion_model='equidistant', distortion=np.array([0.1, 0, 0, 0])
+    )
+    bag = record(tmp_path / 'bent', robot, {**cameras, 'door': bent}, positions, frames=frames)
+    assert run(tmp_path, bag) == 0, capsys.readouterr().err
+    camera = read_episode(tmp_path / 'out' / 'bent').cameras['door']
+    assert camera.distortion_model == 'equidistant'
+    assert camera.distortion.tolist() == [0.1, 0, 0, 0]
+
+
+def test_views_are_named_after_what_tells_them_apart():
+    topics = ['/cell/front/color/image_raw', '/cell/front/color/image_raw/compressed',
+              '/wrist_camera/image_rect', '/cell/front/depth/image_raw']  # fmt: skip
+    assert guess_views(topics) == {
+        'front': '/cell/front/color/image_raw',
+        'wrist_camera': '/wrist_camera/image_rect',
+    }

@@ -1,0 +1,86 @@
+"""`mtv-world robot`: what is guessed from a URDF against robot files that people wrote."""
+
+from crane import load, URDF, write_robot
+import cv2
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.errors import RobotError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_guess import guess_robot
+
+
+@pytest.fixture
+def crane(tmp_path):
+    return write_robot(tmp_path)
+
+
+def test_a_urdf_becomes_a_robot_file_with_a_picture(crane, tmp_path, capsys):
+    urdf, out = crane.with_name('crane.urdf'), tmp_path / 'mine' / 'guessed.yaml'
+    picture = tmp_path / 'crane.png'
+    command = ['robot', str(urdf), '--out', str(out), '--picture', str(picture)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert 'joint roll: turns without end' in printed
+    assert 'gripper jaw_left: closed at 0, open at 0.04' in printed
+    guessed, written = load_robot(out), load_robot(crane)
+    assert guessed.joint_names == written.joint_names
+    assert guessed.base_link == written.base_link == 'plinth'
+    assert np.abs(guessed.tools[0].T_link_tool - written.tools[0].T_link_tool).max() < 0.01
+    image = cv2.imread(str(picture))
+    assert image.shape == (960, 960, 3)
+    assert (image < 200).any(axis=-1).mean() > 0.02
+    assert main(command) == 1  # nothing that exists is overwritten
+    assert 'exists' in capsys.readouterr().err
+
+
+def test_the_guess_for_two_arms_agrees_with_the_bundled_file():
+    yam = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    values = guess_robot(share_path('config', 'robots', 'yam_bimanual.urdf')).values
+    assert tuple(values['joints']) == yam.joint_names and values['base_link'] == yam.base_link
+    for guess, tool in zip(values['tools'], yam.tools, strict=True):
+        assert (guess['arm'], guess['link']) == (tool.arm, tool.link)
+        assert guess['gripper_joint'] == tool.gripper_joint
+        assert abs(guess['gripper_open'] - tool.gripper_open) < 1e-6
+        assert abs(guess['gripper_closed'] - tool.gripper_closed) < 0.003
+        assert np.abs(guess['position'] - tool.T_link_tool[:3, 3]).max() < 0.02
+        aligned = np.abs(np.dot(guess['quaternion_xyzw'], [0, 0, -(0.5**0.5), 0.5**0.5]))
+        assert aligned > 0.999
+
+
+def test_joints_that_follow_in_a_chain_are_resolved_and_circles_named(crane):
+    text = URDF.replace('<mimic joint="jaw_left"/>', '<mimic joint="{}" multiplier="2"/>')
+    chain = text.format('jaw_right2') + (
+        '<link name="x"/><joint name="jaw_right2" type="prismatic"><parent link="hand"/>'
+        '<child link="x"/><axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="1" '
+        'velocity="1"/><mimic joint="{}" multiplier="0.5" offset="0.01"/></joint></robot>'
+    )
+    chain = chain.replace('</robot><link', '<link')
+    urdf = crane.with_name('crane.urdf')
+    urdf.write_text(chain.format('jaw_left'))
+    robot = load_robot(crane)
+    shut, wide = np.zeros((1, 6)), np.zeros((1, 6))
+    wide[0, 5] = 0.02
+    moved = robot.link_poses('right', wide) - robot.link_poses('right', shut)
+    apart = np.linalg.norm(moved[0, :3, 3])
+    assert apart == pytest.approx(0.02)  # 2 * 0.5 of the leader
+    urdf.write_text(chain.format('jaw_right'))
+    with pytest.raises(RobotError, match='follows itself'):
+        load_robot(crane)
+
+
+def test_a_floating_joint_rests_and_is_named(crane, tmp_path):
+    text = crane.with_name('crane.urdf').read_text()
+    floating = text.replace('name="stand" type="fixed"', 'name="stand" type="floating"')
+    crane.with_name('crane.urdf').write_text(floating)
+    guessed = guess_robot(crane.with_name('crane.urdf'))
+    assert 'joints of several numbers rest: stand' in guessed.notes[0]
+    assert load(tmp_path / 'again').joint_names == tuple(guessed.values['joints'])
+
+
+def test_what_has_no_arm_is_refused(tmp_path):
+    (tmp_path / 'box.urdf').write_text('<robot name="box"><link name="base"/></robot>')
+    with pytest.raises(RobotError, match='has no arm'):
+        guess_robot(tmp_path / 'box.urdf')
