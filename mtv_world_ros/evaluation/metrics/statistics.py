@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.evaluation.metrics.scores import MARGINS, MEANS, QUALITY
+from mtv_world_ros.evaluation.metrics.scores import BOTH, MARGINS, MEANS, QUALITY
 
 Interval = tuple[float, float]
 UNKNOWN: Interval = (nan, nan)
@@ -99,7 +99,7 @@ def summarise(episodes: Sequence[dict[str, float]]) -> dict[str, Estimate]:
     Args:
         episodes: `episode_means` of each episode, and its `QUALITY` where measured.
     """
-    names = [*MEANS, *MARGINS, *QUALITY]
+    names = [*MEANS, *BOTH, *MARGINS, *QUALITY]
     rows = [[means.get(name, nan) for name in names] for means in episodes]
     columns = dict(zip(names, np.array(rows, np.float64).reshape(-1, len(names)).T, strict=True))
     found = {
