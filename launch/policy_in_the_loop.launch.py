@@ -8,6 +8,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, Shutdown
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PythonExpression
+from launch_ros.substitutions import ExecutableInPackage
 
 #: arguments that become an option of `mtv-world imagine`, with default and meaning
 OPTIONS = {
@@ -37,6 +38,8 @@ def generate_launch_description():
         for name in OPTIONS
         for part in (f'--{name}', LaunchConfiguration(name.replace('-', '_')))
     ]
+    # colcon installs it into lib/mtv_world_ros, which is on no PATH
+    command = ExecutableInPackage(package='mtv_world_ros', executable='mtv-world')
     live = LaunchConfiguration('live')
     runs = {
         PythonExpression(["'", live, "' == 'true'"]): ['--live'],
@@ -47,7 +50,7 @@ def generate_launch_description():
     }
     processes = [
         ExecuteProcess(
-            cmd=['mtv-world', 'imagine', *start, *options],
+            cmd=[command, 'imagine', *start, *options],
             output='screen',
             condition=IfCondition(condition),
             on_exit=Shutdown(reason='all episodes are over'),

@@ -1,6 +1,8 @@
 """Plays a recorded episode through the node; ends when the episode is over.
 
 ros2 launch mtv_world_ros replay.launch.py episode:=/path/to/episode
+
+With `namespace:=` the node, the episode's topics and its clock lie in that namespace.
 """
 
 from launch import LaunchDescription
@@ -30,6 +32,7 @@ def generate_launch_description():
         DeclareLaunchArgument('compressed_input', default_value='true', description='JPEG images'),
         DeclareLaunchArgument('rate', default_value='1.0', description='of playing'),
         DeclareLaunchArgument('pace', default_value='realtime', description='or burst'),
+        DeclareLaunchArgument('namespace', default_value='', description='of node and player'),
         DeclareLaunchArgument('checkpoint', default_value='', description='empty = bundled'),
         DeclareLaunchArgument(
             'num_inference_steps', default_value='', description="empty = the checkpoint's"
@@ -46,6 +49,8 @@ def generate_launch_description():
             'pace': LaunchConfiguration('pace'),
             'checkpoint': LaunchConfiguration('checkpoint'),
             'num_inference_steps': LaunchConfiguration('num_inference_steps'),
+            'namespace': LaunchConfiguration('namespace'),
+            'clock': 'clock',
             'required': 'true',
         }.items(),
     )
@@ -53,6 +58,7 @@ def generate_launch_description():
         package='mtv_world_ros',
         executable='mtv-world',
         name='player',
+        namespace=LaunchConfiguration('namespace'),
         arguments=['replay', episode, '--', '--clock', '--lock-step',
                    '--rate', LaunchConfiguration('rate')],
         output='screen',

@@ -39,6 +39,7 @@ def make_node(context):
         name='world_model',
         namespace=LaunchConfiguration('namespace'),
         parameters=[LaunchConfiguration('params_file'), given],
+        remappings=[('/clock', LaunchConfiguration('clock'))],
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
         output='screen',
         emulate_tty=True,
@@ -60,6 +61,11 @@ def generate_launch_description():
             description='parameter file of the node',
         ),
         DeclareLaunchArgument('namespace', default_value='', description='of the node'),
+        DeclareLaunchArgument(
+            'clock',
+            default_value='/clock',
+            description='topic of the clock; a relative name lies in the namespace',
+        ),
         DeclareLaunchArgument('log_level', default_value='info', description='of the node'),
         DeclareLaunchArgument(
             'required', default_value='false', description='end the whole launch with the node'

@@ -28,7 +28,8 @@ def match_joints(
         trajectory: joints in any order.
         robot: the robot.
         current: (J,) positions that missing joints keep, with `allow_missing`.
-        allow_missing: whether missing joints are filled instead of refused.
+        allow_missing: whether missing joints are filled instead of refused, as long as all that
+            are named are the robot's: another name may be a misspelt one.
 
     Raises:
         TrajectoryError: joints named twice or missing, velocities that are not finite.
@@ -45,10 +46,13 @@ def match_joints(
     if doubled:
         raise TrajectoryError(f'joints {doubled} are named more than once')
     missing = [name for name in robot.joint_names if name not in given]
-    if missing and (not allow_missing or current is None):
+    unknown = [name for name in given if name not in robot.joint_names]
+    is_partial = allow_missing and current is not None and not unknown
+    if missing and not is_partial:
+        hint = f'; it has no {unknown}{nearest(unknown[0], missing)}' if unknown else ''
         raise TrajectoryError(
-            f"joints {missing} of robot '{robot.name}' are missing; the trajectory has "
-            f'{list(given)}{nearest(missing[0], given)}'
+            f"joints {missing} of robot '{robot.name}' are missing{hint}; the trajectory has "
+            f'{list(given)}'
         )
     if given == robot.joint_names:
         return trajectory

@@ -164,6 +164,22 @@ def declare(node: Node, kind: type[Schema]) -> None:
     node.add_on_set_parameters_callback(partial(_check, kind))
 
 
+def refuse_unknown(node: Node) -> None:
+    """Refuses parameters that were given at start-up and that the node does not have.
+
+    To be called when all of them are declared.
+
+    Raises:
+        ConfigError: naming the nearest ones.
+    """
+    known = node.list_parameters([], 0).names
+    # rclpy has no public way to ask for what was given
+    unknown = [name for name in node._parameter_overrides if not node.has_parameter(name)]
+    if unknown:
+        said = ', '.join(f"'{name}'{nearest(name, known)}" for name in unknown)
+        raise ConfigError(f"'{node.get_name()}' has no parameter {said}; --help lists them")
+
+
 def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
     """Declares `camera_topics.<view>` and returns each view's camera topic, by default its name.
 

@@ -22,6 +22,8 @@ _ANSWER_S = 30.0
 class Peers:
     """Keeps the newest diagnostics of every node, and talks to their services.
 
+    Nodes are told apart by their whole names, with the namespace.
+
     Args:
         node: owner of the subscription and the clients.
         spin_once: handles callbacks for a moment; raises where waiting makes no sense any more.
@@ -35,11 +37,12 @@ class Peers:
 
     def silence_s(self, name: str) -> float:
         """For how long a node has said nothing [s]; infinite = never heard."""
-        heard = self._heard.get(name)
+        heard = self._heard.get(self._status_name(name))
         return float('inf') if heard is None else time.monotonic() - heard[0]
 
     def state(self, name: str) -> Mapping[str, str]:
         """What a node said of itself last."""
+        name = self._status_name(name)
         return self._heard[name][1] if name in self._heard else {}
 
     def unconnected(self, topics: Iterable[str], least: int = 1) -> list[str]:
@@ -58,7 +61,7 @@ class Peers:
 
     def forget(self, name: str) -> None:
         """Forgets what a node said: what it says next is new."""
-        self._heard.pop(name, None)
+        self._heard.pop(self._status_name(name), None)
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
         """Spins until the condition holds.
@@ -98,6 +101,10 @@ class Peers:
         for name, result in zip(values, results, strict=True):
             if not result.successful:
                 raise ConfigError(f"'{node}' refuses parameter '{name}': {result.reason}")
+
+    def _status_name(self, name: str) -> str:
+        """A node's name, absolute or in this node's namespace, as diagnostics have it."""
+        return self._node.resolve_service_name(name).lstrip('/')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

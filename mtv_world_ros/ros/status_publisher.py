@@ -49,7 +49,7 @@ class StatusPublisher:
     def report(self, state: str, values: Mapping[str, object]) -> None:
         """Publishes a report at once."""
         status = to_status(
-            f'{self._node.get_name()}: episode',
+            f'{status_name(self._node)}: episode',
             '',
             DiagnosticStatus.OK,
             state,
@@ -71,12 +71,16 @@ class StatusPublisher:
             recent = self._last[1] if age < _WARN_S else ''
             warning = '; '.join(filter(None, (recent, warning)))
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
-        name = self._node.get_name()
-        status = to_status(name, '', level, warning or 'ready', values)
+        status = to_status(status_name(self._node), '', level, warning or 'ready', values)
         self._diagnostics.publish(to_diagnostics(self._header(), status))
 
     def _header(self) -> Header:
         return make_header(self._node.get_clock().now().nanoseconds)
+
+
+def status_name(node: Node) -> str:
+    """Returns the node's name in diagnostics: with its namespace, without the first slash."""
+    return node.get_fully_qualified_name().lstrip('/')
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Publisher:

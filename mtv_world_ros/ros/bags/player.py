@@ -84,7 +84,8 @@ class Player(Node):
         self._outputs = {
             topic: self._offer(types[topic], topic) for topic in _chosen(types, options)
         }
-        self._clock_output = self.create_publisher(Clock, '/clock', 10) if options.clock else None
+        clock = self._played_name('/clock')
+        self._clock_output = self.create_publisher(Clock, clock, 10) if options.clock else None
         self._ends: list[dict[str, str]] = []
         self._unpublished: set[tuple[str, str]] = set()
         if options.lock_step:
@@ -123,7 +124,11 @@ class Player(Node):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        return self.create_publisher(message_class(msgtype), topic, profile)
+        return self.create_publisher(message_class(msgtype), self._played_name(topic), profile)
+
+    def _played_name(self, topic: str) -> str:
+        """A topic of the bag, in the player's namespace if it has one: two players, two robots."""
+        return topic if self.get_namespace() == '/' else topic.lstrip('/')
 
     def _wait_for_subscribers(self) -> None:
         needed = self._options.wait_for or [
@@ -145,7 +150,7 @@ class Player(Node):
         """Topics without subscriber, as far as the graph, or their publisher, can tell."""
         lonely = [topic for topic in topics if not self.count_subscribers(topic)]
         if self._options.lock_step and not lonely:
-            node = self._options.report_topic.split('/')[-2]
+            node = self.resolve_topic_name(self._options.report_topic).rpartition('/')[0]
             lonely = [] if self._peers.state(node) else [f'/diagnostics of {node}']
         return lonely or self._peers.unconnected(topics)
 
@@ -308,7 +313,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add('--no-wait', action='store_true', help='play whether or not anybody listens')
     add('--lock-step', action='store_true', help='after each trajectory wait for the answer')
     add('--answer-timeout', type=float, default=120.0, help='wait for an answer this long [s]')
-    add('--report-topic', default='/world_model/report', help='where answers are reported')
+    add('--report-topic', default='world_model/report', help='where answers are reported')
     return parser.parse_args(arguments)
 
 

@@ -79,7 +79,7 @@ class EpisodeRunner(Node):
         request, timeout = SetBool.Request(data=True), options.wait_timeout
         self._peers.call(SetBool, f'{options.world_model}/imagine', request, timeout)
         self._wait_for(
-            lambda: self._peers.silence_s(self._name(options.policy_node)) < timeout,
+            lambda: self._peers.silence_s(options.policy_node) < timeout,
             f"the node '{options.policy_node}'",
         )
         self._connect()
@@ -158,7 +158,7 @@ class EpisodeRunner(Node):
                 (options.policy_node, 'policy_died'),
                 (options.world_model, 'world_model_died'),
             ):
-                silence_s = self._peers.silence_s(self._name(name))
+                silence_s = self._peers.silence_s(name)
                 if silence_s > options.heartbeat_timeout:
                     return {'how': how, 'text': f"'{name}' has been silent for {silence_s:.1f} s"}
             if time.monotonic() > end_s:
@@ -172,7 +172,7 @@ class EpisodeRunner(Node):
         options = self._options
         nodes = {'policy_died': options.policy_node, 'world_model_died': options.world_model}
         for how, node in nodes.items():
-            silence_s = self._peers.silence_s(self._name(node))
+            silence_s = self._peers.silence_s(node)
             if silence_s > options.heartbeat_timeout:
                 return {'how': how, 'text': f"'{node}' has been silent for {silence_s:.1f} s"}
         return {}
@@ -202,7 +202,7 @@ class EpisodeRunner(Node):
             others = [*shown, 'joint_trajectory', 'instruction', '/diagnostics']
             others += [f'{node}/report' for node in (options.world_model, options.policy_node)]
             self._recording.start([*predicted, *others])
-            self._peers.forget(self._name(options.world_model))
+            self._peers.forget(options.world_model)
             self._wait_for(lambda: self._are_recorded(predicted), 'connections to the recorder')
             least = 3
         outputs = self._outputs.values()
@@ -212,7 +212,7 @@ class EpisodeRunner(Node):
         )
 
     def _are_recorded(self, topics: Sequence[str]) -> bool:
-        is_heard = bool(self._peers.state(self._name(self._options.world_model)))
+        is_heard = bool(self._peers.state(self._options.world_model))
         # the policy sees these too
         shared = [t for t in topics if t.endswith(('/image_raw', '/joint_states'))]
         lonely = self._peers.unconnected(topics) + self._peers.unconnected(shared, least=2)
@@ -246,11 +246,6 @@ class EpisodeRunner(Node):
             self._status.publish_diagnostics({'episodes': len(self._results)})
             if self._live is not None:
                 self._live.refresh()
-
-    @staticmethod
-    def _name(node: str) -> str:
-        """Name of a node without its namespace, as diagnostics have it."""
-        return node.rsplit('/', 1)[-1]
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:

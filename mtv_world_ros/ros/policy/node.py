@@ -32,7 +32,7 @@ from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
 from mtv_world_ros.ros.status_publisher import StatusPublisher
-from mtv_world_ros.ros.world_model.loading import load_spec, reload_cameras
+from mtv_world_ros.ros.world_model.loading import check_calibration, load_spec, reload_cameras
 
 Load = Callable[[PolicySettings], PolicyMaker]
 _TICK_S = 0.02
@@ -87,6 +87,10 @@ class PolicyNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_TICK_S, self._guarded(self._loop.tick), clock=steady)
         self.create_timer(settings.diagnostics_period_s, self._on_period, clock=steady)
+        self.add_on_set_parameters_callback(
+            lambda changed: check_calibration(changed, self._settings(), self._spec)
+        )
+        parameters.refuse_unknown(self)
         self.get_logger().info(f"ready: policy '{settings.policy}'")
 
     def close(self) -> None:

@@ -149,6 +149,22 @@ class ObservationBuffer:
         )
         return ages
 
+    def problems(self, now_ns: int) -> list[str]:
+        """Returns what is missing or too old for an observation, in words; empty = nothing."""
+        limits, said = self._limits(), []
+        for view, images in self._images.items():
+            said += _freshness(f"images of view '{view}'", images, now_ns, limits.max_image_age_s)
+            if not self._intrinsics.has(view):
+                said.append(f"no camera_info of view '{view}'")
+        old = {
+            name: _freshness('', samples, now_ns, limits.max_joint_state_age_s)
+            for name, samples in self._joints.items()
+        }
+        names = [name for name, text in old.items() if text]
+        if names:
+            said.append(f'no fresh joint_states of {", ".join(names)}')
+        return said
+
     def observe(self, now_ns: int) -> Scene:
         """Makes an observation of the newest images that belong together.
 
@@ -297,6 +313,10 @@ class Intrinsics:
             )
         return camera
 
+    def has(self, view: str) -> bool:
+        """Tells whether the view's info was received."""
+        return view in self._infos
+
     def info(self, view: str, frame_id: str) -> CameraInfo:
         """The view's info, with the image's frame where the image names one."""
         info = self._infos[view]
@@ -313,6 +333,15 @@ class Intrinsics:
 
 def _age(samples: Sequence[tuple[int, object]], now_ns: int) -> float:
     return (now_ns - samples[-1][0]) / NANO if samples else float('nan')
+
+
+def _freshness(
+    what: str, samples: Sequence[tuple[int, object]], now_ns: int, limit: float
+) -> list[str]:
+    if not samples:
+        return [f'no {what}']
+    age = _age(samples, now_ns)
+    return [] if abs(age) <= limit else [f'{what} are {age:.1f} s old']
 
 
 def _check_age(reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float) -> None:

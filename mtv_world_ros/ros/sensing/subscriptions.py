@@ -50,9 +50,10 @@ class Inputs:
         on_trajectory: Handler,
         guarded: Callable[[Handler], Handler],
     ) -> None:
-        self._all = subscribe_observations(
+        self._observations = subscribe_observations(
             node, views, compressed=compressed, buffer=buffer, guarded=guarded
         )
+        self._all = [*self._observations]
         instruction = guarded(on_instruction)
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
         handle = guarded(on_trajectory)
@@ -65,6 +66,15 @@ class Inputs:
         """Looks at the publishers again; to be called now and then."""
         for subscription in self._all:
             subscription.refresh()
+
+    def unpublished(self) -> list[str]:
+        """Topics of observations that nobody publishes."""
+        return [s.topic for s in self._observations if not s.num_publishers]
+
+    @property
+    def plan_topic(self) -> str:
+        """Where trajectories come in."""
+        return self._plans.topic
 
     def publisher_counts(self) -> dict[str, int]:
         """Publishers by topic, as `publishers.<topic>`, and `policies`: those of trajectories."""
@@ -125,14 +135,18 @@ class MatchedSubscription:
         self._node, self._kind, self._callback = node, kind, callback
         self.topic = node.resolve_topic_name(topic)
         prefix = f'qos_overrides.{self.topic}.subscription'
-        read_only = ParameterDescriptor(read_only=True)
-        choice = node.declare_parameter(f'{prefix}.reliability', default, read_only).value
+
+        def declare(name: str, value: object, text: str) -> Any:
+            told = ParameterDescriptor(description=f'{text} of {self.topic}', read_only=True)
+            return node.declare_parameter(f'{prefix}.{name}', value, told).value
+
+        words = ', '.join(_RELIABILITIES)
+        choice = declare('reliability', default, f'{words}: reliability of the subscription')
         if choice not in _RELIABILITIES:
             raise ConfigError(
-                f"parameter '{prefix}.reliability' is '{choice}'; it must be one of "
-                f'{", ".join(_RELIABILITIES)}'
+                f"parameter '{prefix}.reliability' is '{choice}'; it must be one of {words}"
             )
-        self._depth = node.declare_parameter(f'{prefix}.depth', depth, read_only).value
+        self._depth = declare('depth', depth, 'Messages kept by the subscription')
         self._matches = choice == 'match'
         self._qos = _LOWEST
         if choice == 'reliable':

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
 
 from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.errors import CalibrationError, MtvWorldError
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
@@ -52,6 +56,20 @@ def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[Camera
     """
     with rejected_as(Reason.CAMERA_INFO_INVALID):
         return load_cameras(settings, spec)
+
+
+def check_calibration(
+    changed: Sequence[Parameter], settings: NodeSettings, spec: WorldModelSpec
+) -> SetParametersResult:
+    """Refuses a `calibration_file` that is wrong or lacks a view, before it is taken."""
+    for parameter in changed:
+        if parameter.name != 'calibration_file':
+            continue
+        try:
+            load_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
+        except MtvWorldError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+    return SetParametersResult(successful=True)
 
 
 def load_spec(checkpoint: str) -> WorldModelSpec:

@@ -8,9 +8,11 @@ from contextlib import suppress
 import sys
 import time
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -26,7 +28,12 @@ from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.adapter_parameter import AdapterSwitch
 from mtv_world_ros.ros.world_model.live_fidelity import LiveFidelity
-from mtv_world_ros.ros.world_model.loading import load_cameras, load_named_pipeline, reload_cameras
+from mtv_world_ros.ros.world_model.loading import (
+    check_calibration,
+    load_cameras,
+    load_named_pipeline,
+    reload_cameras,
+)
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.requests import RequestMaker
@@ -49,6 +56,7 @@ class WorldModelNode(Node):
         super().__init__('world_model')
         parameters.declare(self, Settings)
         self._settings = parameters.read(self, Settings)
+        self.add_on_set_parameters_callback(self._check_calibration)
         self.add_post_set_parameters_callback(self._on_parameters)
         pipeline = load(self._settings)
         self._spec, self._robot = pipeline.spec, pipeline.robot
@@ -65,7 +73,9 @@ class WorldModelNode(Node):
         self._maker = RequestMaker(
             self._robot, self._buffer, self.settings, lambda: self._worker.last_scene
         )
-        self._reporter = Reporter(self, self._robot.name, self.settings, self._state)
+        self._reporter = Reporter(
+            self, self._robot.name, self.settings, self._state, self._missing
+        )
         self._fidelity = LiveFidelity(self, pipeline, self._reporter.scored, self._reporter.crash)
         self._publisher = PredictionPublisher(
             self,
@@ -97,6 +107,7 @@ class WorldModelNode(Node):
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
         self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
+        parameters.refuse_unknown(self)
         self._worker.start()
         self.get_logger().info(
             f'ready: {", ".join(self._spec.views)} at {self._spec.width}x{self._spec.height}, '
@@ -182,12 +193,25 @@ class WorldModelNode(Node):
         self._buffer.clear()
         self._give_up()
 
+    def _check_calibration(self, changed: list[Parameter]) -> SetParametersResult:
+        """Refuses a `calibration_file` that cannot be used."""
+        return check_calibration(changed, self._settings, self._spec)
+
     def _on_parameters(self, _: object) -> None:
         self._settings = parameters.read(self, Settings)
 
     def _on_period(self) -> None:
         self._inputs.refresh()
         self._reporter.publish_diagnostics()
+
+    def _missing(self) -> list[str]:
+        """What the node needs and does not get; in imagine mode only to begin."""
+        if self._maker.imagine and self._worker.last_scene is not None:
+            return []
+        silent = [f'nobody publishes {topic}' for topic in self._inputs.unpublished()]
+        if not self._maker.num_requests and not self._inputs.publisher_counts()['policies']:
+            silent.append(f'nobody publishes {self._inputs.plan_topic}')
+        return silent or self._buffer.problems(self.get_clock().now().nanoseconds)
 
     def _state(self) -> Mapping[str, object]:
         return {

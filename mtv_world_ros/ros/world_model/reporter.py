@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import isnan
 import time
 import traceback
@@ -19,7 +19,7 @@ from mtv_world_ros.ros.messages.conversions import to_diagnostics, to_status
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.status_publisher import create_publisher
+from mtv_world_ros.ros.status_publisher import create_publisher, status_name
 from mtv_world_ros.ros.world_model.live_fidelity import Scored
 from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
@@ -46,9 +46,10 @@ class Reporter:
 
     Args:
         node: owner of the publishers and the logger.
-        hardware_id: name of the robot.
+        hardware_id: name of the robot; diagnostics put the node's namespace before it.
         settings: the present parameters.
         state: what else `/diagnostics` shows, asked each time.
+        missing: what the node needs and does not get, in words, asked each time.
     """
 
     def __init__(
@@ -57,9 +58,11 @@ class Reporter:
         hardware_id: str,
         settings: Callable[[], Settings],
         state: Callable[[], Mapping[str, object]],
+        missing: Callable[[], Sequence[str]],
     ) -> None:
-        self._node, self._hardware_id = node, hardware_id
-        self._settings, self._state = settings, state
+        self._node = node
+        self._hardware_id = f'{node.get_namespace()}/{hardware_id}'.lstrip('/')
+        self._settings, self._state, self._missing = settings, state, missing
         self._tally = Tally()
         self._report = create_publisher(node, DiagnosticArray, '~/report', 100)
         self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
@@ -138,7 +141,8 @@ class Reporter:
         """Publishes `/diagnostics`."""
         now_s = time.monotonic()
         state = self._state()
-        level, message = self._tally.level(now_s, num_policies=int(str(state['policies'])))
+        num_policies, missing = int(str(state['policies'])), self._missing()
+        level, message = self._tally.level(now_s, num_policies=num_policies, missing=missing)
         values = {**state, **self._tally.values(now_s)}
         self._publish(self._diagnostics, '', level, message, values)
 
@@ -164,7 +168,7 @@ class Reporter:
         message: str,
         values: Mapping[str, object],
     ) -> None:
-        name = f'{self._node.get_name()}{suffix}'
+        name = f'{status_name(self._node)}{suffix}'
         status = to_status(name, self._hardware_id, level, message, values)
         header = make_header(self._node.get_clock().now().nanoseconds)
         publisher.publish(to_diagnostics(header, status))
@@ -196,12 +200,15 @@ class Tally:
         for name, value in seconds.items():
             self._seconds.setdefault(name, deque(maxlen=_WINDOW)).append(value)
 
-    def level(self, now_s: float, num_policies: int = 1) -> tuple[bytes, str]:
+    def level(
+        self, now_s: float, *, num_policies: int = 1, missing: Sequence[str] = ()
+    ) -> tuple[bytes, str]:
         """How bad it is, and everything that is wrong.
 
         Args:
             now_s: now [s].
             num_policies: publishers of trajectories.
+            missing: what the node needs and does not get, in words.
         """
         level, texts = DiagnosticStatus.WARN, []
         if self._last is not None and now_s - self._last[0] < _WARN_S:
@@ -218,6 +225,7 @@ class Tally:
                 f'the last {self._fruitless} rollouts were pre-empted before their first chunk: '
                 'trajectories arrive faster than the model predicts'
             )
+        texts += [', '.join(missing)] if missing else []
         return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, 'ready')
 
     def values(self, now_s: float) -> dict[str, object]:

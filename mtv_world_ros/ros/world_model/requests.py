@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from trajectory_msgs.msg import JointTrajectory
+import numpy as np
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
+from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.ros.messages.conversions import to_trajectory
@@ -22,6 +24,7 @@ class RequestMaker:
     Attributes:
         imagine: whether rollouts go on from the last predicted frames.
         instruction: what the robot is told.
+        num_requests: made so far.
 
     Args:
         robot: whose joints trajectories move.
@@ -39,11 +42,11 @@ class RequestMaker:
     ) -> None:
         self._robot, self._buffer = robot, buffer
         self._settings, self._last_scene = settings, last_scene
-        self._count = 0
+        self.num_requests = 0
         self.imagine = settings().mode == 'imagine'
         self.instruction: str | None = None
 
-    def make(self, message: JointTrajectory, now_ns: int, received_s: float) -> Request:
+    def make(self, message: JointTrajectoryMsg, now_ns: int, received_s: float) -> Request:
         """Returns the request.
 
         Args:
@@ -56,10 +59,7 @@ class RequestMaker:
         """
         settings = self._settings()
         trajectory = to_trajectory(message)
-        with rejected_as(Reason.JOINT_NAMES):
-            trajectory = match_joints(trajectory, self._robot)
-        with rejected_as(Reason.JOINT_LIMITS):
-            check_positions(self._robot, trajectory.positions, tolerance=settings.limit_tolerance)
+        self._check_joints(trajectory, settings.limit_tolerance)
         stamp_ns = to_ns(message.header.stamp)
         limits = TimeLimits(
             trajectory_age=settings.max_trajectory_age_s, horizon=settings.max_horizon_s
@@ -67,9 +67,9 @@ class RequestMaker:
         last = self._last_scene() if self.imagine else None
         scene = last or self._real_scene(now_ns)
         from_observation(trajectory, stamp_ns, scene.observation.stamp_ns, limits)
-        self._count += 1
+        self.num_requests += 1
         return Request(
-            rollout=self._count,
+            rollout=self.num_requests,
             trajectory=trajectory,
             stamp_ns=stamp_ns,
             scene=scene,
@@ -84,6 +84,14 @@ class RequestMaker:
             received_ns=now_ns,
             limit_tolerance=settings.limit_tolerance,
         )
+
+    def _check_joints(self, trajectory: JointTrajectory, tolerance: float) -> None:
+        """Joints that are not named keep their position; none is outside its limits."""
+        home = np.clip(0.0, self._robot.lower, self._robot.upper)
+        with rejected_as(Reason.JOINT_NAMES):
+            whole = match_joints(trajectory, self._robot, home, allow_missing=True)
+        with rejected_as(Reason.JOINT_LIMITS):
+            check_positions(self._robot, whole.positions, tolerance=tolerance)
 
     def _real_scene(self, now_ns: int) -> Scene:
         if now_ns == 0:

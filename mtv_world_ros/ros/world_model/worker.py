@@ -11,6 +11,7 @@ import traceback
 
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
+from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.pipeline import ImaginedEpisode, ObservedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -32,7 +33,8 @@ class Request:
 
     Attributes:
         rollout: number of the rollout, counted from 1.
-        trajectory: in the robot's joint order; times count from `stamp_ns`.
+        trajectory: of some or all of the robot's joints, in any order; the others stay where they
+            are when it starts. Times count from `stamp_ns`.
         stamp_ns: the trajectory's stamp [ns]; 0 = it starts at the observation.
         scene: the newest scene when it came in; its frames are real, or predicted.
         imagine: whether to start from the last predicted frames if there are newer ones, and
@@ -291,9 +293,12 @@ class RolloutWorker:
         episode.seed, episode.num_seeds = request.seed, request.num_seeds
         episode.num_inference_steps = request.num_inference_steps
         episode.limit_tolerance = request.limit_tolerance
+        start = episode.observation
         trajectory = from_observation(
-            request.trajectory, request.stamp_ns, episode.observation.stamp_ns, request.limits
+            request.trajectory, request.stamp_ns, start.stamp_ns, request.limits
         )
+        robot = self._pipeline.robot
+        trajectory = match_joints(trajectory, robot, start.positions, allow_missing=True)
         for prediction in episode.extend(trajectory):
             ready_s = time.monotonic()
             chunk = Chunk(request=request, scene=scene, prediction=prediction, ready_s=ready_s)

@@ -327,3 +327,43 @@ def is_alive(pid):
         return stat.read_text().rsplit(')', 1)[1].split()[0] != 'Z'
     except OSError:
         return False
+
+
+def test_two_robots_and_two_players_do_not_meet(episode, launch, tmp_path, ros, client):
+    """Each in a namespace of its own, with its own clock, on one machine."""
+    heard = {}
+    for name in ('one', 'two'):
+        folder = tmp_path / name
+        folder.mkdir()
+        heard[name] = ros.start_node(
+            folder, 'pace:=burst', 'compressed_input:=true', 'use_sim_time:=true',
+            f'seed:={100 + len(heard)}', remaps=(f'__ns:=/{name}', '/clock:=clock'),
+        )  # fmt: skip
+        client.subscribe(ros.REPORT, f'/{name}/world_model/report', 100)
+    try:
+        for name in heard:
+            client.wait(
+                lambda n=name: client.node.count_publishers(f'/{n}/world_model/report'), name, 60
+            )
+        spaces = [('--ros-args', '-r', f'__ns:=/{name}') for name in heard]
+        first, second = (
+            launch('player', episode, '--clock', '--lock-step', '--rate', rate, *space)
+            for rate, space in zip(('4', '2'), spaces, strict=True)
+        )
+        for player in (first, second):
+            client.wait(lambda p=player: p.poll() is not None, 'a player', 60)
+            code, said = finish(player)
+            assert code == 0, said
+            assert '2 trajectories, 2 done' in said
+        client.spin_for(1.0)
+        for number, name in enumerate(heard):
+            told = client.statuses(f'/{name}/world_model/report')
+            values = [{pair.key: pair.value for pair in status.values} for status in told]
+            assert {status.name for status in told} == {f'{name}/world_model: rollout'}
+            assert {status.hardware_id for status in told} == {f'{name}/yam_bimanual'}
+            assert [v['seed'] for v in values if v['state'] == 'done'] == [str(100 + number)] * 2
+        names = {s.name for s in client.statuses('/diagnostics')}
+        assert {'one/world_model', 'two/world_model'} <= names
+    finally:
+        for process in heard.values():
+            assert process.stop() == 0, process.output()

@@ -200,7 +200,7 @@ def test_newer_chunk_drops_frames_of_a_plan_that_no_longer_holds(client):
     since = len(client.report_values())
     client.send_scene()
     client.send_trajectory(seconds=8.0)
-    wait_for_frames(client, 1)
+    client.wait_for_state('done', since)  # its frames go on for eight seconds
     client.send_scene()
     client.send_trajectory()
     client.wait_for_ends(2, since)
@@ -326,6 +326,18 @@ def test_joints_are_matched_by_name_in_any_order_with_others_between(client, ros
     assert client.received[JOINTS][-1].position[1] == pytest.approx(1.047)
 
 
+def test_joints_that_a_plan_leaves_out_stay_where_joint_states_have_them(client, ros):
+    right = ros.HOME.copy()
+    right[7] = 0.4
+    stamp_ns = client.now_ns()
+    client.send_scene(stamp_ns, joints=ros.make_joint_state(stamp_ns, positions=right))
+    left = ros.JOINTS[:7]  # as a planner of one arm's group sends them
+    assert client.imagine_one(scene='sent', names=left)['state'] == 'done'
+    wait_for_frames(client, NUM_FRAMES, JOINTS)
+    end = dict(zip(ros.JOINTS, client.received[JOINTS][-1].position, strict=True))
+    assert (end['left_joint1'], end['right_joint1']) == pytest.approx((0.2, 0.4))
+
+
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
@@ -337,6 +349,7 @@ def test_joints_are_matched_by_name_in_any_order_with_others_between(client, ros
         ('stamp_mode', 'future', 'must be one of target, source'),
         ('pace', 'brust', "did you mean 'burst'?"),
         ('checkpoint', '/tmp', 'read-only'),
+        ('calibration_file', '/nonexistent', "'/nonexistent' does not exist"),
         ('mode', 'imagine', 'read-only'),
         ('seed', 'three', 'type'),
     ],

@@ -56,10 +56,19 @@ def changed(point, joint, value):
 
 
 BAD_TRAJECTORIES = {
-    'missing joint': ('joint_names', 'right_gripper', lambda ros: {'names': ros.JOINTS[:-1]}),
+    'no joint of the robot': (
+        'joint_names',
+        "it has no ['lift']",
+        lambda ros: {'names': ('lift',), 'positions': np.zeros((4, 1))},
+    ),
+    'misspelt joint of a partial plan': (
+        'joint_names',
+        "did you mean 'left_joint6'?",
+        lambda ros: {'names': ('left_joint1', 'left_jiont6'), 'positions': np.zeros((4, 2))},
+    ),
     'unknown joint': (
         'joint_names',
-        "did you mean 'right_gripperr'",
+        "did you mean 'right_gripper'?",
         lambda ros: {'names': (*ros.JOINTS[:-1], 'right_gripperr')},
     ),
     'joint named twice': (

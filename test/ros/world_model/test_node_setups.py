@@ -2,7 +2,9 @@
 
 import signal
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
+from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
@@ -152,6 +154,7 @@ def test_qos_overrides_and_latched_instruction(start, new_client, ros):
         ('pace:=quick', "pace is 'quick'; it must be one of realtime, burst"),
         ('mode:=imagined', "did you mean 'imagine'?"),
         ('num_inference_steps:=many', "'num_inference_steps' must be of type int"),
+        ('checkpont:=x', "no parameter 'checkpont' (did you mean 'checkpoint'?)"),
         ('calibration_file:=/none.yaml', "'/none.yaml' does not exist; set 'calibration_file'"),
         (f'qos_overrides.{PREDICTED}.publisher.reliability:=maybe', 'maybe'),
     ],
@@ -162,6 +165,39 @@ def test_wrong_parameter_at_start_is_one_clear_line(start, parameter, said):
     output = process.output()
     assert said in output
     assert 'Traceback' not in output
+
+
+def test_health_warns_with_names_until_every_input_is_there_and_fresh(start, new_client, ros):
+    client = new_client
+    start('max_image_age_s:=2.0')
+
+    def says(level, *texts):
+        def met():
+            said = [s for s in client.statuses('/diagnostics') if s.name == 'world_model'][-1:]
+            return said and said[0].level == level and all(t in said[0].message for t in texts)
+
+        client.wait(met, f'level {level} with {texts}')
+
+    topics = ('/low/image_raw', '/high/camera_info', '/joint_states', '/joint_trajectory')
+    says(DiagnosticStatus.WARN, *(f'nobody publishes {topic}' for topic in topics))
+    client.connect_inputs({t: k for t, k in ros.INPUTS.items() if t != '/high/image_raw'})
+    says(DiagnosticStatus.WARN, 'nobody publishes /high/image_raw')
+    client.connect_inputs({'/high/image_raw': Image})
+    says(DiagnosticStatus.WARN, "no images of view 'low'", 'no fresh joint_states of left_joint1')
+    client.send_scene(info_low=None)
+    says(DiagnosticStatus.WARN, "no camera_info of view 'low'")
+    client.send_scene()
+    says(DiagnosticStatus.OK, 'ready')
+    says(DiagnosticStatus.WARN, "images of view 'high' are 2.")
+
+
+def test_parameters_describe_themselves(start, new_client):
+    start()
+    names = [f'qos_overrides./low/image_raw.subscription.{n}' for n in ('reliability', 'depth')]
+    request = DescribeParameters.Request(names=names)
+    answer = new_client.call(DescribeParameters, '/world_model/describe_parameters', request)
+    assert [d.name for d in answer.descriptors] == names
+    assert 'best_effort' in answer.descriptors[0].description
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
