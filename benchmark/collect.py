@@ -3,7 +3,7 @@
     python benchmark/collect.py [--repeats 2] [--seed 0] [--out benchmark/results]
 
 CPU seconds of one process, `--repeats` episodes of each of the 15 tasks, dropped attempts
-included. Physics: planning, simulation, predicates. Rendering: scene building, images and masks of
+included. Physics: planning, simulation, relations. Rendering: scene building, images and masks of
 both views. Writing: JPEG, PNG, MCAP.
 """
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 import hashlib
 import json
 import math
 import os
 from pathlib import Path
+import shutil
 import sys
 from typing import Any
 
@@ -165,3 +167,48 @@ def write_whole(path: Path, content: bytes | str) -> None:
     except OSError:
         beside.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """Yields an empty folder that gets the name `folder` when the block ends without an error.
+
+    A folder of that name stays until then. A process that is killed between the two renames
+    leaves it under the name `<folder>.old`; see `recover_folder`.
+
+    Args:
+        folder: the final name.
+
+    Raises:
+        OSError: it cannot be written; what was there before is still there.
+    """
+    partial, old = (folder.with_name(f'{folder.name}.{word}') for word in ('partial', 'old'))
+    recover_folder(folder)
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        for file in partial.rglob('*'):
+            if file.is_file():
+                _flush(file)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    partial.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def recover_folder(folder: Path) -> None:
+    """Renames `<folder>.old` back if a process was killed while it replaced the folder."""
+    old = folder.with_name(f'{folder.name}.old')
+    if old.exists() and not folder.exists():
+        old.rename(folder)
+
+
+def _flush(file: Path) -> None:
+    """Waits until the disk has the file's content."""
+    with file.open('rb') as stream:
+        os.fsync(stream.fileno())

@@ -46,8 +46,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=names,
         default=(),
         metavar='NAMES',
-        help='scripted policies that take turns in place of the expert, whatever comes of it, '
-        'e.g. expert,expert-late-0.6,expert-shift-0.03',
+        help='scripted policies that take turns in place of the expert; keeps successes and '
+        'failures alike, e.g. expert,expert-late-0.6,expert-shift-0.03',
     )
     parser.add_argument(
         '--faults',

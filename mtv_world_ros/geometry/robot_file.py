@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-import shutil
 from typing import Any, Literal, Self
 from xml.etree import ElementTree
 
@@ -16,6 +15,7 @@ import yaml
 from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
+from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool
 from mtv_world_ros.geometry.robot_shape import find_mesh, write_convex_hull
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
@@ -177,19 +177,15 @@ def save_robot(file: Path, folder: Path) -> Path:
         ConfigError, RobotError: the robot cannot be used.
     """
     robot = load_robot(file)
-    partial = folder.with_name(f'{folder.name}.partial')
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
     values = read_yaml(file, 'robot file', 'robot_file')
     values['base_link'] = robot.base_link
-    if values.get('urdf'):
-        tree = _with_hulls(file.parent / values['urdf'], partial)
-        tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
-        values['urdf'] = _URDF
-    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    with whole_folder(folder) as partial:
+        if values.get('urdf'):
+            tree = _with_hulls(file.parent / values['urdf'], partial)
+            tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
+            values['urdf'] = _URDF
+        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
+        (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
     return folder / ROBOT_YAML
 
 

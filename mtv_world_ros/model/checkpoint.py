@@ -13,6 +13,7 @@ import torch
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
@@ -62,32 +63,22 @@ def save_checkpoint(
     checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype = torch.float32
 ) -> None:
     """Writes a checkpoint folder; it appears under its name only when it is whole."""
-    partial = folder.with_name(folder.name + '.partial')
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    check_card(checkpoint.card, partial)
-    stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
-    stored.save_pretrained(partial / 'transformer', safe_serialization=True)
-    cast(Any, checkpoint.autoencoder).save_pretrained(
-        partial / 'autoencoder', safe_serialization=True
-    )
-    checkpoint.scheduler.save_pretrained(partial / 'scheduler')
-    if checkpoint.actions is not None:
-        checkpoint.actions.save(partial)
-    for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
-        if encoder is not None:
-            encoder.save(partial)
-    for name, part in _folders(checkpoint).items():
-        shutil.copytree(part, partial / name)
-    (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
-    if folder.exists():
-        old = folder.with_name(folder.name + '.old')
-        shutil.rmtree(old, ignore_errors=True)
-        folder.rename(old)
-        partial.rename(folder)
-        shutil.rmtree(old)
-    else:
-        partial.rename(folder)
+    with whole_folder(folder) as partial:
+        check_card(checkpoint.card, partial)
+        stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
+        stored.save_pretrained(partial / 'transformer', safe_serialization=True)
+        cast(Any, checkpoint.autoencoder).save_pretrained(
+            partial / 'autoencoder', safe_serialization=True
+        )
+        checkpoint.scheduler.save_pretrained(partial / 'scheduler')
+        if checkpoint.actions is not None:
+            checkpoint.actions.save(partial)
+        for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
+            if encoder is not None:
+                encoder.save(partial)
+        for name, part in _folders(checkpoint).items():
+            shutil.copytree(part, partial / name)
+        (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
 
 
 def _folders(checkpoint: Checkpoint) -> dict[str, Path]:

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 import json
 from pathlib import Path
 import re
-import shutil
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from torch import nn, Tensor
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
+from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.card import CARD
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
@@ -85,19 +85,15 @@ def save_adapter(
     """
     from peft.utils import get_peft_model_state_dict
 
-    partial = folder.with_name(folder.name + '.partial')
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
     config = json.dumps(transformer.peft_config[_NAME].to_dict(), default=list, sort_keys=True)
     tensors = {**transformer.state_dict(), **(weights or {})}
     factors = get_peft_model_state_dict(transformer, tensors, adapter_name=_NAME)
-    _save(factors, partial / ADAPTER, config)
-    _save({name: tensors[name] for name in beside(transformer)}, partial / BESIDE_FILE)
-    (partial / BASE_FILE).write_text(json.dumps(_base(transformer), indent=2) + '\n')
-    if card is not None:
-        (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    with whole_folder(folder) as partial:
+        _save(factors, partial / ADAPTER, config)
+        _save({name: tensors[name] for name in beside(transformer)}, partial / BESIDE_FILE)
+        (partial / BASE_FILE).write_text(json.dumps(_base(transformer), indent=2) + '\n')
+        if card is not None:
+            (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
 
 
 def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:

@@ -121,7 +121,7 @@ class Result:
         task: name of the task.
         index: of the episode within the task.
         seed: of the episode, the policy and the imagination's noise.
-        ever: the simulator's predicate held at some time.
+        ever: the task was done at some time, in the simulator.
         final: it held at the end; this is what counts as success.
         imagined: the estimate at the end of the imagined episode.
         seen: the same estimator on the simulator's own frames: what is wrong with it is not the

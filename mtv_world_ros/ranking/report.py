@@ -22,8 +22,8 @@ TITLE = 'Policy ranking'
 #: hues of the report's style sheet
 _NUM_HUES = 6
 _MEANING = (
-    'Success in the simulator is its predicate on object poses, held at the end. Success in '
-    'imagination is an estimate of at least {threshold} at the end of the imagined episode, '
+    "Success in the simulator: the task's relations hold on true object poses at the end. Success "
+    'in imagination is an estimate of at least {threshold} at the end of the imagined episode, '
     'which starts from the same first pictures. The scripted policies go by time and do not look, '
     'so what differs is the world that their commands meet.'
 )

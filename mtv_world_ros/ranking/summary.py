@@ -130,7 +130,7 @@ class Summary:
         return [r for r in self.results if r.policy == policy and task in (None, r.task)]
 
     def true_rate(self, policy: str, task: str | None) -> Rate:
-        """Returns how often it really succeeded: the predicate held at the end."""
+        """Returns how often it really succeeded: the task was done at the end."""
         found = self.chosen(policy, task)
         return Rate(hits=sum(result.final for result in found), count=len(found))
 

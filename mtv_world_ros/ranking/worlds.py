@@ -184,7 +184,7 @@ class SimulatedWorld:
         self.observation = shown[-1]
 
     def outcome(self) -> tuple[bool, bool]:
-        """Returns whether the task's predicate ever held, and held at the end."""
+        """Returns whether the task was ever done, and is done at the end."""
         return ever_and_final(self._sim.task.succeeds(self._sim.situation()))
 
     def _advance(self, targets: FloatArray, number: int, is_frame: bool) -> SimObservation | None:

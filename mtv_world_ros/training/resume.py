@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 import json
-import os
 from pathlib import Path
-import shutil
 from typing import Any
 
 from safetensors import SafetensorError
@@ -16,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.config import TrainingConfig
 
@@ -58,24 +57,14 @@ def save_state(
         tensors |= {f'adam.{index}.{k}': v for k, v in state.items()}
     tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     whole = {**card, 'ema_step': weights.ema.optimization_step}
-    partial = folder / f'{STATE}.partial'
-    with disk_errors_named(folder):
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        try:
-            save_file(tensors, partial / _TENSORS)
-            (partial / _CARD).write_text(json.dumps(whole))
-            for file in partial.iterdir():
-                _flush(file)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
-            raise
-        _swap(partial, folder / STATE)
+    with disk_errors_named(folder), whole_folder(folder / STATE) as partial:
+        save_file(tensors, partial / _TENSORS)
+        (partial / _CARD).write_text(json.dumps(whole))
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
     """Returns the metadata of the saved state; None if there is none."""
-    _recover(folder / STATE)
+    recover_folder(folder / STATE)
     file = folder / STATE / _CARD
     return json.loads(file.read_text()) if file.is_file() else None
 
@@ -164,25 +153,3 @@ def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer)
             state.setdefault(int(index), {})[name] = value
     groups = optimizer.state_dict()['param_groups']
     optimizer.load_state_dict({'state': state, 'param_groups': groups})
-
-
-def _flush(file: Path) -> None:
-    with file.open('rb') as stream:
-        os.fsync(stream.fileno())
-
-
-def _swap(partial: Path, target: Path) -> None:
-    """Puts a finished folder under its name; until then the old one is there, or `.old` is."""
-    old = target.with_name(target.name + '.old')
-    shutil.rmtree(old, ignore_errors=True)
-    if target.exists():
-        target.rename(old)
-    partial.rename(target)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _recover(target: Path) -> None:
-    """Brings the old folder back where the run was killed between the two renames."""
-    old = target.with_name(target.name + '.old')
-    if not target.exists() and old.exists():
-        old.rename(target)

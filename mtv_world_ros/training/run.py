@@ -27,6 +27,7 @@ from mtv_world_ros.errors import (
     TrainingError,
     TrainingInterrupted,
 )
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import save_robot
@@ -427,6 +428,4 @@ class HeldOut:
         known = json.loads(best.read_text())['score'] if best.is_file() else -math.inf
         if judged.score > known:
             trainer.export(folder / f'{trainer.result.name}-best')
-            partial = best.with_name(f'{_BEST}.partial')
-            partial.write_text(json.dumps({'step': step, 'score': judged.score}))
-            partial.rename(best)
+            write_whole(best, json.dumps({'step': step, 'score': judged.score}))

@@ -13,6 +13,7 @@ import torch
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model import wan_keys
 from mtv_world_ros.model.card import CARD, check_card, ROBOT_FOLDER
@@ -91,10 +92,7 @@ def import_weights(
     if out.exists():
         raise CheckpointError(f"'{out}' exists; give --out a folder that does not")
     sources = find_sources(Path(path), elsewhere or {})
-    partial = out.with_name(out.name + '.partial')
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
+    with whole_folder(out) as partial:
         reports = _import_parts(sources, partial, transformer, autoencoder, shard_bytes)
         shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
         build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
@@ -103,9 +101,6 @@ def import_weights(
         (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
         listed = [asdict(report) for report in reports]
         (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return reports
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 import fcntl
 from functools import partial
-import json
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,12 @@ from mtv_world_ros.sim.collect.dataset_card import (
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.sim.collect.dataset_readme import write_readme
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
+from mtv_world_ros.sim.collect.episode_maker import (
+    CollectConfig,
+    EpisodeMaker,
+    plain_config,
+    Spent,
+)
 from mtv_world_ros.sim.collect.jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
 from mtv_world_ros.sim.collect.siblings import (
     SceneJob,
@@ -139,12 +142,6 @@ def _sibling_jobs(
     if progress:
         tqdm.write(skipped_text(found))
     return sibling_jobs(found, scenes, out)
-
-
-def plain_config(config: CollectConfig) -> dict[str, Any]:
-    """Returns the configuration as the card has it."""
-    values = json.loads(json.dumps(asdict(config)))
-    return values if values['siblings'] else {k: v for k, v in values.items() if k != 'siblings'}
 
 
 @contextmanager

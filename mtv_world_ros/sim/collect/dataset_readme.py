@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,10 @@ from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.documents import Table
 from mtv_world_ros.sim.collect.contact_sheet import SHEET_FILE
 from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, write_file, ZERO_SHOT_SET
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, plain_config
 from mtv_world_ros.sim.tasks.tasks import TASKS
 
 README_FILE = 'README.md'
@@ -25,8 +24,8 @@ KEYS = {
     'task': 'name of the task',
     'instruction': 'what the robot is told, also on `/instruction`',
     'objects': 'JSON list of names; masks number them from 1',
-    'outcome': '`success`: the predicate held at some frame and in the last five; else `failure`',
-    'ever': 'the predicate held at some frame',
+    'outcome': '`success`: the task was done at some frame and in the last five; else `failure`',
+    'ever': 'the task was done at some frame',
     'final': 'it held in each of the last five frames',
     'seed': 'of the episode; it alone reproduces the scene and the motion',
     'attempt': 'seeds dropped before this one',
@@ -37,9 +36,8 @@ KEYS = {
 }
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    lines = [head, ['---'] * len(head), *rows]
-    return '\n'.join('| ' + ' | '.join(map(str, line)) + ' |' for line in lines)
+def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    return Table(head=head, rows=rows).markdown(aligned=False)
 
 
 def _number(count: int, noun: str) -> str:
@@ -65,20 +63,24 @@ def _counts(
 
 def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[str]:
     """Returns the commands that make the data set again; several where tasks differ in number."""
-    size = card['config']['randomization']
-    plain = CollectConfig().randomization
+    config, plain = card['config'], plain_config(CollectConfig())
+    given = {
+        **{side: config['randomization'][side] for side in ('width', 'height')},
+        'fps': f'{1 / config["record"]["frame_period_s"]:g}',
+        'moved-cameras': config['moved_share'],
+        'policies': ','.join(config['policies']),
+        'faults': ','.join(config['kinds']),
+        'siblings': config.get('siblings', 0),
+        'pictures': config['record']['pictures'],
+    }
+    usual = {
+        **plain['randomization'],
+        'fps': f'{1 / plain["record"]["frame_period_s"]:g}',
+        'pictures': plain['record']['pictures'],
+    }
     options = ''.join(
-        f' --{side} {size[side]}'
-        for side in ('width', 'height')
-        if size[side] != getattr(plain, side)
+        f' --{name} {value}' for name, value in given.items() if value and value != usual.get(name)
     )
-    period = card['config']['record']['frame_period_s']
-    if period != CollectConfig().record.frame_period_s:
-        options += f' --fps {1 / period:g}'
-    if share := card['config']['moved_share']:
-        options += f' --moved-cameras {share}'
-    if policies := card['config']['policies']:
-        options += f' --policies {",".join(policies)}'
     end = f'--seed {card["seed"]}{options} --out DIR'
     if card['kind'] == ZERO_SHOT_SET:
         return [f'mtv-world collect --zero-shot {kinds} --episodes {number} {end}'
@@ -106,11 +108,13 @@ def _zero_shot_numbers(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
 
 def _other_configuration(config: Mapping[str, Any]) -> str:
     """A line where a command alone does not make the set again."""
-    usual = json.loads(json.dumps(asdict(CollectConfig())))
+    usual = plain_config(CollectConfig())
+    for key in ('moved_share', 'policies', 'kinds', 'siblings'):
+        usual |= {key: config[key]} if key in config else {}
+    for key in ('pictures', 'frame_period_s'):
+        usual['record'][key] = config['record'][key]
     for side in ('width', 'height'):
         usual['randomization'][side] = config['randomization'][side]
-    for key in ('moved_share', 'policies'):
-        usual[key] = config[key]
     if config == usual:
         return ''
     return (
@@ -201,8 +205,8 @@ def _how(card: Mapping[str, Any]) -> str:
 def _filtering(card: Mapping[str, Any]) -> str:
     if card['config']['policies']:
         return (
-            'Whatever comes of it is kept; a scene that cannot be built, or in which the policy '
-            'finds no plan, is dropped and the next seed is tried.'
+            'Successes and failures are kept alike; a scene that cannot be built, or in which the '
+            'policy finds no plan, is dropped and the next seed is tried.'
         )
     return (
         "An expert's attempt that fails is dropped and the next seed is tried, scenes that cannot "

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+import json
 import time
+from typing import Any
 
 import numpy as np
 
@@ -76,6 +78,12 @@ class Spent:
     rendering_s: float
     writing_s: float
     num_frames: int
+
+
+def plain_config(config: CollectConfig) -> dict[str, Any]:
+    """Returns the configuration as the card has it."""
+    values = json.loads(json.dumps(asdict(config)))
+    return values if values['siblings'] else {k: v for k, v in values.items() if k != 'siblings'}
 
 
 class EpisodeMaker:

@@ -13,6 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import write_whole
 
 #: bytes of tensors that are gathered before they are written
 SHARD_BYTES = 256 * 2**20
@@ -111,15 +112,11 @@ class LatentCache:
         number = len(list(self.folder.glob(f'{_STEM}-*.safetensors')))
         while (file := self.folder / f'{_STEM}-{number:05d}.safetensors').exists():
             number += 1
-        partial = file.with_suffix('.partial')
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.settings, indent=2, sort_keys=True) + '\n'
-            (self.folder / SETTINGS).write_text(text)
-            partial.write_bytes(data)
-            partial.rename(file)
+            write_whole(self.folder / SETTINGS, text)
+            write_whole(file, data)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise TrainingError(
                 f"latent cache '{self.folder}' cannot be written: {error.strerror or error}; the "
                 f'shard takes {len(data) / 1e6:.1f} MB, the {len(self)} clips before it are kept. '

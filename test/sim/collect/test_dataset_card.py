@@ -16,7 +16,8 @@ from mtv_world_ros.sim.collect.dataset_card import (
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.sim.collect.dataset_readme import commands, readme
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, plain_config
+from mtv_world_ros.sim.collect.record import RecordConfig
 from mtv_world_ros.sim.tasks.tasks import tasks_named
 
 START_NS, HEIGHT, WIDTH = 1_700_000_000_000_000_000, 24, 32
@@ -130,6 +131,29 @@ def test_the_command_on_the_card_makes_the_same_set(make):
         'mtv-world collect --task shake_bottle --episodes 3 --seed 3 --out DIR',
         f'mtv-world collect --task {rest} --episodes 2 --seed 3 --out DIR',
     }
+
+
+@pytest.mark.parametrize(
+    ('config', 'options'),
+    [
+        ({}, ''),
+        ({'kinds': ('high', 'miss'), 'siblings': 3}, ' --faults high,miss --siblings 3'),
+        (
+            {'record': RecordConfig(pictures='first', frame_period_s=0.2)},
+            ' --fps 5 --pictures first',
+        ),
+        ({'moved_share': 0.5, 'policies': ('expert',)}, ' --moved-cameras 0.5 --policies expert'),
+    ],
+)
+def test_every_option_is_in_the_command_and_then_python_is_not_named(
+    make, tmp_path, config, options
+):
+    entries = [make('shake_bottle', 0)]
+    card = card_of(TASKS_SET, 3, plain_config(CollectConfig(**config)), entries)
+    assert commands(card, entries) == [
+        f'mtv-world collect --task shake_bottle --episodes 1 --seed 3{options} --out DIR'
+    ]
+    assert 'made from Python' not in readme(tmp_path, card, entries)
 
 
 def test_the_card_of_a_zero_shot_set_gives_one_command_where_kinds_took_turns(make):

@@ -96,7 +96,7 @@ def test_a_full_disk_is_said_and_what_was_written_is_kept(tmp_path: Path) -> Non
             filled(tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert not list(cache.folder.glob('*.partial'))
+    assert not list(cache.folder.glob('*.part*'))
     assert len(LatentCache(tmp_path, SETTINGS)) == 2
 
 
