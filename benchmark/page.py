@@ -33,6 +33,7 @@ DESCRIBES = {
     'denoising_steps': ('mtv_world_ros/model/sampler.py',),
     'distillation': ('mtv_world_ros/training', 'mtv_world_ros/model'),
     'evaluation': ('mtv_world_ros/evaluation',),
+    'foresight': ('mtv_world_ros/ros',),
     'forward_kinematics': ('mtv_world_ros/geometry',),
     'long_rollouts': ('mtv_world_ros/model',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
@@ -50,7 +51,7 @@ DESCRIBES = {
 }
 #: kinds of pages whose numbers are a checkpoint's; by default the bundled one's
 OF_A_CHECKPOINT = (
-    'denoising_steps', 'evaluation', 'policy_in_the_loop', 'ros_overhead', 'serving',
+    'denoising_steps', 'evaluation', 'foresight', 'policy_in_the_loop', 'ros_overhead', 'serving',
 )  # fmt: skip
 _MADE = re.compile(
     r'^Made at commit `(\w+)(\+?)`, (?:no checkpoint|(\w+) checkpoint `(\w+)`)\. '
