@@ -70,6 +70,10 @@ class PolicyError(MtvWorldError):
     """A policy cannot answer, or its answer cannot be used."""
 
 
+class PolicyServerError(PolicyError):
+    """A policy's server does not start, cannot be reached, is gone or does not answer in time."""
+
+
 class DescriptionError(MtvWorldError):
     """Naming the objects of a scene failed; not the same answer as "there are none".
 

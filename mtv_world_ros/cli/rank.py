@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +23,7 @@ from mtv_world_ros.cli.options import (
 
 if TYPE_CHECKING:
     from mtv_world_ros.ranking.jobs import Job
+    from mtv_world_ros.ranking.policy_list import ListedPolicy
     from mtv_world_ros.ranking.rank import Checkpoint
 
 _DESCRIPTION = """\
@@ -30,8 +33,9 @@ happens, real and imagined) and two files for every rollout: the result, and the
 over the last imagined ones. Running the same command again goes on where it was stopped.
 """
 _EPILOG = """\
-A policy is `expert`, followed by faults with their sizes, e.g. expert-noise-0.03-late-0.3; the
-catalogue of faults is sim/expert/faults.py. By default one denoising step.
+A scripted policy is `expert`, followed by faults with their sizes, e.g.
+expert-noise-0.03-late-0.3; the catalogue of faults is sim/expert/faults.py. By default one
+denoising step. Logs of the policy servers that a file starts go to DIR/logs.
 """
 
 
@@ -44,7 +48,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
     )
     policies = parser.add_mutually_exclusive_group()
-    policies.add_argument('--policies', metavar='LIST', help='comma-separated; default: ten')
+    policies.add_argument(
+        '--policies',
+        metavar='LIST|FILE',
+        help='scripted ones, comma-separated, or a YAML file of any policies, like '
+        'config/rankings/example.yaml; default: ten scripted ones',
+    )
     policies.add_argument(
         '--faults',
         choices=('train', 'calibrate', 'test'),
@@ -91,6 +100,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.ranking.flip_sheet import flip_sheet
     from mtv_world_ros.ranking.optimism import Optimism
+    from mtv_world_ros.ranking.policy_list import ListedPolicies
     from mtv_world_ros.ranking.rank import FOLDER, run_jobs
     from mtv_world_ros.ranking.report import console, write_ranking
     from mtv_world_ros.ranking.runner import RolloutConfig
@@ -106,17 +116,24 @@ def _rank(arguments: argparse.Namespace) -> int:
     checkpoints = [
         _checkpoint(arguments, name, out) for name, out in zip(names, folders, strict=True)
     ]
+    listed = _listed(arguments)
+    config = RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks)
+    if listed:
+        policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())
+        config = replace(config, make_policy=policies)
     found, failed = run_jobs(
-        _jobs(arguments),
+        _jobs(arguments, listed),
         checkpoints,
-        config=RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks),
+        config=config,
         workers=arguments.workers,
         ray_address=arguments.ray,
         overwrite=arguments.overwrite,
     )
+    # the benchmark of faults is about policies whose names say their faults
     optimism = {
         name: Optimism.of(results, out / FOLDER, arguments.seed)
         for name, out, results in zip(names, folders, found, strict=True)
+        if not listed
     }
     summaries = [
         Summary(
@@ -128,7 +145,7 @@ def _rank(arguments: argparse.Namespace) -> int:
                 'checkpoint': checkpoint.settings['checkpoint'],
             },
             # the first report has all checkpoints side by side
-            optimism=optimism if number == 0 else {names[number]: optimism[names[number]]},
+            optimism={k: v for k, v in optimism.items() if number == 0 or k == names[number]},
         )
         for number, (results, checkpoint) in enumerate(zip(found, checkpoints, strict=True))
     ]
@@ -136,6 +153,8 @@ def _rank(arguments: argparse.Namespace) -> int:
         write_ranking(summary, out) for summary, out in zip(summaries, folders, strict=True)
     ]
     for name, out, results in zip(names, folders, found, strict=True):
+        if name not in optimism:
+            continue
         sheet = flip_sheet(results, optimism[name].flips, out / FOLDER)
         if sheet is not None:
             write_sheet(out / 'flips.png', sheet)
@@ -157,7 +176,20 @@ def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoi
     return Checkpoint(make_pipeline=make_pipeline, out=out, settings=settings)
 
 
-def _jobs(arguments: argparse.Namespace) -> list[Job]:
+def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:
+    """The policies of a file; none where `--policies` is a comma-separated list."""
+    from mtv_world_ros.assembly import checkpoint_robot
+    from mtv_world_ros.ranking.policy_list import check_single_clients, load_policy_list
+
+    path = Path(arguments.policies or '')
+    if path.suffix not in ('.yaml', '.yml'):
+        return ()
+    listed = load_policy_list(path, checkpoint_robot(arguments.checkpoint, arguments.robot))
+    check_single_clients(listed, arguments.workers)
+    return listed
+
+
+def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list[Job]:
     from mtv_world_ros.assembly import checkpoint_robot
     from mtv_world_ros.ranking.jobs import (
         DEFAULT_POLICIES,
@@ -170,13 +202,17 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     from mtv_world_ros.sim.tasks.tasks import tasks_named
 
     policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
-    if arguments.policies is not None:
+    if listed:
+        policies = tuple(policy.name for policy in listed)
+    elif arguments.policies is not None:
         policies = policies_named(arguments.policies)
     elif arguments.faults is not None:
         policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
     expert = Expert(checkpoint_robot(arguments.checkpoint, arguments.robot))
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
+    definitions = {policy.name: policy.definition for policy in listed}
+    jobs = [replace(job, definition=definitions.get(job.policy, '')) for job in jobs]
     print(f'{len(policies)} policies, {len(tasks)} tasks, {len(jobs)} rollouts in each world')
     return jobs
 

@@ -71,13 +71,26 @@ def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
     """
-    values = read_yaml(path, 'policy file', 'policy')
+    return policy_config(read_yaml(path, 'policy file', 'policy'), robot, str(path))
+
+
+def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
+    """Returns the policy that the values of such a file describe.
+
+    Args:
+        values: of the file.
+        robot: whose joints it moves.
+        where: what errors begin with.
+
+    Raises:
+        ConfigError: a key is unknown or missing, a value is wrong.
+    """
     if not isinstance(values, Mapping) or 'kind' not in values:
-        raise ConfigError(f"{path}: expected a key 'kind': {', '.join(_KINDS)}")
+        raise ConfigError(f"{where}: expected a key 'kind': {', '.join(_KINDS)}")
     kind = values['kind']
     if kind not in _KINDS:
         raise ConfigError(
-            f"{path}: kind '{kind}' is none{nearest(str(kind), _KINDS)}; valid are "
+            f"{where}: kind '{kind}' is none{nearest(str(kind), _KINDS)}; valid are "
             f'{", ".join(_KINDS)}'
         )
-    return validated(_KINDS[kind], values, str(path), context={'robot': robot})
+    return validated(_KINDS[kind], values, where, context={'robot': robot})

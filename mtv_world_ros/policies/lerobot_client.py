@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from mtv_world_ros.bounded_input import limits
 from mtv_world_ros.config import Count, Positive, Schema
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.errors import ConfigError, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import ServerMapping
 from mtv_world_ros.policies.timed_actions import read_timed_actions
 
@@ -187,7 +187,7 @@ class LeRobotPolicy:
         except grpc.RpcError as error:
             self.close()
             code, details = error.code().name, error.details()  # type: ignore[attr-defined]
-            raise PolicyError(
+            raise PolicyServerError(
                 f"the policy server '{self._config.server}' did not do it: {code}: {details}"
             ) from error
 

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from mtv_world_ros.bounded_input import limits
 from mtv_world_ros.config import Positive
 from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, masked, PolicyError
+from mtv_world_ros.errors import ConfigError, masked, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
 
 
@@ -147,7 +147,7 @@ class OpenPiPolicy:
             )
             self._connection = self._opened.enter_context(connecting)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
-            raise PolicyError(
+            raise PolicyServerError(
                 f"no connection to the policy server '{config.server}': "
                 f'{masked(str(error), key)}; is it running?'
             ) from (None if key and key in str(error) else error)
@@ -171,7 +171,7 @@ class OpenPiPolicy:
             message = self._connection.recv(timeout=self._config.timeout_s)
         except TimeoutError as error:
             self.close()  # what comes later would be taken for the next answer
-            raise PolicyError(
+            raise PolicyServerError(
                 f"the policy server '{self._config.server}' did not answer within "
                 f"{self._config.timeout_s:g} s ('timeout_s')"
             ) from error
@@ -184,8 +184,8 @@ class OpenPiPolicy:
             raise PolicyError(f'the policy server failed: {masked(last, self._key)}')
         return unpack(message)
 
-    def _gone(self, error: Exception) -> PolicyError:
-        return PolicyError(f"the policy server '{self._config.server}' is gone: {error}")
+    def _gone(self, error: Exception) -> PolicyServerError:
+        return PolicyServerError(f"the policy server '{self._config.server}' is gone: {error}")
 
 
 #: kinds of dtype that have no plain bytes: structures, objects, complex numbers

@@ -44,12 +44,15 @@ class Job:
         task: name of the task.
         index: of the episode within the task.
         seed: of the scene, of the policy and of the imagination's noise.
+        definition: tells policies apart that had this name at different times; empty = the name
+            says it all.
     """
 
     policy: str
     task: str
     index: int
     seed: int
+    definition: str = ''
 
     @property
     def name(self) -> str:

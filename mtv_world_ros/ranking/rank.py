@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
@@ -47,7 +47,7 @@ def run_jobs(
     ray_address: str | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
-) -> tuple[list[list[Result]], dict[str, str]]:
+) -> tuple[list[list[Result]], dict[Job, str]]:
     """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
 
     Each result is written beside its name and renamed, and its last frames as a PNG, real ones
@@ -70,18 +70,19 @@ def run_jobs(
     stores = [_Store(checkpoint, config, jobs, overwrite) for checkpoint in checkpoints]
     wanted = {job: tuple(k for k, s in enumerate(stores) if job not in s.found) for job in jobs}
     left = [WantedJob(job, numbers) for job, numbers in wanted.items() if numbers]
-    failed: dict[str, str] = {}
+    failed: dict[Job, str] = {}
     make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
     outcomes = _scored(left, make, workers, ray_address)
     bar = tqdm(outcomes, total=len(left), unit='rollout', disable=not show_progress)
     for done, outcome in bar:
         if isinstance(outcome, str):
-            failed[done.job.name] = outcome
+            failed[done.job] = outcome
             continue
         for number, result in outcome.items():
             stores[int(number)].add(done.job, result)
     if jobs and not all(store.found for store in stores):
-        raise MtvWorldError(f'no rollout has a result; the first: {next(iter(failed.items()))}')
+        job, reason = next(iter(failed.items()))
+        raise MtvWorldError(f'no rollout has a result; the first, {job.name}: {reason}')
     return [[store.found[job] for job in jobs if job in store.found] for store in stores], failed
 
 
@@ -102,6 +103,8 @@ class _Store:
             'max_chunks': config.max_chunks,
         }
         check_same_settings(self._out / FOLDER, self._settings, overwrite)
+        for job in () if overwrite else jobs:
+            _check_same_policy(_path(self._out, job), job)
         stored = {job: _stored(self._out, job, self._settings) for job in jobs}
         self.found = {job: result for job, result in stored.items() if result is not None}
 
@@ -110,7 +113,8 @@ class _Store:
         path, picture = _path(self._out, job), base64.b64decode(values.pop('last_frames', ''))
         if picture:
             write_whole(path.with_suffix('.png'), picture)
-        write_json(path, {'settings': self._settings, 'result': values})
+        stored = {'settings': self._settings, 'definition': job.definition, 'result': values}
+        write_json(path, stored)
         self.found[job] = Result.from_json(values)
 
 
@@ -137,4 +141,17 @@ def _stored(out: Path, job: Job, settings: Mapping[str, Any]) -> Result | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     same = values['settings'] == plain(settings) and result.seed == job.seed
-    return result if same else None
+    return result if same and values.get('definition', '') == job.definition else None
+
+
+def _check_same_policy(path: Path, job: Job) -> None:
+    """Refuses a result of another policy that had this name."""
+    try:
+        definition = json.loads(path.read_text(encoding='utf-8')).get('definition', '')
+    except (OSError, ValueError, AttributeError):
+        return  # not readable, thus nothing is lost
+    if definition != job.definition:
+        raise ConfigError(
+            f"'{path}' is of another policy with the name '{job.policy}'; give this one another "
+            'name, or --overwrite to replace its results'
+        )

@@ -47,6 +47,7 @@ def tables(summary: Summary) -> list[Table]:
         _powered(summary),
         _confusion(summary),
         _speed(summary),
+        *_failures(summary),
     ]
 
 
@@ -70,8 +71,8 @@ def remarks(summary: Summary) -> list[str]:
     if summary.failed:
         first, reason = next(iter(summary.failed.items()))
         found.append(
-            f'{len(summary.failed)} rollouts have no result and count nowhere; the first, '
-            f'{first}: {reason}'
+            f'{len(summary.failed)} rollouts have no result and are in no rate; the first, '
+            f'{first.name}: {reason}'
         )
     return [remark for remark in found if remark]
 
@@ -225,6 +226,26 @@ def _speed(summary: Summary) -> Table:
     return Table(caption=caption, head=['', ''], rows=rows)
 
 
+def _failures(summary: Summary) -> list[Table]:
+    """How many rollouts have no result, by policy, and why."""
+    if not summary.failed:
+        return []
+    by_policy: dict[str, list[str]] = {}
+    for job, reason in summary.failed.items():
+        by_policy.setdefault(job.policy, []).append(reason)
+    rows = [
+        [policy, str(len(reasons)), str(len(summary.chosen(policy, None))), reasons[0]]
+        for policy, reasons in by_policy.items()
+    ]
+    return [
+        Table(
+            caption='Rollouts without a result, by policy',
+            head=['policy', 'without', 'with', 'the first reason'],
+            rows=rows,
+        )
+    ]
+
+
 def console(summary: Summary) -> str:
     """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
     tables = [
@@ -233,6 +254,7 @@ def console(summary: Summary) -> str:
         _rates(summary, None),
         _powered(summary),
         _speed(summary),
+        *_failures(summary),
     ]
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
     return '\n\n'.join([*parts, *remarks(summary)[2:]])

@@ -41,10 +41,12 @@ class RolloutConfig:
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         max_chunks: answers of the policy at most.
+        make_policy: makes a policy for an episode.
     """
 
     num_inference_steps: int = 1
     max_chunks: int = 8
+    make_policy: MakePolicy = scripted_policy
 
     def __post_init__(self) -> None:
         if self.num_inference_steps < 0 or self.max_chunks < 1:
@@ -60,13 +62,10 @@ class RolloutRunner:
     Args:
         pipeline: imagines and judges; its robot is the simulator's.
         config: how episodes are run.
-        make_policy: makes a policy for an episode.
     """
 
-    def __init__(
-        self, pipeline: Pipeline, config: RolloutConfig, make_policy: MakePolicy = scripted_policy
-    ) -> None:
-        self.pipeline, self.config, self._make_policy = pipeline, config, make_policy
+    def __init__(self, pipeline: Pipeline, config: RolloutConfig) -> None:
+        self.pipeline, self.config = pipeline, config
         self._expert = Expert(pipeline.robot)
         self._sim = SimEpisode(pipeline.robot, self._expert.home)
 
@@ -81,7 +80,7 @@ class RolloutRunner:
 
     def simulate(self, job: Job) -> SimulatedRollout:
         """Returns what a policy reached in the simulator."""
-        policy = self._make_policy(job.policy, job.task, job.seed, self._expert)
+        policy = self.config.make_policy(job.policy, job.task, job.seed, self._expert)
         world = SimulatedWorld(self._sim, self.pipeline.spec.fps, job.seed, job.task)
         run = self._run(policy, world, world.instruction, job)
         ever, final = world.outcome()
@@ -229,5 +228,5 @@ def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld)
 def make_runner(
     make_pipelines: Sequence[Callable[[], Pipeline]], config: RolloutConfig
 ) -> ComparisonRunner:
-    """Returns a runner of scripted policies; picklable with `functools.partial`."""
+    """Returns a runner; picklable with `functools.partial`."""
     return ComparisonRunner([RolloutRunner(make(), config) for make in make_pipelines])

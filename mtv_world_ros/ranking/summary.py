@@ -20,7 +20,7 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
     rates,
 )
 from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson, Interval, wilson
-from mtv_world_ros.ranking.jobs import Judged, Result
+from mtv_world_ros.ranking.jobs import Job, Judged, Result
 from mtv_world_ros.ranking.optimism import Optimism
 
 #: label of all tasks together
@@ -109,7 +109,7 @@ class Summary:
     """
 
     results: Sequence[Result]
-    failed: Mapping[str, str]
+    failed: Mapping[Job, str]
     num_true: int
     provenance: Mapping[str, str]
     optimism: Mapping[str, Optimism] = field(default_factory=dict)
@@ -241,7 +241,7 @@ class Summary:
             'num_true_for_powered': self.num_true,
             'num_rollouts': len(self.results),
             'num_cut_off_by_limit': sum(not result.is_over for result in self.results),
-            'failed': dict(self.failed),
+            'failed': {job.name: reason for job, reason in self.failed.items()},
             'provenance': dict(self.provenance),
         }
 

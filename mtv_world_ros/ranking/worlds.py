@@ -18,6 +18,7 @@ from mtv_world_ros.data_types import (
     SuccessEstimate,
 )
 from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.sim.collect.record import START_NS
@@ -165,6 +166,8 @@ class SimulatedWorld:
         """Executes an answer; the arms hold up to a whole frame."""
         before = self.observation
         matched = match_joints(answer, self._sim.robot, before.positions)
+        # as in imagination
+        check_positions(self._sim.robot, matched.positions, tolerance=LIMIT_TOLERANCE)
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
         times = np.linspace(CONTROL_PERIOD_S, num * CONTROL_PERIOD_S, num)

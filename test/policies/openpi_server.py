@@ -78,8 +78,10 @@ def check_key(connection, request):
 
 
 async def main():
-    options = {'process_request': check_key} if '--key' in sys.argv else {}
-    async with serve(handle, '127.0.0.1', 0, compression=None, max_size=None, **options) as server:
+    options: dict = {'process_request': check_key} if '--key' in sys.argv else {}
+    options |= {'compression': None, 'max_size': None}
+    port = int(sys.argv[sys.argv.index('--port') + 1]) if '--port' in sys.argv else 0
+    async with serve(handle, '127.0.0.1', port, **options) as server:
         print(server.sockets[0].getsockname()[1], flush=True)
         await server.serve_forever()
 

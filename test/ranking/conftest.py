@@ -71,7 +71,7 @@ def runner(robot, expert):
         world_model.begin(seed, task)
         return scripted_policy(name, task, seed, expert)
 
-    return RolloutRunner(pipeline, RolloutConfig(max_chunks=4), make_policy)
+    return RolloutRunner(pipeline, RolloutConfig(max_chunks=4, make_policy=make_policy))
 
 
 @pytest.fixture

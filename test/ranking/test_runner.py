@@ -110,7 +110,7 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
     alone = Checkpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
     found, failed = run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False)
     assert [result.index for result in found[0]] == [1]
-    assert failed == {jobs[0].name: 'its server is gone'}
+    assert failed == {jobs[0]: 'its server is gone'}
 
 
 def test_wrong_limits_are_refused():

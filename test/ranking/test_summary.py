@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.ranking.jobs import Result
+from mtv_world_ros.ranking.jobs import Job, Result
 from mtv_world_ros.ranking.report import markdown, remarks, write_ranking
 from mtv_world_ros.ranking.summary import Summary
 
@@ -25,7 +25,7 @@ def summary(make_result):
         for index, (final, probability) in enumerate(zip(finals, probabilities, strict=True))
     ]
     return Summary(
-        results=results, failed={'x_00000_<b>': 'gone'}, num_true=2,
+        results=results, failed={Job(policy='<b>', task='x', index=0, seed=1): 'gone'}, num_true=2,
         provenance={'command': 'mtv-world rank'},
     )  # fmt: skip
 
