@@ -290,11 +290,10 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
     from mtv_world_ros.sim.expert.expert import Expert
     from mtv_world_ros.sim.expert.faults import parse_variant
-    from mtv_world_ros.sim.expert.scripted_policy import scripted_policy, ScriptedPolicyConfig
+    from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 
     variant = settings.variant
     parse_variant(variant)
-    config = ScriptedPolicyConfig(hold_s=settings.hold_s)
     expert = Expert(robot)
 
     def make(task: str, scene_seed: int) -> Policy:
@@ -303,7 +302,7 @@ def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMake
                 f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
                 "'scene_seed' to those of the recorded episode"
             )
-        return scripted_policy(variant, task, scene_seed, expert, config=config)
+        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
 
     return make
 

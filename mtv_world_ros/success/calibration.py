@@ -44,7 +44,7 @@ class Calibration(Schema):
         tasks: that it was fitted on.
         num_episodes: that it was fitted on.
         num_seeds: rollouts of each.
-        l2: strength of the pull towards the stated weights (`EstimatorConfig`).
+        l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
         scores: before and after, the latter on tasks that were left out of the fit.
         made: command, date, machine.
     """

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from math import exp, isfinite, nan
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,36 +17,25 @@ from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
 from mtv_world_ros.success.situation import CannotTell, grippers_open
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
-from mtv_world_ros.success.views import EvidenceConfig, Views
+from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-__all__ = ['EstimatorConfig', 'Judged', 'SuccessEstimator', 'load_tasks']
+__all__ = ['Judged', 'SuccessEstimator', 'load_tasks']
 
 #: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
 #: or an object that has to move has not moved
 UNDONE_PROBABILITY = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstimatorConfig:
-    """The logistic's weights, which are stated, not calibrated, and when to abstain.
+#: logit per unit of a feature, used where no calibration holds; see `evidence.FEATURES` and
+#: `calibration.weighed`
+STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5}
 
-    Attributes:
-        weights: logit per unit of a feature; see `evidence.FEATURES` and `calibration.weighed`.
-        evidence: when masks are not enough.
-    """
 
-    weights: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType(
-            {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5}
-        )
-    )
-    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-
-    def probability(self, features: Mapping[str, float]) -> float:
-        """Returns the logistic of the features; those that are NaN do not count."""
-        terms = [weight * weighed(features, name) for name, weight in self.weights.items()]
-        return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
+def stated_probability(features: Mapping[str, float]) -> float:
+    """Returns the logistic of the features by `STATED_WEIGHTS`; NaN features do not count."""
+    terms = [weight * weighed(features, name) for name, weight in STATED_WEIGHTS.items()]
+    return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
 
 
 def capped(probability: float, features: Mapping[str, float]) -> float:
@@ -73,7 +60,6 @@ class SuccessEstimator:
         self,
         tasks: Sequence[TaskSpec] = (),
         task: str | None = None,
-        config: EstimatorConfig | None = None,
         calibration: Calibration | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
@@ -83,7 +69,6 @@ class SuccessEstimator:
             tasks: known tasks.
             task: name of the one to judge; default: the one the instruction matches. Where the
                 instruction names no objects for it, they take the task's placeholders in order.
-            config: weights and limits.
             calibration: fitted weights, used where they hold.
             segmenter: what finds the masks; finds objects in the pictures of tasks, too.
 
@@ -98,7 +83,6 @@ class SuccessEstimator:
             )
         self.tasks = tuple(known for known in tasks if task in (None, known.name))
         self.is_given = task is not None
-        self.config = config or EstimatorConfig()
         self.calibration = calibration
         self.segmenter = '' if segmenter is None else segmenter.name
         self._picture_masks = PictureMasks(segmenter)
@@ -121,9 +105,9 @@ class SuccessEstimator:
             task, bound = self._task(instruction, footage.masks.names)
             _check_views(task, footage)
         except CannotTell as reason:
-            views = Views(footage=footage, memory=memory, used=(), config=self.config.evidence)
+            views = Views(footage=footage, memory=memory, used=())
             return Judged(_abstains(reason, views, []), memory)
-        views = Views(footage=footage, memory=memory, used=task.views, config=self.config.evidence)
+        views = Views(footage=footage, memory=memory, used=task.views)
         subjects = [
             views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
         ]
@@ -147,10 +131,11 @@ class SuccessEstimator:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
         features['released'] = _released(task, views.footage.openings)
         basis = self._objection(task)
-        weigh = self.config if basis or not self.calibration else self.calibration
+        calibrated = None if basis else self.calibration
+        probability = calibrated.probability if calibrated else stated_probability
         low, middle, high = (
             capped(
-                weigh.probability({**features, 'margin': clipped(features['margin'] + shift)}),
+                probability({**features, 'margin': clipped(features['margin'] + shift)}),
                 features,
             )
             for shift in (-spread, 0.0, spread)

@@ -12,25 +12,17 @@ from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.jaccard import jaccard
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvidenceConfig:
-    """When masks are not enough.
-
-    Attributes:
-        last_frames: frames at the end whose median counts.
-        max_residual: largest miss of the views' rays, as a share of the image's diagonal.
-        max_disagreement: largest difference between views of the subject's J with its goal.
-        min_visible: smallest area of the subject at the end, as a share of its largest.
-        hidden_below: an object that shows less than this share of its last unhidden area, and
-            lies within that mask, is taken to stand where it stood then.
-    """
-
-    last_frames: int = 3
-    max_residual: float = 0.02
-    max_disagreement: float = 0.7
-    min_visible: float = 0.3
-    hidden_below: float = 0.8
+#: frames at the end whose median counts
+_LAST_FRAMES = 3
+#: largest miss of the views' rays, as a share of the image's diagonal
+_MAX_RESIDUAL = 0.02
+#: largest difference between views of the subject's J with its goal
+_MAX_DISAGREEMENT = 0.7
+#: smallest area of the subject at the end, as a share of its largest
+_MIN_VISIBLE = 0.3
+#: an object that shows less than this share of its last unhidden area, and lies within that mask,
+#: is taken to stand where it stood then
+_HIDDEN_BELOW = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,13 +33,11 @@ class Views:
         footage: the last chunk.
         memory: of the rollout, with this chunk.
         used: names of the views to look at; empty = all.
-        config: limits.
     """
 
     footage: Footage
     memory: RolloutMemory
     used: tuple[str, ...]
-    config: EvidenceConfig
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -109,7 +99,7 @@ class Views:
         """
         scores = np.where(goals.any((-2, -1)), self._jaccard(item, goals), np.nan)
         known = scores[np.isfinite(scores)]
-        if len(known) > 1 and np.ptp(known) > self.config.max_disagreement:
+        if len(known) > 1 and np.ptp(known) > _MAX_DISAGREEMENT:
             raise CannotTell(
                 'the views disagree: J with the goal mask is '
                 + ', '.join(f'{value:.2f}' for value in known)
@@ -118,13 +108,13 @@ class Views:
         return scores, np.where(np.isfinite(scores), first, np.nan)
 
     def _jaccard(self, item: int, reference: BoolArray) -> FloatArray:
-        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         scores = np.median(jaccard(masks, reference[:, None]), axis=1)
         return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
 
     def share_inside(self, item: int, regions: BoolArray) -> FloatArray:
         """Returns (V,) shares of an object's mask in (V, H, W) regions; NaN = not known."""
-        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         area = np.maximum(masks.sum((-2, -1)), 1)
         shares = np.median((masks & regions[:, None]).sum((-2, -1)) / area, axis=1)
         return np.where(self.end_ok(item), shares, np.nan)
@@ -141,10 +131,10 @@ class Views:
         Raises:
             CannotTell: it has.
         """
-        masks = self.footage.masks.masks[:, item, -self.config.last_frames :]
+        masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         last = np.median(masks.sum((-2, -1)), axis=1)
         known, largest = self.end_ok(item), self.memory.largest[:, item]
-        if known.any() and (last[known] < self.config.min_visible * largest[known]).all():
+        if known.any() and (last[known] < _MIN_VISIBLE * largest[known]).all():
             share = float(np.max(last[known] / largest[known]))
             raise CannotTell(f"'{self.names[item]}' has vanished: {share:.0%} of its area is left")
 
@@ -160,7 +150,7 @@ class Views:
         return self._located(item), False
 
     def _located(self, item: int) -> Location:
-        footage, last = self.footage, self.config.last_frames
+        footage, last = self.footage, _LAST_FRAMES
         pixels = np.array(
             [_median_known(view) for view in centroids(footage.masks.masks[:, item, -last:])]
         )
@@ -173,7 +163,7 @@ class Views:
                 f"'{name}' is known in fewer than two views ({self._unknown(item) or 'one view'})"
             )
         camera = footage.cameras[0]
-        limit = self.config.max_residual * float(np.hypot(camera.width, camera.height))
+        limit = _MAX_RESIDUAL * float(np.hypot(camera.width, camera.height))
         if found.residual_px > limit:
             raise CannotTell(
                 f"the views disagree on where '{name}' is: their rays miss each other by "
@@ -201,7 +191,7 @@ class Views:
         seen, last = self.memory.seen_masks[:, item], self.footage.masks.masks[:, item, -1]
         area, seen_area = last.sum((-2, -1)), seen.sum((-2, -1))
         inside = (seen & last).sum((-2, -1))
-        hidden = self.start_ok(item) & (area < self.config.hidden_below * seen_area)
+        hidden = self.start_ok(item) & (area < _HIDDEN_BELOW * seen_area)
         elsewhere = inside < 0.6 * area
         return bool(hidden.any() and not elsewhere.any())
 

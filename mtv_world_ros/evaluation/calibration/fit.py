@@ -16,7 +16,7 @@ from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.success.calibration import Calibration, weighed
-from mtv_world_ros.success.estimator import capped, EstimatorConfig
+from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
 from mtv_world_ros.success.evidence import FEATURES
 
 #: fewer episodes of known outcome than this say nothing
@@ -174,8 +174,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
     scales = np.where(spread > 1e-6, spread, 1.0)
     standard = np.where(known, (rows - means) / scales, 0.0)
     # imagination rarely shows what failed, as an object left behind: there, what was stated holds
-    stated = EstimatorConfig().weights
-    prior = scales * [stated.get(name, 0.0) for name in FEATURES]
+    prior = scales * [STATED_WEIGHTS.get(name, 0.0) for name in FEATURES]
     logistic = fit_logistic(standard, labels, l2=l2, prior=prior, non_negative=True)
     return {
         'features': FEATURES,

@@ -16,14 +16,14 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
-from mtv_world_ros.assembly import PolicyMaker
+from mtv_world_ros.assembly import assemble_policy, checkpoint_robot, PolicyMaker
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
-from mtv_world_ros.ros.policy.loading import load_named_policy, load_named_robot
 from mtv_world_ros.ros.policy.loop import PolicyLoop
 from mtv_world_ros.ros.policy.parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor
@@ -36,6 +36,16 @@ from mtv_world_ros.ros.world_model.loading import check_calibration, load_spec, 
 
 Load = Callable[[PolicySettings], PolicyMaker]
 _TICK_S = 0.02
+
+
+def load_named_robot(settings: PolicySettings) -> RobotModel:
+    """Loads the robot that is set, by default the checkpoint's."""
+    return checkpoint_robot(settings.checkpoint, settings.robot_file or None)
+
+
+def load_named_policy(settings: PolicySettings) -> PolicyMaker:
+    """Returns how the policy that is set is made."""
+    return assemble_policy(settings.policy, load_named_robot(settings))
 
 
 class PolicyNode(Node):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pinocchio as pin
 
@@ -12,24 +10,14 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot import RobotModel, Tool
 from mtv_world_ros.geometry.transforms import rotation
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IkConfig:
-    """Damped least squares, iterated until the tool is there.
-
-    Attributes:
-        damping: added to the diagonal of J^T J.
-        tolerance_m: accepted position error.
-        tolerance_rad: accepted orientation error.
-        num_iterations: steps before a pose counts as out of reach.
-        limit_margin: distance kept from the joint limits [rad].
-    """
-
-    damping: float = 1e-5
-    tolerance_m: float = 3e-4
-    tolerance_rad: float = 2e-3
-    num_iterations: int = 60
-    limit_margin: float = 0.005
+#: of damped least squares: added to the diagonal of J^T J
+_DAMPING = 1e-5
+#: accepted errors of position [m] and orientation [rad]
+_TOLERANCE_M, _TOLERANCE_RAD = 3e-4, 2e-3
+#: steps before a pose counts as out of reach
+_NUM_ITERATIONS = 60
+#: distance kept from the joint limits [rad]
+_LIMIT_MARGIN = 0.005
 
 
 def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
@@ -47,10 +35,12 @@ def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
 
 
 class ArmSolver:
-    """Solves the joints of one arm for tool poses, starting from the previous solution."""
+    """Solves the joints of one arm for tool poses, starting from the previous solution.
 
-    def __init__(self, robot: RobotModel, tool: Tool, config: IkConfig | None = None) -> None:
-        self._config = config or IkConfig()
+    Damped least squares, iterated until the tool is there.
+    """
+
+    def __init__(self, robot: RobotModel, tool: Tool) -> None:
         self._model = robot.pinocchio_model
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(tool.link)
@@ -66,9 +56,8 @@ class ArmSolver:
         ]
         self._q_at = np.array([joint.idx_q for joint in joints])
         self._v_at = np.array([joint.idx_v for joint in joints])
-        margin = self._config.limit_margin
-        self._lower = np.asarray(robot.lower)[self.indices] + margin
-        self._upper = np.asarray(robot.upper)[self.indices] - margin
+        self._lower = np.asarray(robot.lower)[self.indices] + _LIMIT_MARGIN
+        self._upper = np.asarray(robot.upper)[self.indices] - _LIMIT_MARGIN
         self._neutral = pin.neutral(self._model)
 
     def solve(self, pose: FloatArray, start: FloatArray) -> FloatArray:
@@ -77,17 +66,17 @@ class ArmSolver:
         Raises:
             SimulatorError: the pose is out of reach from `start`.
         """
-        config, goal = self._config, pin.SE3(np.asarray(pose))
+        goal = pin.SE3(np.asarray(pose))
         q, joints = self._neutral.copy(), np.clip(start, self._lower, self._upper)
-        for _ in range(config.num_iterations):
+        for _ in range(_NUM_ITERATIONS):
             q[self._q_at] = joints
             pin.computeJointJacobians(self._model, self._data, q)
             pin.updateFramePlacement(self._model, self._data, self._frame)
             placement = self._data.oMf[self._frame] * self._tool
             error = pin.log6(placement.actInv(goal)).vector
             if (
-                np.linalg.norm(error[:3]) < config.tolerance_m
-                and np.linalg.norm(error[3:]) < config.tolerance_rad
+                np.linalg.norm(error[:3]) < _TOLERANCE_M
+                and np.linalg.norm(error[3:]) < _TOLERANCE_RAD
             ):
                 return joints
             jacobian = (
@@ -96,7 +85,7 @@ class ArmSolver:
                     self._model, self._data, self._frame, pin.ReferenceFrame.LOCAL
                 )[:, self._v_at]
             )
-            normal = jacobian.T @ jacobian + config.damping * np.eye(len(joints))
+            normal = jacobian.T @ jacobian + _DAMPING * np.eye(len(joints))
             step = np.linalg.solve(normal, jacobian.T @ error)
             joints = np.clip(joints + np.clip(step, -0.5, 0.5), self._lower, self._upper)
         x, y, z = pose[:3, 3]

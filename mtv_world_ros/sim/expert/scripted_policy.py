@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,23 +20,13 @@ from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, Random
 from mtv_world_ros.sim.world.scene import Place, Scene
 from mtv_world_ros.sim.world.simulator import scene_generator
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScriptedPolicyConfig:
-    """How a scripted policy answers.
-
-    Attributes:
-        chunk_s: horizon of an answer [s].
-        point_period_s: between its points [s].
-        hold_s: from the end of the plan to the end of the episode [s].
-        max_draws: draws of a faulty plan before the policy gives up: faults drawn at random may
-            bring a way point out of reach.
-    """
-
-    chunk_s: float = 3.2
-    point_period_s: float = 0.1
-    hold_s: float = 0.6
-    max_draws: int = 20
+#: horizon of an answer [s], and time between its points [s]
+_CHUNK_S, _POINT_PERIOD_S = 3.2, 0.1
+#: default time from the end of the plan to the end of the episode [s]
+HOLD_S = 0.6
+#: draws of a faulty plan before the policy gives up: faults drawn at random may bring a way point
+#: out of reach
+_MAX_DRAWS = 20
 
 
 def fault_generator(seed: int) -> np.random.Generator:
@@ -55,7 +45,7 @@ class ScriptedPolicy:
         expert: plans.
         task: what to do.
         scene: where everything is.
-        config: how it answers.
+        hold_s: from the end of the plan to the end of the episode [s].
     """
 
     def __init__(
@@ -64,10 +54,10 @@ class ScriptedPolicy:
         expert: Expert,
         task: Task,
         scene: Scene,
-        config: ScriptedPolicyConfig | None = None,
+        hold_s: float = HOLD_S,
     ) -> None:
         self.variant, self.task, self.scene = variant, task, scene
-        self._expert, self._config = expert, config or ScriptedPolicyConfig()
+        self._expert, self._hold_s = expert, hold_s
         self._plan: JointTrajectory | None = None
         self._first_ns: int | None = None
 
@@ -114,7 +104,7 @@ class ScriptedPolicy:
             PolicyError: not reset, or the observation is older than the episode.
         """
         del instruction
-        plan, config = self.plan, self._config
+        plan = self.plan
         if self._first_ns is None:
             self._first_ns = observation.stamp_ns
         elapsed = (observation.stamp_ns - self._first_ns) / 1e9
@@ -125,8 +115,8 @@ class ScriptedPolicy:
             )
         if elapsed >= self.seconds - 1e-6:
             return None
-        num = round(config.chunk_s / config.point_period_s)
-        times = np.linspace(config.point_period_s, num * config.point_period_s, num)
+        num = round(_CHUNK_S / _POINT_PERIOD_S)
+        times = np.linspace(_POINT_PERIOD_S, num * _POINT_PERIOD_S, num)
         return JointTrajectory(
             joint_names=plan.joint_names,
             times=times,
@@ -137,7 +127,7 @@ class ScriptedPolicy:
     @property
     def seconds(self) -> float:
         """How long its episode lasts [s]."""
-        return float(self.plan.times[-1]) + self._config.hold_s
+        return float(self.plan.times[-1]) + self._hold_s
 
     def _draw_plan(self, rng: np.random.Generator, faults: WayPointFaults) -> JointTrajectory:
         is_wrong, is_miss = rng.uniform(size=2) < (
@@ -145,7 +135,7 @@ class ScriptedPolicy:
             self.variant.size('miss'),
         )
         reason = ''
-        for _ in range(self._config.max_draws):
+        for _ in range(_MAX_DRAWS):
             for task, scene in self._intentions(rng, is_wrong=bool(is_wrong)):
                 try:
                     seen = self._seen(scene, rng)
@@ -154,7 +144,7 @@ class ScriptedPolicy:
                     reason = str(error)
         raise PolicyError(
             f"policy '{self.name}' finds no plan for task '{self.task.name}' in this scene in "
-            f'{self._config.max_draws} draws ({reason or "it has no other object to take"}); '
+            f'{_MAX_DRAWS} draws ({reason or "it has no other object to take"}); '
             'take another seed, or smaller faults'
         )
 
@@ -217,7 +207,7 @@ def scripted_policy(
     seed: int,
     expert: Expert,
     randomization: RandomizationConfig | None = None,
-    config: ScriptedPolicyConfig | None = None,
+    hold_s: float = HOLD_S,
 ) -> ScriptedPolicy:
     """Returns the policy of a name, for the scene that the simulator draws for a task and a seed.
 
@@ -227,7 +217,7 @@ def scripted_policy(
         seed: of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: plans.
         randomization: as the simulator's.
-        config: how it answers.
+        hold_s: from the end of the plan to the end of the episode [s].
 
     Raises:
         PolicyError: no such policy.
@@ -235,7 +225,7 @@ def scripted_policy(
     """
     variant, kind = parse_variant(name), task_named(task)
     scene = draw_scene(kind, scene_generator(seed), randomization)
-    return ScriptedPolicy(variant, expert, kind, scene, config)
+    return ScriptedPolicy(variant, expert, kind, scene, hold_s)
 
 
 def _velocities(plan: JointTrajectory, times: FloatArray) -> FloatArray:
