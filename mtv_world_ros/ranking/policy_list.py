@@ -23,7 +23,7 @@ from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.policies.server_process import PORT, ServerProcess
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import parse_variant
-from mtv_world_ros.sim.expert.scripted_policy import scripted_policy, ScriptedPolicyConfig
+from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
@@ -186,8 +186,7 @@ class ListedPolicies:
         listed = next(policy for policy in self.policies if policy.name == name)
         config = listed.config
         if isinstance(config, ScriptedPolicySettings):
-            hold = ScriptedPolicyConfig(hold_s=config.hold_s)
-            return scripted_policy(config.variant, task, seed, expert, config=hold)
+            return scripted_policy(config.variant, task, seed, expert, hold_s=config.hold_s)
         if name not in self._made:
             self._made[name] = GuardedPolicy(listed, self.logs)
         return self._made[name]
