@@ -12,7 +12,7 @@ from typing import Any, cast
 import torch
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.errors import CheckpointError, MtvWorldError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
@@ -97,7 +97,18 @@ def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Chec
     Raises:
         CheckpointError: a part is missing, is a pickle, or belongs to another model.
     """
-    folder = Path(folder)
+    try:
+        return _load(Path(folder), dtype)
+    except MtvWorldError:
+        raise
+    except Exception as error:  # configurations of other libraries raise all kinds of errors
+        raise CheckpointError(
+            f"checkpoint '{folder}' cannot be loaded ({type(error).__name__}: {error}); copy or "
+            'export it again'
+        ) from error
+
+
+def _load(folder: Path, dtype: torch.dtype) -> Checkpoint:
     card = read_card(folder)
     for part in PARTS:
         if not (folder / part).is_dir():

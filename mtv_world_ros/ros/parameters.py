@@ -128,6 +128,12 @@ class Settings(NodeSettings):
     limit_tolerance: float = parameter(
         1e-3, 'Joints may exceed their limits by this [rad or m].', (0.0, 0.1)
     )
+    stuck_after_s: float = parameter(
+        600.0,
+        'A model that does not end a denoising step for this time is given up: the rollout fails, '
+        'and a new thread takes over [s]. The first step may compile.',
+        (0.1, 86400.0),
+    )
     stamp_mode: Literal['target', 'source'] = parameter(
         'target', 'Stamp of predictions: the predicted time, or the observation they come from.'
     )

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import ctypes
 import os
+from pathlib import Path
 import signal
 import sys
+import tempfile
 from typing import TypeVar
 
 import rclpy
@@ -81,7 +83,9 @@ def run(
         return 0
     end_with_parent()
     interrupt = _Interrupt()
-    signal.signal(signal.SIGINT, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
+    _find_log_folder()
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
     try:
@@ -89,21 +93,43 @@ def run(
         interrupt.raises = False
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except MtvWorldError as error:
-        sys.stderr.write(f'{type(error).__name__}: {error}\n')
-        return 1
-    except Exception:
-        if rclpy.ok():
+        _say_stopped(node)
+    except Exception as error:
+        if not rclpy.ok():  # the shutdown came first: what failed after it says nothing
+            _say_stopped(node)
+        elif isinstance(error, MtvWorldError):
+            sys.stderr.write(f'{type(error).__name__}: {error}\n')
+            return 1
+        else:
             raise
     finally:
         _shut_down(node)
     return 0
 
 
+def _say_stopped(node: Node | None) -> None:
+    if node is None:
+        sys.stderr.write('stopped while starting\n')
+
+
+def _find_log_folder() -> None:
+    """Lets ROS log into a temporary folder where it cannot write its own (a read-only home)."""
+    home = os.environ.get('ROS_HOME') or Path.home() / '.ros'
+    folder = Path(os.environ.get('ROS_LOG_DIR') or Path(home) / 'log')
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except (OSError, RuntimeError) as error:
+        other = tempfile.mkdtemp(prefix='ros_log_')
+        os.environ['ROS_LOG_DIR'] = other
+        sys.stderr.write(f"'{folder}' cannot be written ({error}); ROS logs into '{other}'\n")
+
+
 def _shut_down(node: Node | None) -> None:
     """Ends the node; a second Ctrl-C (a launcher sends one too) does not disturb it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     if node is not None:
         close = getattr(node, 'close', node.destroy_node)
         close()

@@ -21,7 +21,8 @@ from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 VIEWS = ('low', 'high')
 WIDTH, HEIGHT, FPS, NUM_FRAMES = 48, 36, 5.0, 4
-OUT_OF_MEMORY, BLOCKS, CRASHES, SLOW = 1100, 1200, 1300, 1400
+OUT_OF_MEMORY, BLOCKS, CRASHES, SLOW, STUCK = 1100, 1200, 1300, 1400, 1500
+STUCK_S = 3.0
 SLOW_S = 0.3
 
 
@@ -55,6 +56,8 @@ class FakeWorldModel:
             raise ModelMemoryError('the device ran out of memory (fake)')
         if seed // 100 == CRASHES // 100:
             raise RuntimeError('a fault of the fake model')
+        if seed // 100 == STUCK // 100:
+            time.sleep(STUCK_S)  # asks nobody whether it is still wanted
         end_s = time.monotonic() + (SLOW_S if seed // 100 == SLOW // 100 else 0)
         while seed // 100 == BLOCKS // 100 or time.monotonic() < end_s:
             time.sleep(0.001)

@@ -32,10 +32,12 @@ class Reason(StrEnum):
     TRAJECTORY_TOO_LONG = 'trajectory_too_long'
     JOINT_NAMES = 'joint_names'
     JOINT_LIMITS = 'joint_limits'
+    INSTRUCTION_TOO_LONG = 'instruction_too_long'
     NO_CLOCK = 'no_clock'
     WORLD_MODEL_MISSING = 'world_model_missing'
     ROLLOUT_INVALID = 'rollout_invalid'
     OUT_OF_MEMORY = 'out_of_memory'
+    WORKER_STUCK = 'worker_stuck'
     INTERNAL_ERROR = 'internal_error'
 
 

@@ -25,6 +25,9 @@ from mtv_world_ros.ros.parameters import NodeSettings
 _NUM_IMAGES = 3
 #: joint samples kept a joint; at 1 kHz this reaches back a quarter of a second
 _NUM_SAMPLES = 256
+#: no joint moves faster than this [rad/s or m/s]; encoders may jump by a little
+_FASTEST = 1000.0
+_LEAST_JUMP = 0.3
 _AGE_LIMITS = {
     Reason.IMAGE_STALE: 'max_image_age_s',
     Reason.JOINT_STATE_STALE: 'max_joint_state_age_s',
@@ -79,6 +82,7 @@ class ObservationBuffer:
         self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
             camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
         }
+        self._received: dict[str, float] = {}
         self._joints: dict[str, deque[tuple[int, float]]] = {
             name: deque(maxlen=_NUM_SAMPLES) for name in joint_names
         }
@@ -119,9 +123,25 @@ class ObservationBuffer:
             Rejection: no positions, not one a name, or not finite.
         """
         stamp_ns = to_ns(message.header.stamp)
-        for name, position in to_positions(message).items():
-            if name in self._joints:
-                self._joints[name].append((stamp_ns, position))
+        positions = {n: p for n, p in to_positions(message).items() if n in self._joints}
+        before, self._received = self._received, {**self._received, **positions}
+        for name, position in positions.items():
+            self._check_speed(name, stamp_ns, position, before.get(name, position))
+        for name, position in positions.items():
+            self._joints[name].append((stamp_ns, position))
+
+    def _check_speed(self, name: str, stamp_ns: int, position: float, received: float) -> None:
+        """Refuses a sample that no joint can have reached, unless the one before said so, too."""
+        if not self._joints[name]:
+            return
+        last_ns, last = self._joints[name][-1]
+        reach = _LEAST_JUMP + _FASTEST * abs(stamp_ns - last_ns) / NANO
+        if min(abs(position - last), abs(position - received)) > reach:
+            raise Rejection(
+                Reason.JOINT_STATE_INVALID,
+                f"joint '{name}' jumps from {last:g} to {position:g} in "
+                f'{(stamp_ns - last_ns) / NANO:.4f} s',
+            )
 
     def clear(self) -> None:
         """Forgets images and joint states (the clock jumped); camera infos stay."""

@@ -18,9 +18,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
-from mtv_world_ros.ros.messages.rejection import Rejection
+from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run
@@ -99,14 +100,19 @@ class WorldModelNode(Node):
             on_trajectory=self._on_trajectory,
             guarded=self._reporter.guarded,
         )
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(SetBool, '~/imagine', self._on_imagine)
+        served, guarded = self._reporter.served, self._reporter.guarded
+        self.create_service(Trigger, '~/reset', served(self._on_reset))
+        self.create_service(SetBool, '~/imagine', served(self._on_imagine))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._settings.diagnostics_period_s, self._on_period, clock=steady)
+        self.create_timer(
+            self._settings.diagnostics_period_s, guarded(self._on_period), clock=steady
+        )
         back = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
-        self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
+        self._jumps = self.get_clock().create_jump_callback(
+            back, post_callback=guarded(self._on_jump)
+        )
         parameters.refuse_unknown(self)
         self._worker.start()
         self.get_logger().info(
@@ -135,6 +141,8 @@ class WorldModelNode(Node):
                 )
 
     def _on_instruction(self, message: String) -> None:
+        with bounded(Reason.INSTRUCTION_TOO_LONG):
+            check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
@@ -153,13 +161,13 @@ class WorldModelNode(Node):
         try:
             request = self._maker.make(message, now_ns, received_s)
             self._worker.submit(self._fidelity.replan(request))
-        except Rejection as error:
+        except Exception as error:  # one answer a plan, whatever is wrong with it
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
 
     def _publish_results(self) -> None:
         for result in self._worker.take():
-            self._fidelity.expect(result)
-            self._publisher.add(result)
+            for take in (self._fidelity.expect, self._publisher.add):
+                self._reporter.guarded(take)(result)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._give_up()
@@ -201,6 +209,7 @@ class WorldModelNode(Node):
         self._settings = parameters.read(self, Settings)
 
     def _on_period(self) -> None:
+        self._worker.supervise(self._settings.stuck_after_s)
         self._inputs.refresh()
         self._reporter.publish_diagnostics()
 

@@ -38,7 +38,7 @@ _WARN_S = 5.0
 #: rollouts ended in a row without a chunk that are worth a warning
 _STARVED = 5
 #: reasons that mean something is broken here and not in what was sent
-_ERRORS = (Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR)
+_ERRORS = (Reason.OUT_OF_MEMORY, Reason.WORKER_STUCK, Reason.INTERNAL_ERROR)
 
 
 class Reporter:
@@ -78,23 +78,39 @@ class Reporter:
             f'rejected ({error.reason}): {error}', throttle_duration_sec=1.0
         )
 
-    def reject_trajectory(self, error: Rejection, trajectory_stamp_ns: int) -> None:
+    def reject_trajectory(self, error: Exception, trajectory_stamp_ns: int) -> None:
         """Counts and reports a refused trajectory; `/diagnostics` says why at once."""
+        if not isinstance(error, Rejection):
+            self.crash(error)
+            error = Rejection(Reason.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
         self.reject(error)
         values = _rejection_values(error, trajectory_stamp_ns)
         self._publish_report('rejected', values)
         self.publish_diagnostics()
 
-    def guarded(self, handle: Callable[[Any], None]) -> Callable[[Any], None]:
+    def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
         """Returns the handler as a callback that no message makes raise."""
 
-        def callback(message: Any) -> None:
+        def callback(*messages: Any) -> None:
             try:
-                handle(message)
+                handle(*messages)
             except Rejection as error:
                 self.reject(error)
             except Exception as error:  # the node never dies of a message
                 self.crash(error)
+
+        return callback
+
+    def served(self, serve: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Returns the service's callback as one that always answers."""
+
+        def callback(request: Any, response: Any) -> Any:
+            try:
+                return serve(request, response)
+            except Exception as error:  # the node never dies of a request
+                self.crash(error)
+                response.success, response.message = False, f'{type(error).__name__}: {error}'
+                return response
 
         return callback
 
@@ -133,7 +149,11 @@ class Reporter:
             self._node.get_logger().error(ended.trace)
         if ended.reason is not None:
             self.reject(Rejection(ended.reason, ended.text))
-        self._publish_report(ended.state, _ended_values(ended))
+        try:
+            self._publish_report(ended.state, _ended_values(ended))
+        except Exception as error:  # a plan gets its end, whatever is in its values
+            self.crash(error)
+            self._publish_report(ended.state, {'trajectory_stamp_ns': ended.request.stamp_ns})
         if ended.reason is not None:
             self.publish_diagnostics()
 

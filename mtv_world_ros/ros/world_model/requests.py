@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
-from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.ros.messages.conversions import to_trajectory
@@ -16,6 +16,9 @@ from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
 from mtv_world_ros.ros.world_model.worker import from_observation, Request, TimeLimits
+
+#: measured joints may be beyond their limits by this, and by this share of their range
+_MEASURED_SLACK = 0.1
 
 
 class RequestMaker:
@@ -98,4 +101,19 @@ class RequestMaker:
             raise Rejection(
                 Reason.NO_CLOCK, "'use_sim_time' is set but nothing was received on /clock"
             )
-        return self._buffer.observe(now_ns)
+        scene = self._buffer.observe(now_ns)
+        self._check_measured(scene.observation.positions)
+        return scene
+
+    def _check_measured(self, positions: FloatArray) -> None:
+        """Refuses measured joints that are far beyond their limits (wrong unit or joint)."""
+        robot = self._robot
+        slack = _MEASURED_SLACK * (1.0 + np.abs(robot.upper - robot.lower))
+        outside = (positions < robot.lower - slack) | (positions > robot.upper + slack)
+        if outside.any():
+            joint = int(np.argmax(outside))
+            raise Rejection(
+                Reason.JOINT_STATE_INVALID,
+                f"joint '{robot.joint_names[joint]}' is measured at {positions[joint]:g}; its "
+                f'limits are {robot.lower[joint]:g} to {robot.upper[joint]:g} (rad or m)',
+            )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Condition, Thread
+from threading import Condition, current_thread, Thread
 import time
 import traceback
 
@@ -17,6 +17,9 @@ from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO
 from mtv_world_ros.ros.sensing.observations import Scene
+
+#: a thread that is stuck in the model is not waited for longer than this at the end [s]
+_LONGEST_JOIN_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,11 +139,47 @@ class RolloutWorker:
         self._episode: ImaginedEpisode | None = None
         self._last: Scene | None = None
         self._results: deque[Result] = deque()
-        self._thread = Thread(target=self._run, name='rollouts')
+        #: when the thread last showed that it goes on [s]; None = it waits for work
+        self._beat_s: float | None = None
+        self._thread = self._new_thread()
 
     def start(self) -> None:
         """Starts the thread; requests wait until then."""
         self._thread.start()
+
+    def supervise(self, longest_s: float) -> bool:
+        """Gives up a thread that is stuck in the model, and goes on in a new one.
+
+        Args:
+            longest_s: longest time between two denoising steps [s].
+
+        Returns:
+            Whether the thread was stuck; its rollout failed then.
+        """
+        with self._changed:
+            if self._beat_s is None or time.monotonic() - self._beat_s < longest_s:
+                return False
+            if self._running is not None and not self._abandoned:
+                text = (
+                    f'the model did not go on for {longest_s:g} s and was given up; '
+                    "'stuck_after_s' allows more"
+                )
+                self._put(self._ended(self._running, 'failed', Reason.WORKER_STUCK, text))
+            self._running, self._abandoned, self._beat_s = None, False, None
+            self._episode, self._last, self._known = None, None, []
+            self._observed = ObservedEpisode(self._pipeline)
+            self._thread = self._new_thread()
+            self._thread.start()
+            return True
+
+    def _new_thread(self) -> Thread:
+        """A daemon: one that is stuck does not keep the process from ending."""
+        return Thread(target=self._run, name='rollouts', daemon=True)
+
+    @property
+    def _is_given_up(self) -> bool:
+        """Whether another thread took over from the one that asks."""
+        return current_thread() is not self._thread
 
     @property
     def last_scene(self) -> Scene | None:
@@ -209,12 +248,14 @@ class RolloutWorker:
             self._closing = True
             self._changed.notify_all()
         if self._thread.is_alive():
-            self._thread.join()
+            self._thread.join(_LONGEST_JOIN_S)
 
     def _run(self) -> None:
         while (request := self._next()) is not None:
             ended = self._roll_out(request)
             with self._changed:
+                if self._is_given_up:
+                    return
                 if not self._abandoned:
                     self._put(ended)
                 is_preempted = ended.state == 'preempted' and not self._abandoned
@@ -224,9 +265,13 @@ class RolloutWorker:
     def _next(self) -> Request | None:
         while True:
             with self._changed:
+                if self._is_given_up:
+                    return None
+                self._beat_s = None
                 self._changed.wait_for(self._has_work)
                 if self._closing:
                     return None
+                self._beat_s = time.monotonic()
                 job, self._between = self._between, None
                 if job is None and self._pending is None:
                     job = self._catch_up
@@ -250,6 +295,9 @@ class RolloutWorker:
 
     def _should_stop(self) -> bool:
         with self._changed:
+            if self._is_given_up:
+                return True
+            self._beat_s = time.monotonic()
             is_replaced = self._pending is not None and (self._known or not self._is_starved)
             return self._closing or self._abandoned or bool(is_replaced)
 
@@ -303,7 +351,7 @@ class RolloutWorker:
             ready_s = time.monotonic()
             chunk = Chunk(request=request, scene=scene, prediction=prediction, ready_s=ready_s)
             with self._changed:
-                if self._abandoned or self._closing:
+                if self._abandoned or self._closing or self._is_given_up:
                     raise RolloutPreempted('the rollout was given up')
                 if request.imagine:
                     self._episode = episode

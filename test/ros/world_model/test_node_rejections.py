@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-OUT_OF_MEMORY, CRASHES = 1100, 1300
+OUT_OF_MEMORY, CRASHES, STUCK = 1100, 1300, 1500
 
 
 @pytest.fixture(scope='module')
@@ -276,4 +276,70 @@ def test_outlives_whatever_the_model_raises(node, client):
     assert client.set(seed=0) == ''
     assert (ended['state'], ended['reason']) == ('failed', 'internal_error')
     assert ended['text'] == 'RuntimeError: a fault of the fake model'
+    expect_goes_on(client)
+
+
+def test_a_stuck_model_is_given_up_and_another_thread_goes_on(node, client, ros):
+    assert client.set(seed=STUCK, stuck_after_s=0.5) == ''
+    since = len(client.report_values())
+    ended = client.imagine_one()
+    assert (ended['state'], ended['reason']) == ('failed', 'worker_stuck')
+    assert 'stuck_after_s' in ended['text']
+    assert client.set(seed=0, stuck_after_s=600.0) == ''
+    expect_goes_on(client)
+    client.spin_for(3.0)  # the old thread wakes up, and says nothing more
+    ends = ('done', 'preempted', 'rejected', 'failed', 'reset')
+    states = [v['state'] for v in client.report_values()[since:] if v['state'] in ends]
+    assert states == ['failed', 'done']
+    expect_goes_on(client)
+
+
+def test_measured_joints_that_cannot_be_are_refused(node, client, ros):
+    before = rejections(client, 'joint_state_invalid')
+    wild = ros.HOME.copy()
+    wild[1] = 1e300
+    client.send_scene(joints=ros.make_joint_state(client.now_ns(), positions=wild))
+    expect_counted(client, 'joint_state_invalid', before)
+    client.send_scene(joints=ros.make_joint_state(client.now_ns(), positions=wild))
+    ended = client.imagine_one(scene='as it is')
+    assert ended['reason'] == 'joint_state_invalid'
+    client.send_scene()
+    client.send_scene()
+    expect_goes_on(client)
+
+
+def test_a_joint_that_is_named_twice_is_refused(node, client, ros):
+    before = rejections(client, 'joint_state_invalid')
+    names = (*ros.JOINTS[:-1], ros.JOINTS[0])
+    client.send_scene(joints=ros.make_joint_state(client.now_ns(), names=names))
+    expect_counted(client, 'joint_state_invalid', before)
+    expect_goes_on(client)
+
+
+def test_input_that_froze_the_node_is_refused_at_once(node, client, ros):
+    since = time.monotonic()
+    names = [f'joint{n}' for n in range(20_000)]
+    ended = client.imagine_one(names=names, positions=np.zeros((1, 20_000)), times=[1.0])
+    assert ended['reason'] == 'trajectory_malformed'
+    before = rejections(client, 'instruction_too_long')
+    client.publish('/instruction', ros.STRING(data='put the ' * 1900))
+    expect_counted(client, 'instruction_too_long', before)
+    client.publish('/instruction', ros.STRING(data=('put the red ' * 300)))
+    expect_goes_on(client)
+    assert time.monotonic() - since < 20
+
+
+@pytest.mark.parametrize(
+    'changes', [{'d': [float('nan')] * 5}, {'d': [1e30, 0, 0, 0, 0]}, {'fx': 1e308}]
+)
+def test_a_camera_that_cannot_be_is_refused(node, client, ros, changes):
+    info = ros.make_info('low', client.now_ns(), fx=changes.get('fx', 90.0))
+    if 'd' in changes:
+        info.d = changes['d']
+    client.send_scene(info_low=info)
+    assert client.imagine_one(scene='as it is')['reason'] in (
+        'camera_info_changed',
+        'camera_info_invalid',
+    )
+    client.send_scene()
     expect_goes_on(client)
