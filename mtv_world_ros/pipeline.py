@@ -36,6 +36,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
+from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.rollout_memory import footage_of, RolloutMemory
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -329,7 +330,7 @@ class ImaginedEpisode:
         masks = self._follow_masks(state, start_masks, frames)
         clock.lap('masks')
         positions = plan.positions[: plan.num_frames + 1]
-        success, memory = self._judge(state, positions, start_masks, masks)
+        success, memory = self._judge(state, positions, start_masks, masks, objects)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -416,12 +417,22 @@ class ImaginedEpisode:
         positions: FloatArray,
         start_masks: ObjectMasks,
         masks: ObjectMasks,
+        objects: FoundObjects | None = None,
     ) -> Judged:
-        """The estimate after a chunk with joints at (1 + T, J), and what it remembers."""
+        """The estimate after a chunk with joints at (1 + T, J), and what it remembers.
+
+        `objects` are those at the end of the whole chunk, of which T frames may be left.
+        """
+        pipeline = self.pipeline
         footage = footage_of(
-            self.pipeline.robot, state.observation.cameras, positions, start_masks, masks
+            pipeline.robot, state.observation.cameras, positions, start_masks, masks
         )
-        return self.pipeline.estimator.estimate(footage, self.instruction, state.memory)
+        foreseen = None
+        if objects is not None and objects.positions is not None:
+            left_s = (pipeline.spec.num_frames - len(masks.masks[0, 0])) / pipeline.spec.fps
+            num = len(objects.positions) - round(left_s / objects.tracked.step_s)
+            foreseen = foreseen_of(pipeline.robot, objects, num)
+        return pipeline.estimator.estimate(footage, self.instruction, state.memory, foreseen)
 
 
 class ObservedEpisode:

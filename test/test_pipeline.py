@@ -284,6 +284,7 @@ class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
     step_s = 0.1
+    sizes = np.full((2, 3), 0.04)
 
     def __init__(self, log: list[int], num_steps: int = 0) -> None:
         self._log, self._num_steps = log, num_steps
@@ -300,7 +301,7 @@ class DriftingObjects:
         turns = np.broadcast_to(np.eye(3), (count + 1, 2, 3, 3))
         motion = ObjectMotion(reference=np.zeros((2, 3)), points=points, rotations=turns)
         self._log.append(self._num_steps + count)
-        return motion, DriftingObjects(self._log, self._num_steps + count)
+        return (motion,), DriftingObjects(self._log, self._num_steps + count)
 
 
 def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
@@ -396,13 +397,17 @@ class SlidingObjects:
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps
 
-    def advance(self, positions: np.ndarray) -> tuple[ObjectMotion, SlidingObjects]:
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.full((len(self.points), 3), 0.04)
+
+    def advance(self, positions: np.ndarray) -> tuple[tuple[ObjectMotion], SlidingObjects]:
         steps = self.steps + np.arange(len(positions))
         way = np.zeros((len(steps), 1, 3))
         way[:, 0, 0] = 0.01 * steps
         turns = np.tile(np.eye(3), (len(steps), len(self.points), 1, 1))
         motion = ObjectMotion(reference=self.points, points=self.points + way, rotations=turns)
-        return motion, SlidingObjects(self.points, int(steps[-1]))
+        return (motion,), SlidingObjects(self.points, int(steps[-1]))
 
 
 class SlidingModel:

@@ -39,6 +39,14 @@ class ObjectMotion:
         turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
         return (way > _STILL_M) | turned
 
+    def then(self, motion: ObjectMotion) -> ObjectMotion:
+        """Returns both, one after the other; row 0 of the second is the last of the first."""
+        return replace(
+            self,
+            points=np.concatenate([self.points, motion.points[1:]]),
+            rotations=np.concatenate([self.rotations, motion.rotations[1:]]),
+        )
+
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
         return ObjectMotion(
@@ -56,10 +64,16 @@ class TrackedObjects(Protocol):
         """Time between the joint positions that `advance` takes [s]."""
         ...
 
-    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
+    @property
+    def sizes(self) -> FloatArray:
+        """(O, 3) their extents, upright, as the masks show them [m]."""
+        ...
+
+    def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
 
-        Row 0 is where they are now.
+        The first motion is the expected one; the others, if any, are of places and sizes within
+        the error of what the masks tell. Row 0 is where they are now.
         """
         ...
 
@@ -84,6 +98,8 @@ class FoundObjects:
         masks: (V, O, H, W) in it.
         poses: (V, 4, 4) T_base_camera then.
         tracked: where they are now.
+        motions: since that frame, `tracked.step_s` apart; the expected one first.
+        positions: (N, J) joints at their rows [rad or m].
     """
 
     names: tuple[str, ...]
@@ -91,6 +107,8 @@ class FoundObjects:
     masks: BoolArray
     poses: FloatArray
     tracked: TrackedObjects
+    motions: tuple[ObjectMotion, ...] = ()
+    positions: FloatArray | None = None
 
     def move(
         self,
@@ -110,11 +128,15 @@ class FoundObjects:
         Returns:
             Their pictures (V, T, H, W, 4), and the objects after the last row.
         """
-        motion, tracked = self.tracked.advance(positions)
+        motions, tracked = self.tracked.advance(positions)
         rows = np.rint(times / self.tracked.step_s).astype(int)
-        shown = motion[np.minimum(rows, len(motion.points) - 1)]
+        shown = motions[0][np.minimum(rows, len(positions) - 1)]
         pictures = moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)
-        return pictures, replace(self, tracked=tracked)
+        if self.motions and self.positions is not None:
+            pairs = zip(self.motions, motions, strict=True)
+            motions = tuple(before.then(after) for before, after in pairs)
+            positions = np.concatenate([self.positions, positions[1:]])
+        return pictures, replace(self, tracked=tracked, motions=motions, positions=positions)
 
 
 def moved_pictures(

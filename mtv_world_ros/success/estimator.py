@@ -12,6 +12,7 @@ from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
+from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenMotions
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
@@ -29,7 +30,7 @@ UNDONE_PROBABILITY = 0.1
 
 #: logit per unit of a feature, used where no calibration holds; see `evidence.FEATURES` and
 #: `calibration.weighed`
-STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5}
+STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5, 'foreseen': 1.5}
 
 
 def stated_probability(features: Mapping[str, float]) -> float:
@@ -88,7 +89,11 @@ class SuccessEstimator:
         self._picture_masks = PictureMasks(segmenter)
 
     def estimate(
-        self, footage: Footage, instruction: str = '', memory: RolloutMemory | None = None
+        self,
+        footage: Footage,
+        instruction: str = '',
+        memory: RolloutMemory | None = None,
+        foreseen: ForeseenMotions | None = None,
     ) -> Judged:
         """Returns the probability that the task is done at the end of a rollout's chunk.
 
@@ -99,6 +104,7 @@ class SuccessEstimator:
             footage: the chunk.
             instruction: what the robot was told; says which task it is and with which objects.
             memory: of the chunks before; None = the chunk is the rollout's first.
+            foreseen: motions of the objects up to the chunk's end, by a model of contact.
         """
         memory = remember(memory, footage)
         try:
@@ -115,7 +121,9 @@ class SuccessEstimator:
             evidence = gather(views, task, bound, self._picture_masks)
         except CannotTell as reason:
             return Judged(_abstains(reason, views, subjects), memory)
-        return Judged(self._judge(task, evidence, views), memory)
+        starts = memory.points[:, 0]
+        succeeded = None if foreseen is None else foreseen.succeeds(task, bound, starts)
+        return Judged(self._judge(task, evidence, views, succeeded), memory)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """The task and its objects; a given task takes the objects in their order."""
@@ -127,8 +135,11 @@ class SuccessEstimator:
         known = '; '.join(task.instruction for task in self.tasks) or 'none'
         raise CannotTell(f"'{instruction}' is no known task (known: {known})")
 
-    def _judge(self, task: TaskSpec, evidence: Evidence, views: Views) -> SuccessEstimate:
+    def _judge(
+        self, task: TaskSpec, evidence: Evidence, views: Views, succeeded: FloatArray | None
+    ) -> SuccessEstimate:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
+        features['foreseen'] = foreseen_feature(succeeded)
         features['released'] = _released(task, views.footage.openings)
         basis = self._objection(task)
         calibrated = None if basis else self.calibration
@@ -149,6 +160,8 @@ class SuccessEstimator:
                 f'J with the goal mask {g:.2f}, with the start mask {s:.2f}' for g, s in pairs
             ]
         reasons += evidence.notes
+        if succeeded is not None:
+            reasons.append(f'{sum(succeeded)} of {len(succeeded)} foreseen motions succeed')
         if task.gripper == 'open' and views.footage.openings is None:
             reasons.append('gripper not checked')
         elif features['released'] == 0.0:

@@ -1,8 +1,10 @@
 """A graph network that carries, pushes and drops objects: one step of 0.1 s after the other.
 
 Nodes are objects and tools. Every step an object hears of every tool (where it is in the tool's
-own frame, how far the fingers are open) and of every other object, and decides how far it goes
-along with which tool. It is translation-invariant in the plane by construction.
+own frame, how far the fingers are apart, by how much they overlap it) and of every other object,
+and decides how far it goes along with which tool. It is translation-invariant in the plane by
+construction. Overlaps are computed from the widths and heights of the masks, not learned: so a
+grasp that fails for a reason that training never showed is still a matter of the same few numbers.
 
 Interaction networks: Battaglia et al. 2016; their use as simulators: Sanchez-Gonzalez et al. 2020.
 
@@ -20,6 +22,9 @@ import torch.nn.functional as F
 #: between two steps [s]
 STEP_S = 0.1
 _SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
+_NEAR = 100.0  # 1 / 1 cm: clearances enter in this unit, cut off at 3
+#: clearances of a tool and an object, and of two objects
+_NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,14 +36,14 @@ class Scene:
         features: (B, O, V, F) of `object_shapes`.
         present: (B, O) bool, False where the batch is padded.
         tools: (B, T + 1, A, 4, 4) T_base_tool as commanded.
-        openings: (B, T + 1, A) of the grippers as commanded, 0 closed to 1 open.
+        gaps: (B, T + 1, A) from a tool to each of its fingers, as commanded [m].
     """
 
     points: Tensor
     features: Tensor
     present: Tensor
     tools: Tensor
-    openings: Tensor
+    gaps: Tensor
 
     def to(self, device: torch.device | str) -> Scene:
         """Returns it on a device."""
@@ -83,6 +88,43 @@ class Memory:
     spread: Tensor
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Extents:
+    """Sizes of objects as their masks show them, at the start.
+
+    Attributes:
+        shape: (B, O, S) as learned.
+        widths: (B, O, 4) in the plane along x, the diagonal, y and the other diagonal [m]: of the
+            views the least, since a mask in the plane is too long away from its camera.
+        low: (B, O) lowest point, from the centre [m].
+        high: (B, O) highest point, from the centre [m].
+    """
+
+    shape: Tensor
+    widths: Tensor
+    low: Tensor
+    high: Tensor
+
+    def half_width(self, direction: Tensor, rotations: Tensor) -> Tensor:
+        """Returns (B, O, K) half the width along directions (B, O, K, 2) of the plane [m].
+
+        Args:
+            direction: unit vectors, or zeros.
+            rotations: (B, O, 3, 3) of the objects from the start; their yaw counts.
+        """
+        cos = rotations[..., 0, 0] + rotations[..., 1, 1]
+        sin = rotations[..., 1, 0] - rotations[..., 0, 1]
+        norm = (cos**2 + sin**2 + 1e-8).sqrt()
+        cos, sin = (cos / norm)[..., None], (sin / norm)[..., None]
+        x, y = direction.unbind(-1)
+        x, y = cos * x + sin * y, cos * y - sin * x
+        two_cos, two_sin = x * x - y * y, 2 * x * y
+        a, b, c, d = (width[..., None] for width in self.widths.unbind(-1))
+        # through four samples, half a turn apart from where they repeat
+        mean, four = (a + b + c + d) / 4, (2 * two_cos * two_cos - 1) * (a - b + c - d) / 4
+        return (mean + (two_cos * (a - c) + two_sin * (b - d)) / 2 + four).clamp(min=0.0) / 2
+
+
 def _mlp(*widths: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     for number, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
@@ -105,14 +147,17 @@ class ObjectMotionNetwork(nn.Module):
         self.hidden = hidden
         shape = 32
         self.shape = _mlp(num_features + 1, width, shape)
-        # r now, next, before (9) | rotation in the tool (6) | openings (3) | tool: height, way (4)
-        self.tool_edge = _mlp(22 + shape + hidden, width, width, width)
-        # offset (3) | velocities (6) | rotation of the other (6)
-        self.object_edge = _mlp(15 + 2 * shape + hidden, width, width)
+        # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
+        # clearances now and next
+        given = 22 + 2 * _NUM_TOOL_CLEARANCES
+        self.tool_edge = _mlp(given + shape + hidden, width, width, width)
+        # offset (3) | velocities (6) | rotation of the other (6) | clearances
+        given = 15 + _NUM_OBJECT_CLEARANCES
+        self.object_edge = _mlp(given + 2 * shape + hidden, width, width)
         self.gate = nn.Linear(width, 1)
         self.push = nn.Linear(width, 6)
-        # height, velocity, spin, rotation
-        self.node = _mlp(1 + 3 + 3 + 6 + shape + hidden + 2 * width, width, width)
+        # height, clearance over the table, velocity, spin, rotation
+        self.node = _mlp(2 + 3 + 3 + 6 + shape + hidden + 2 * width, width, width)
         self.free = nn.Linear(width, 6)
         self.stay = nn.Linear(width, 1)
         self.memory = nn.GRUCell(width, hidden)
@@ -156,10 +201,7 @@ class ObjectMotionNetwork(nn.Module):
             truth: see `forward`.
             forced: see `forward`.
         """
-        described = torch.cat(
-            [scene.features.flatten(2) * _SCALE, scene.points[..., 2:] * _SCALE], dim=-1
-        )
-        shape = self.shape(described)
+        extents = self._extents(scene)
         now = memory or self._begin(scene)
         track = [now]
         for step in range(skip, scene.tools.shape[1] - 1):
@@ -173,13 +215,10 @@ class ObjectMotionNetwork(nn.Module):
             rows = [max(step - 1, 0), step, step + 1]
             moved, turned, held, hidden, more = self.step(
                 scene.tools[:, rows],
-                scene.openings[:, rows],
+                scene.gaps[:, rows],
                 scene.present,
-                shape,
-                now.points,
-                now.rotations,
-                now.velocity,
-                now.hidden,
+                extents,
+                now,
             )
             now = Memory(
                 points=moved,
@@ -196,6 +235,22 @@ class ObjectMotionNetwork(nn.Module):
         rows_of = {name: torch.stack([getattr(m, name) for m in track], 1) for name in names}
         return Motion(**rows_of), now
 
+    def _extents(self, scene: Scene) -> _Extents:
+        features = scene.features
+        described = torch.cat([features.flatten(2) * _SCALE, scene.points[..., 2:] * _SCALE], -1)
+        seen = (features[..., :4] > 0).any(-1, keepdim=True)
+        far = features.new_tensor(1e3)
+        widths = torch.where(seen, features[..., :4], far).amin(2)
+        low = torch.where(seen[..., 0], features[..., 4], -far).amax(2)
+        high = torch.where(seen[..., 0], features[..., 5], far).amin(2)
+        known = seen.any(2)
+        return _Extents(
+            shape=self.shape(described),
+            widths=torch.where(known, widths, 0.0),
+            low=torch.where(known[..., 0], low, 0.0),
+            high=torch.where(known[..., 0], high, 0.0),
+        )
+
     def _begin(self, scene: Scene) -> Memory:
         points = scene.points
         batch, objects = scene.present.shape
@@ -209,115 +264,155 @@ class ObjectMotionNetwork(nn.Module):
         )
 
     def step(
-        self,
-        tools: Tensor,
-        openings: Tensor,
-        present: Tensor,
-        shape: Tensor,
-        points: Tensor,
-        rotations: Tensor,
-        velocity: Tensor,
-        memory: Tensor,
+        self, tools: Tensor, gaps: Tensor, present: Tensor, extents: _Extents, now: Memory
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """One step, from the tools (B, 3, A, 4, 4) and openings (B, 3, A) before, now and after.
+        """One step, from the tools (B, 3, A, 4, 4) and gaps (B, 3, A) before, now and after.
 
         Returns points, rotations, shares of the tools, memory, and what is added to the spread.
         """
-        before, now, after = tools.unbind(1)
-        heard, gates, pushed = self._from_tools(
-            openings, shape, points, rotations, memory, (before, now, after)
-        )
-        told = self._from_objects(present, shape, points, rotations, velocity, memory)
+        before, here, after = tools.unbind(1)
+        heard, gates, pushed = self._from_tools(gaps, extents, now, (before, here, after))
+        told = self._from_objects(present, extents, now)
+        height = now.points[..., 2]
         node = self.node(
             torch.cat(
                 [
-                    points[..., 2:] * _SCALE,
-                    velocity[..., :3] * _SCALE,
-                    velocity[..., 3:],
-                    rotations[..., :2].flatten(-2),
-                    shape,
-                    memory,
+                    height[..., None] * _SCALE,
+                    _near(height + extents.low)[..., None],
+                    now.velocity[..., :3] * _SCALE,
+                    now.velocity[..., 3:],
+                    now.rotations[..., :2].flatten(-2),
+                    extents.shape,
+                    now.hidden,
                     heard,
                     told,
                 ],
                 dim=-1,
             )
         )
-        memory = self.memory(node.flatten(0, 1), memory.flatten(0, 1)).unflatten(
-            0, memory.shape[:2]
+        hidden = self.memory(node.flatten(0, 1), now.hidden.flatten(0, 1)).unflatten(
+            0, now.hidden.shape[:2]
         )
         weights = torch.cat([gates, self.stay(node)], dim=-1).softmax(dim=-1)
         held = weights[..., :-1]
-        carry = after @ _inverse(now)  # (B, A, 4, 4)
-        there = torch.einsum('baij,boj->boai', carry[..., :3, :3], points)
+        carry = after @ _inverse(here)  # (B, A, 4, 4)
+        there = torch.einsum('baij,boj->boai', carry[..., :3, :3], now.points)
         there = there + carry[:, None, :, :3, 3]
         free = self.free(node)
         moved = (
-            points
-            + (held[..., None] * (there - points[:, :, None])).sum(2)
+            now.points
+            + (held[..., None] * (there - now.points[:, :, None])).sum(2)
             + pushed[..., :3]
             + free[..., :3] / _SCALE
         )
         spin = _vector(carry[..., :3, :3])  # (B, A, 3)
         turn = (held[..., None] * spin[:, None]).sum(2) + pushed[..., 3:] + free[..., 3:]
-        turned = _rotation(turn) @ rotations
+        turned = _rotation(turn) @ now.rotations
         more = F.softplus(self.scale(node.detach())[..., 0]) / _SCALE
-        return moved, turned, held, memory, more
+        return moved, turned, held, hidden, more
 
     def _from_tools(
         self,
-        openings: Tensor,
-        shape: Tensor,
-        points: Tensor,
-        rotations: Tensor,
-        memory: Tensor,
+        gaps: Tensor,
+        extents: _Extents,
+        now: Memory,
         tools: tuple[Tensor, Tensor, Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Messages (B, O, D), logits of being carried (B, O, A), pushes (B, O, 6)."""
-        before, now, after = tools
-        seen = [_local(tool, points) * _SCALE for tool in (now, after, before)]
-        num_tools = now.shape[1]
-        turned = now[:, None, :, :3, :3].mT @ rotations[:, :, None]
-        grip = openings.transpose(1, 2)[:, None].expand(-1, points.shape[1], -1, -1)
-        way = torch.einsum('baji,baj->bai', now[..., :3, :3], (after - now)[..., :3, 3])
-        tool = torch.cat([now[:, :, 2:3, 3], way], dim=-1) * _SCALE
-        own = torch.cat([shape, memory], dim=-1)[:, :, None].expand(-1, -1, num_tools, -1)
+        before, here, after = tools
+        seen = [_local(tool, now.points) * _SCALE for tool in (here, after, before)]
+        count, num_tools = now.points.shape[1], here.shape[1]
+        turned = here[:, None, :, :3, :3].mT @ now.rotations[:, :, None]
+        apart = gaps.transpose(1, 2)[:, None].expand(-1, count, -1, -1) * _SCALE
+        way = torch.einsum('baji,baj->bai', here[..., :3, :3], (after - here)[..., :3, 3])
+        tool = torch.cat([here[:, :, 2:3, 3], way], dim=-1) * _SCALE
+        own = torch.cat([extents.shape, now.hidden], dim=-1)
         inputs = [
             # far away is far away
             *(value.clamp(-4, 4) for value in seen),
             turned[..., :2].flatten(-2),
-            grip,
-            tool[:, None].expand(-1, points.shape[1], -1, -1),
-            own,
+            apart,
+            tool[:, None].expand(-1, count, -1, -1),
+            _tool_clearances(here, gaps[:, 1], extents, now),
+            _tool_clearances(after, gaps[:, 2], extents, now),
+            own[:, :, None].expand(-1, -1, num_tools, -1),
         ]
         edge = self.tool_edge(torch.cat(inputs, dim=-1))
         push = self.push(edge)
-        frame = now[:, None, :, :3, :3]
+        frame = here[:, None, :, :3, :3]
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
         angular = (frame @ push[..., 3:, None])[..., 0]
         return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
 
-    def _from_objects(
-        self,
-        present: Tensor,
-        shape: Tensor,
-        points: Tensor,
-        rotations: Tensor,
-        velocity: Tensor,
-        memory: Tensor,
-    ) -> Tensor:
+    def _from_objects(self, present: Tensor, extents: _Extents, now: Memory) -> Tensor:
         """Messages (B, O, D) of the other objects."""
-        count = points.shape[1]
-        offset = ((points[:, None] - points[:, :, None]) * _SCALE).clamp(-6, 6)
-        own = torch.cat([shape, memory], dim=-1)[:, :, None].expand(-1, -1, count, -1)
+        count = now.points.shape[1]
+        offset = now.points[:, None] - now.points[:, :, None]  # of the second from the first
+        own = torch.cat([extents.shape, now.hidden], dim=-1)
         other = torch.cat(
-            [velocity[..., :3] * _SCALE, velocity[..., 3:], rotations[..., :2].flatten(-2), shape],
+            [
+                now.velocity[..., :3] * _SCALE,
+                now.velocity[..., 3:],
+                now.rotations[..., :2].flatten(-2),
+                extents.shape,
+            ],
             dim=-1,
         )
-        other = other[:, None].expand(-1, count, -1, -1)
-        edge = self.object_edge(torch.cat([offset, other, own], dim=-1))
-        pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=points.device)
+        inputs = [
+            (offset * _SCALE).clamp(-6, 6),
+            other[:, None].expand(-1, count, -1, -1),
+            _object_clearances(offset, extents, now),
+            own[:, :, None].expand(-1, -1, count, -1),
+        ]
+        edge = self.object_edge(torch.cat(inputs, dim=-1))
+        pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=offset.device)
         return (edge * pairs[..., None]).sum(2)
+
+
+def _near(clearance: Tensor) -> Tensor:
+    return (clearance * _NEAR).clamp(-3, 3)
+
+
+def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory) -> Tensor:
+    """(B, O, A, 7) of tools (B, A, 4, 4) with fingers `gaps` (B, A) away.
+
+    By how much the object reaches past the inside of either finger, and how far it is from the
+    fingers' outside; how far it is from them across their travel; how much wider it is than the
+    fingers are apart; how far tips are above its top and above its bottom.
+    """
+    x, y, _ = _local(tools, now.points).unbind(-1)
+    frame = tools[:, None, :, :2, :2].expand(-1, now.points.shape[1], -1, -1, -1)
+    directions = F.normalize(frame, dim=-2, eps=1e-4)  # of the tool's x and y in the plane
+    across = extents.half_width(directions[..., 0], now.rotations)
+    along = extents.half_width(directions[..., 1], now.rotations)
+    gap = gaps[:, None]
+    above = tools[:, None, :, 2, 3] - now.points[..., None, 2]
+    rows = [
+        y + along - gap,
+        -y + along - gap,
+        y.abs() - along - gap,
+        x.abs() - across,
+        along - gap,
+        above - extents.high[..., None],
+        above - extents.low[..., None],
+    ]
+    return _near(torch.stack(rows, -1))
+
+
+def _object_clearances(offset: Tensor, extents: _Extents, now: Memory) -> Tensor:
+    """(B, O, O, 3) of the second object from the first: in the plane, above it, below it."""
+    plane = offset[..., :2]
+    distance = plane.norm(dim=-1)
+    direction = plane / distance.clamp(min=1e-4)[..., None]
+    half = extents.half_width(direction, now.rotations)
+    half = half + half.transpose(1, 2)  # the width is the same to either side
+    bottom, top = now.points[..., 2] + extents.low, now.points[..., 2] + extents.high
+    rows = [
+        distance - half,
+        bottom[:, None] - top[:, :, None],
+        bottom[:, :, None] - top[:, None],
+    ]
+    return _near(torch.stack(rows, -1))
 
 
 def _local(tools: Tensor, points: Tensor) -> Tensor:

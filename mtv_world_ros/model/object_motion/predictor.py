@@ -27,6 +27,14 @@ from mtv_world_ros.model.object_motion.network import (
     STEP_S,
 )
 
+#: standard deviations of where masks have an object, and of how large (relative)
+_PLACE_ERROR_M, _SIZE_ERROR = 0.003, 0.04
+#: objects with disturbances of their own
+_MAX_OBJECTS = 16
+#: least height of an object's centre over the table [m]
+_LEAST_HEIGHT_M = 0.004
+#: travel of a finger where the robot's file does not say it [m]
+_TRAVEL_M = 0.04
 _CONFIG, _WEIGHTS = 'config.json', 'model.safetensors'
 
 
@@ -36,10 +44,23 @@ class ObjectMotionPredictor:
     Args:
         network: trained.
         robot: gives tools and grippers.
+        num_disturbed: motions beside the expected one, from places and sizes within the error of
+            what masks tell.
     """
 
-    def __init__(self, network: ObjectMotionNetwork, robot: RobotModel) -> None:
+    def __init__(
+        self, network: ObjectMotionNetwork, robot: RobotModel, num_disturbed: int = 12
+    ) -> None:
         self.network, self.robot = network.eval(), robot
+        rng = np.random.default_rng(0)
+        self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
+        self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
+        self._places[0], self._scales[0] = 0.0, 1.0
+
+    def disturbed(self, points: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Returns (K, O, 3) places and (K, O, V, F) features; row 0 as they are."""
+        item = np.arange(len(points)) % _MAX_OBJECTS
+        return points + self._places[:, item], features * self._scales[:, item]
 
     def find(
         self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
@@ -66,7 +87,7 @@ class TrackedObjects:
         features: (O, V, F) of `object_shapes`.
         memory: of the network; None = nothing has moved yet.
         tools: (A, 4, 4) T_base_tool one step before.
-        openings: (A,) one step before.
+        gaps: (A,) one step before [m].
     """
 
     model: ObjectMotionPredictor
@@ -74,47 +95,68 @@ class TrackedObjects:
     features: FloatArray
     memory: Memory | None = None
     tools: FloatArray | None = None
-    openings: FloatArray | None = None
+    gaps: FloatArray | None = None
 
     @property
     def step_s(self) -> float:
         """Time between the joint positions that `advance` takes [s]."""
         return STEP_S
 
-    def advance(self, positions: FloatArray) -> tuple[ObjectMotion, TrackedObjects]:
+    @property
+    def sizes(self) -> FloatArray:
+        """(O, 3) extents: the mean of the least widths, and twice the height of the centre [m]."""
+        widths = self.features[..., :4]
+        least = np.where((widths > 0).any(-1, keepdims=True), widths, np.inf).min(1).mean(-1)
+        height = 2 * np.maximum(self.reference[:, 2], _LEAST_HEIGHT_M)
+        return np.stack([least, least, height], axis=-1)
+
+    def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
 
-        Row 0 is where they are now.
+        The first motion is the expected one, the others are of disturbed places and sizes. Row 0
+        is where they are now.
         """
         robot = self.model.robot
         tools = robot.tool_poses(positions).transpose(1, 0, 2, 3)
-        openings = robot.gripper_openings(positions).T
+        gaps = finger_gaps(robot, positions)
         before = tools[0] if self.tools is None else self.tools
-        opened = openings[0] if self.openings is None else self.openings
+        apart = gaps[0] if self.gaps is None else self.gaps
         tools = np.concatenate([before[None], tools])
-        openings = np.concatenate([opened[None], openings])
+        gaps = np.concatenate([apart[None], gaps])
         known = np.asarray(np.isfinite(self.reference).all(-1))
+        places, features = self.model.disturbed(
+            np.where(known[:, None], self.reference, 0.0), self.features
+        )
+        count = len(places)
         scene = Scene(
-            points=_tensor(np.where(known[:, None], self.reference, 0.0)),
-            features=_tensor(self.features),
-            present=torch.from_numpy(known)[None],
-            tools=_tensor(tools),
-            openings=_tensor(openings),
+            points=_tensor(places),
+            features=_tensor(features),
+            present=torch.from_numpy(known).expand(count, -1),
+            tools=_tensor(tools).expand(count, -1, -1, -1, -1),
+            gaps=_tensor(gaps).expand(count, -1, -1),
         )
         with torch.inference_mode():
             motion, memory = self.model.network.roll(scene, self.memory, skip=1)
-        points = motion.points[0].double().numpy()
-        points[:, ~known] = np.nan
-        moved = ObjectMotion(
-            reference=self.reference,
-            points=points,
-            rotations=motion.rotations[0].double().numpy(),
+        ways = motion.points.double().numpy() - places[:, None]
+        points = np.where(known[:, None], self.reference + ways, np.nan)
+        rotations = motion.rotations.double().numpy()
+        moved = tuple(
+            ObjectMotion(reference=self.reference, points=points[k], rotations=rotations[k])
+            for k in range(count)
         )
-        return moved, replace(self, memory=memory, tools=tools[-2], openings=openings[-2])
+        return moved, replace(self, memory=memory, tools=tools[-2], gaps=gaps[-2])
+
+
+def finger_gaps(robot: RobotModel, positions: FloatArray) -> FloatArray:
+    """Returns (T, A) how far each finger is from its tool at positions (T, J) [m]."""
+    travels = [
+        _TRAVEL_M if tool.finger_travel_m is None else tool.finger_travel_m for tool in robot.tools
+    ]
+    return robot.gripper_openings(positions).T * np.array(travels)
 
 
 def _tensor(values: FloatArray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))[None]
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
 def save_network(network: ObjectMotionNetwork, folder: Path) -> None:

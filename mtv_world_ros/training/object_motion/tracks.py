@@ -22,16 +22,17 @@ from mtv_world_ros.geometry.object_shape import object_shapes
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.network import STEP_S
+from mtv_world_ros.model.object_motion.predictor import finger_gaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectTracks:
-    """One episode at the network's steps; row 0 is the first frame.
+    """An episode, or the rest of one, at the network's steps; row 0 is the frame it begins with.
 
     Attributes:
         features: (O, V, F) of `object_shapes`.
         tools: (T + 1, A, 4, 4) T_base_tool as commanded.
-        openings: (T + 1, A) as commanded.
+        gaps: (T + 1, A) from a tool to its fingers, as commanded [m].
         points: (T + 1, O, 3) [m], from where the first frame's masks have the objects.
         rotations: (T + 1, O, 3, 3) from the start.
         known: (T + 1, O) bool.
@@ -40,17 +41,25 @@ class ObjectTracks:
 
     features: FloatArray
     tools: FloatArray
-    openings: FloatArray
+    gaps: FloatArray
     points: FloatArray
     rotations: FloatArray
     known: BoolArray
     turns_known: bool
 
 
-def object_tracks(path: Path, robot: RobotModel, views: Sequence[str]) -> ObjectTracks:
-    """Reads an episode.
+def object_tracks(
+    path: Path, robot: RobotModel, views: Sequence[str], num_starts: int = 1
+) -> list[ObjectTracks]:
+    """Reads an episode: from its first frame on, and from later ones that have masks.
 
     Where the objects are is taken from its `/object_poses`, or else from its masks.
+
+    Args:
+        path: of the episode.
+        robot: whose commands it has.
+        views: whose masks are used.
+        num_starts: frames to begin with at most, spread evenly over those that have masks.
 
     Raises:
         EpisodeError: it lacks masks in the first frame, joint states or commands, or no object is
@@ -61,64 +70,105 @@ def object_tracks(path: Path, robot: RobotModel, views: Sequence[str]) -> Object
     if episode.masks is None or states is None or not episode.trajectories:
         raise EpisodeError(f"'{path}' has no object masks, joint states or commands")
     masks = {view: episode.masks[view] for view in views}
-    origin = int(masks[views[0]].stamps_ns[0])
+    stamps = masks[views[0]].stamps_ns
     matched = [(stamp, match_joints(t, robot, None)) for stamp, t in episode.trajectories]
     columns = [states.joint_names.index(name) for name in robot.joint_names]
-    commands = stitch(matched, origin)
-    count = int(_last_ns(episode, masks, origin) / 1e9 / STEP_S + 1e-6)
+    commands = stitch(matched, int(stamps[0]))
+    count = int(_last_ns(episode, masks) / 1e9 / STEP_S + 1e-6)
     times = np.arange(count + 1, dtype=np.float64) * STEP_S
     positions = resample(commands, states.positions[0][columns], times)
     cameras = [episode.cameras[view] for view in views]
-    poses = np.stack([camera_poses(camera, robot, positions) for camera in cameras])
-    first = _ids_to_masks([masks[view].frames[0] for view in views], len(episode.info.objects))
-    start = locate_all(cameras, list(poses[:, 0]), centroids(first))
-    if not np.isfinite(start).any():
-        raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
-    points, rotations, known = _moved(episode, masks, start, cameras, poses, origin + times * 1e9)
-    return ObjectTracks(
-        features=object_shapes(first, start, cameras, list(poses[:, 0])),
+    recording = _Recording(
+        episode=episode,
+        masks=masks,
+        cameras=cameras,
+        poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
         tools=robot.tool_poses(positions).transpose(1, 0, 2, 3),
-        openings=robot.gripper_openings(positions).T,
-        points=np.nan_to_num(points),
-        rotations=rotations,
-        known=known & np.isfinite(start).all(-1),
-        turns_known=episode.object_poses is not None,
+        gaps=finger_gaps(robot, positions),
+        stamps_ns=stamps[0] + times * 1e9,
     )
+    # the last second shows nothing new
+    frames = np.flatnonzero(stamps - stamps[0] < (count - 10) * STEP_S * 1e9)
+    chosen = np.linspace(0, len(frames), num_starts, endpoint=False).astype(int)
+    tracks = [recording.tracks_from(int(frame)) for frame in sorted({0, *chosen.tolist()})]
+    if not tracks[0].known[0].any():
+        raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
+    return [track for track in tracks if track.known[0].any()]
 
 
-def _last_ns(episode: Episode, masks: dict[str, Track], origin: int) -> float:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Recording:
+    """An episode on the network's clock.
+
+    Attributes:
+        episode: as read.
+        masks: of each view.
+        cameras: V.
+        poses: (V, T + 1, 4, 4) T_base_camera.
+        tools: see `ObjectTracks`.
+        gaps: see `ObjectTracks`.
+        stamps_ns: (T + 1,).
+    """
+
+    episode: Episode
+    masks: dict[str, Track]
+    cameras: Sequence[CameraModel]
+    poses: FloatArray
+    tools: FloatArray
+    gaps: FloatArray
+    stamps_ns: FloatArray
+
+    def tracks_from(self, frame: int) -> ObjectTracks:
+        """Returns what follows one frame of the masks."""
+        stamp = next(iter(self.masks.values())).stamps_ns[frame : frame + 1]
+        row = int(nearest_rows(self.stamps_ns, stamp)[0])
+        seen = self._masks_at(stamp)
+        start = locate_all(self.cameras, list(self.poses[:, row]), centroids(seen))
+        points, rotations, known = self._moved(start, row)
+        return ObjectTracks(
+            features=object_shapes(seen, start, self.cameras, list(self.poses[:, row])),
+            tools=self.tools[row:],
+            gaps=self.gaps[row:],
+            points=np.nan_to_num(points),
+            rotations=rotations,
+            known=known & np.isfinite(start).all(-1),
+            turns_known=self.episode.object_poses is not None,
+        )
+
+    def _moved(self, start: FloatArray, row: int) -> tuple[FloatArray, FloatArray, BoolArray]:
+        found, wanted_ns = self.episode.object_poses, self.stamps_ns[row:]
+        if found is not None:
+            T = found.T_base_object[nearest_rows(found.stamps_ns, wanted_ns)]
+            points = start + T[..., :3, 3] - T[0, :, :3, 3]
+            turns = T[..., :3, :3] @ np.swapaxes(T[0, :, :3, :3], -1, -2)
+            return points, turns, np.ones(points.shape[:2], bool)
+        points = np.stack(
+            [
+                locate_all(
+                    self.cameras,
+                    list(self.poses[:, row + step]),
+                    centroids(self._masks_at(wanted_ns[step : step + 1])),
+                )
+                for step in range(len(wanted_ns))
+            ]
+        )
+        known = np.asarray(np.isfinite(points).all(-1))
+        turns = np.broadcast_to(np.eye(3), (*points.shape[:2], 3, 3))
+        return np.where(known[..., None], points, start), np.array(turns), known
+
+    def _masks_at(self, stamp_ns: np.ndarray) -> BoolArray:
+        """(V, O, H, W) nearest to a stamp (1,)."""
+        ids = np.stack(
+            [
+                track.frames[int(nearest_rows(track.stamps_ns, stamp_ns)[0])]
+                for track in self.masks.values()
+            ]
+        )
+        numbers = range(1, len(self.episode.info.objects) + 1)
+        return np.stack([ids == number for number in numbers], axis=1)
+
+
+def _last_ns(episode: Episode, masks: dict[str, Track]) -> float:
     found = episode.object_poses
-    stamps = masks[next(iter(masks))].stamps_ns if found is None else found.stamps_ns
-    return float(stamps[-1] - origin)
-
-
-def _moved(
-    episode: Episode,
-    masks: dict[str, Track],
-    start: FloatArray,
-    cameras: Sequence[CameraModel],
-    poses: FloatArray,
-    wanted_ns: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    found, num = episode.object_poses, len(wanted_ns)
-    if found is not None:
-        rows = nearest_rows(found.stamps_ns, wanted_ns)
-        T = found.T_base_object[rows]
-        points = start + T[..., :3, 3] - found.T_base_object[0, :, :3, 3]
-        turns = T[..., :3, :3] @ np.swapaxes(found.T_base_object[0, :, :3, :3], -1, -2)
-        return points, turns, np.ones(points.shape[:2], bool)
-    points = np.full((num, *start.shape), np.nan)
-    for step in range(num):
-        frames = [
-            track.frames[int(nearest_rows(track.stamps_ns, wanted_ns[step : step + 1])[0])]
-            for track in masks.values()
-        ]
-        seen = _ids_to_masks(frames, len(start))
-        points[step] = locate_all(cameras, list(poses[:, step]), centroids(seen))
-    known = np.asarray(np.isfinite(points).all(-1))
-    turns = np.broadcast_to(np.eye(3), (num, len(start), 3, 3))
-    return np.where(known[..., None], points, start), np.array(turns), known
-
-
-def _ids_to_masks(ids: Sequence[np.ndarray], num_objects: int) -> BoolArray:
-    return np.stack([np.stack(ids) == number + 1 for number in range(num_objects)], axis=1)
+    shown = masks[next(iter(masks))].stamps_ns
+    return float((shown if found is None else found.stamps_ns)[-1] - shown[0])

@@ -46,7 +46,7 @@ def scene(num_objects: int, present: int) -> Scene:
         features=torch.where(known[:, None, None], 0.1 * random(1, num_objects, 2, 9), 0.0),
         present=known[None],
         tools=tools,
-        openings=random(1, STEPS + 1, 2),
+        gaps=random(1, STEPS + 1, 2),
     )
 
 
@@ -54,9 +54,9 @@ def test_two_calls_one_after_the_other_are_one_call(network):
     given = scene(3, 3)
     with torch.inference_mode():
         whole = network(given)
-        part = replace(given, tools=given.tools[:, :6], openings=given.openings[:, :6])
+        part = replace(given, tools=given.tools[:, :6], gaps=given.gaps[:, :6])
         first, memory = network.roll(part)
-        part = replace(given, tools=given.tools[:, 4:], openings=given.openings[:, 4:])
+        part = replace(given, tools=given.tools[:, 4:], gaps=given.gaps[:, 4:])
         second, _ = network.roll(part, memory, skip=1)
     torch.testing.assert_close(first.points, whole.points[:, :6])
     torch.testing.assert_close(second.points, whole.points[:, 5:])
@@ -99,9 +99,14 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network)
         reference=np.array([[0.1, 0.2, 0.02], [np.nan] * 3]),
         features=np.full((2, 2, 9), 0.04),
     )
-    whole, _ = tracked.advance(positions)
-    first, later = tracked.advance(positions[:5])
-    second, _ = later.advance(positions[4:])
+    (whole, *disturbed), _ = tracked.advance(positions)
+    (first, *_), later = tracked.advance(positions[:5])
+    (second, *_), _ = later.advance(positions[4:])
+    assert len(disturbed) > 5
+    for motion in disturbed:  # of other places, told from where the object was found
+        np.testing.assert_allclose(motion.points[0, 0], tracked.reference[0])
+        assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
+    np.testing.assert_allclose(tracked.sizes[0], [0.04, 0.04, 0.04])
     np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=1e-6)
     np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=1e-6)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()

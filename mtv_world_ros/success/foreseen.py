@@ -1,0 +1,97 @@
+"""How often a task succeeds among the motions that are foreseen: evidence before any picture.
+
+An object motion model foresees several motions of the same plan, from places and sizes within the
+error of the masks. Where some of them fail, a grasp is near its limits.
+
+K motions, N steps, O objects, A arms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.geometry.object_motion import FoundObjects
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.success.situation import CannotTell, TruePoses
+from mtv_world_ros.success.task import ever_and_final, TaskSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForeseenMotions:
+    """Motions since the objects were found.
+
+    Attributes:
+        names: of O objects.
+        points: (K, N, O, 3) [m], NaN where not known.
+        rotations: (K, N, O, 3, 3) from row 0.
+        sizes: (O, 3) extents [m].
+        openings: (A, N) of the grippers, 0 closed to 1 open.
+    """
+
+    names: tuple[str, ...]
+    points: FloatArray
+    rotations: FloatArray
+    sizes: FloatArray
+    openings: FloatArray
+
+    def succeeds(
+        self, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
+    ) -> FloatArray | None:
+        """Returns (K,) whether the task is done at the end of each; None = they do not tell.
+
+        Args:
+            task: what is asked.
+            bound: placeholder -> name of its object.
+            starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.
+        """
+        if not set(bound.values()) <= set(self.names):
+            return None
+        items = {role: self.names.index(name) for role, name in bound.items()}
+        if not np.isfinite(self.points[:, :, list(items.values())]).all():
+            return None
+        try:
+            return np.array([self._done(k, task, items, starts) for k in range(len(self.points))])
+        except CannotTell:
+            return None
+
+    def _done(
+        self, number: int, task: TaskSpec, items: Mapping[str, int], starts: FloatArray
+    ) -> bool:
+        points, turns = self.points[number], self.rotations[number]
+        first = np.where(np.isfinite(starts), starts, points[0])
+        points = np.concatenate([first[None], points])
+        turns = np.concatenate([turns[:1], turns])
+        openings = np.concatenate([self.openings[:, :1], self.openings], axis=1)
+        poses = TruePoses(
+            positions={role: points[:, item] for role, item in items.items()},
+            rotations={role: turns[:, item] for role, item in items.items()},
+            sizes={
+                role: tuple(map(float, task.sizes_m.get(role, self.sizes[item])))
+                for role, item in items.items()
+            },  # type: ignore[misc]
+            openings=openings,
+        )
+        return ever_and_final(task.holds(poses, openings))[1]
+
+
+def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> ForeseenMotions:
+    """Returns what was foreseen of objects, without the last chunk's steps after `num_steps`."""
+    assert objects.positions is not None
+    kept = slice(0, num_steps)
+    return ForeseenMotions(
+        names=objects.names,
+        points=np.stack([motion.points[kept] for motion in objects.motions]),
+        rotations=np.stack([motion.rotations[kept] for motion in objects.motions]),
+        sizes=objects.tracked.sizes,
+        openings=robot.gripper_openings(objects.positions[kept]),
+    )
+
+
+def foreseen_feature(succeeded: FloatArray | None) -> float:
+    """Returns the share of the motions that succeed, -1 (none) to 1 (all); NaN = not known."""
+    return nan if succeeded is None else float(2 * np.mean(succeeded) - 1)
