@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
+from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import load_network
 from mtv_world_ros.sim.collect.collect import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
@@ -103,3 +104,20 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
 def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
     with pytest.raises(TrainingError, match='no episode can be trained on'):
         read_tracks([tmp_path], robot, VIEWS)
+
+
+def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    stays = train._whole(track)
+    still = stays.points[:, :1].expand_as(stays.points)
+    carried = still + torch.linspace(0, 0.1, still.shape[1])[None, :, None, None]
+    turns = torch.eye(3).expand_as(stays.rotations)
+
+    def cost(imagined, real):
+        spread = torch.full(real.shape[:3], 0.01)
+        held = torch.zeros(*real.shape[:3], 2)
+        motion = Motion(points=imagined, rotations=turns, held=held, spread=spread)
+        return train._loss(motion, replace(stays, points=real, rotations=turns)).item()
+
+    assert cost(carried, still) == pytest.approx(cost(still, carried), rel=1e-5)
+    assert cost(carried, carried) < cost(still, carried)
