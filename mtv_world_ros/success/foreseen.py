@@ -67,13 +67,14 @@ class ForeseenMotions:
         points = np.concatenate([first[None], points])
         turns = np.concatenate([turns[:1], turns])
         openings = np.concatenate([self.openings[:, :1], self.openings], axis=1)
+        sizes = {
+            role: tuple(map(float, task.sizes_m.get(role) or self.sizes[item]))
+            for role, item in items.items()
+        }
         poses = TruePoses(
             positions={role: points[:, item] for role, item in items.items()},
             rotations={role: turns[:, item] for role, item in items.items()},
-            sizes={
-                role: tuple(map(float, task.sizes_m.get(role, self.sizes[item])))
-                for role, item in items.items()
-            },  # type: ignore[misc]
+            sizes=sizes,  # type: ignore[arg-type]
             openings=openings,
         )
         return ever_and_final(task.holds(poses, openings))[1]

@@ -128,11 +128,16 @@ def train_motion(
             losses.append(loss)
             bar.set_postfix(loss=f'{np.mean(losses[-50:]):.3f}')
             if len(losses) % _SAVE_EVERY == 0 or len(losses) == config.steps:
-                _save(averaged.module, folder, losses)
+                _save(_network_of(averaged), folder, losses)
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
-        _save(averaged.module, folder, losses)
-    return averaged.module.eval()
+        _save(_network_of(averaged), folder, losses)
+    return _network_of(averaged).eval()
+
+
+def _network_of(averaged: torch.optim.swa_utils.AveragedModel) -> ObjectMotionNetwork:
+    assert isinstance(averaged.module, ObjectMotionNetwork)
+    return averaged.module
 
 
 def _losses(
