@@ -203,11 +203,6 @@ def test_help_starts_without_torch_and_diffusers():
     assert shown.stdout.strip() == '[]'
 
 
-def test_node_is_thin():
-    node = ROOT / 'mtv_world_ros' / 'ros' / 'world_model' / 'node.py'
-    assert len(node.read_text().splitlines()) <= 200
-
-
 def test_imports_are_declared(setup_arguments, manifest):
     extras = [name for names in setup_arguments['extras_require'].values() for name in names]
     requirements = setup_arguments['install_requires'] + extras
