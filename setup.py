@@ -71,6 +71,8 @@ setup(
         'evaluate': ['matplotlib>=3.6', 'scipy>=1.11', 'torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
+        # `mtv-world view`: the Rerun viewer, native and for browsers.
+        'view': ['rerun-sdk>=0.30'],
         # LeRobot datasets are read with it (mtv-world import-dataset).
         'import': ['pyarrow>=17'],
         # Clients of policy servers: LeRobot's (grpcio), openpi's.

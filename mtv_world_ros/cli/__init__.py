@@ -25,6 +25,7 @@ from mtv_world_ros.cli import (
     robot,
     train,
     train_motion,
+    view,
 )
 from mtv_world_ros.errors import MtvWorldError, nearest, TrainingInterrupted
 
@@ -40,6 +41,7 @@ COMMANDS = (
     rank,
     calibrate,
     report,
+    view,
     robot,
     doctor,
     recover,

@@ -63,7 +63,11 @@ def _replay(arguments: argparse.Namespace) -> int:
         num_inference_steps=arguments.steps,
         overwrite=arguments.overwrite,
     )
+    from mtv_world_ros.viewing.sheets import write_pictures
+
+    pictures = write_pictures([arguments.episode, out], out)
     print(summary)
+    print(f'written: {" ".join(map(str, pictures))}')
     return 0
 
 

@@ -1,0 +1,1 @@
+"""Recordings, predictions and evaluations as pictures: a viewer, contact sheets, videos."""

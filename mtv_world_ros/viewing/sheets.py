@@ -1,0 +1,89 @@
+"""Contact sheet and video of what bags show: real, drawn and imagined frames side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.evaluation.video import (
+    Comparison,
+    contact_sheet,
+    KINDS,
+    side_by_side,
+    write_png,
+    write_video,
+)
+from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.viewing.streams import read_streams, Streams
+
+SHEET, VIDEO = 'contact_sheet.png', 'comparison.mp4'
+#: where a kind of frame is not there
+_BLANK = 225
+#: frames that may stand for a moment, in imagined frame periods around it
+_REACH = 0.6
+
+
+def write_pictures(bags: Sequence[Path], out: Path, title: str = '') -> list[Path]:
+    """Writes `contact_sheet.png` and `comparison.mp4` of predictions; returns their paths.
+
+    Args:
+        bags: predictions, and the episode that they are of, if it is at hand.
+        out: folder of the pictures.
+        title: heading; empty = the first instruction.
+
+    Raises:
+        EpisodeError: nothing was imagined.
+    """
+    streams = read_streams(bags)
+    comparison = compared(streams)
+    told = [text for _, text in streams.words if text.startswith('instruction: ')]
+    estimates = ', '.join(
+        'abstains' if np.isnan(value) else f'{value:.2f}' for _, value in streams.success
+    )
+    notes = [f'success estimates: {estimates}'] if estimates else []
+    heading = title or (told[0] if told else '')
+    write_png(out / SHEET, contact_sheet(comparison, title=heading, notes=notes))
+    period = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 0.2
+    write_video(out / VIDEO, side_by_side(comparison), 1 / period)
+    return [out / SHEET, out / VIDEO]
+
+
+def compared(streams: Streams) -> Comparison:
+    """Returns the imagined frames beside those of the same times; grey where there are none.
+
+    Raises:
+        EpisodeError: nothing was imagined.
+    """
+    views = tuple(view for kind, view in streams.images if kind == 'imagined')
+    if not views:
+        raise EpisodeError('the recording holds no imagined frames')
+    stamps = np.unique([stamp for stamp, _ in streams.images['imagined', views[0]]])
+    size = streams.images['imagined', views[0]][0][1].shape[:2]
+    reach = _REACH * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    frames = {
+        kind: np.stack([_at(streams, kind, view, stamps, size, reach) for view in views])
+        for kind in KINDS
+    }
+    return Comparison(views=views, times=(stamps - stamps[0]) * 1e-9, **frames)
+
+
+def _at(
+    streams: Streams, kind: str, view: str, stamps: np.ndarray, size: Sequence[int], reach: float
+) -> ByteArray:
+    """(T, H, W, 3) frames nearest to the stamps."""
+    blank = np.full((*size, 3), _BLANK, np.uint8)
+    found = streams.images.get((kind, view), [])
+    if not found:
+        return np.stack([blank] * len(stamps))
+    known = np.array([stamp for stamp, _ in found])
+    shown = []
+    for stamp in stamps:
+        index = int(np.abs(known - stamp).argmin())
+        near = abs(int(known[index]) - int(stamp)) <= reach
+        frame = resize_frames(found[index][1][None], size[1], size[0])[0] if near else blank
+        shown.append(frame)
+    return np.stack(shown)

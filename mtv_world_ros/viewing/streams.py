@@ -1,0 +1,123 @@
+"""What a bag shows: real, drawn and imagined frames by view and time, masks, joints, words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data.bag.images import compressed_to_ids, compressed_to_rgb, raw_to_rgb
+from mtv_world_ros.data.bag.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
+
+#: kinds of frames, in the order in which they are shown
+KINDS = ('real', 'trajectory', 'imagined')
+#: camera images of a view, or what the node publishes of it; also what imagination starts from
+_IMAGES = re.compile(
+    r'^/(?:.+/)?(?P<view>(?!(?:predicted|trajectory|mask)/)[^/]+)/'
+    r'(?:(?P<stream>predicted|trajectory|mask)/)?(?:image_raw(?:/compressed)?|mask/compressed)$'
+)
+_KINDS = {'predicted': 'imagined', 'trajectory': 'trajectory', 'mask': 'imagined', None: 'real'}
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """What a bag, or several of the same time, show; each list is ordered by stamps [ns].
+
+    Attributes:
+        images: (kind, view) -> stamp and (H, W, 3) uint8 RGB.
+        masks: (kind, view) -> stamp and (H, W) uint8 object numbers, 0 = none.
+        joints: kind (`real`, `imagined`), stamp, names and positions [rad or m].
+        success: stamp and probability; NaN = abstains.
+        words: stamp and text: instructions, reports with the reasons of estimates.
+    """
+
+    images: dict[tuple[str, str], list[tuple[int, ByteArray]]] = field(default_factory=dict)
+    masks: dict[tuple[str, str], list[tuple[int, ByteArray]]] = field(default_factory=dict)
+    joints: list[tuple[str, int, tuple[str, ...], np.ndarray]] = field(default_factory=list)
+    success: list[tuple[int, float]] = field(default_factory=list)
+    words: list[tuple[int, str]] = field(default_factory=list)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views, in the order of the recording."""
+        return tuple(dict.fromkeys(view for _, view in self.images))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of frames that there are."""
+        return tuple(kind for kind in KINDS if any(kind == found for found, _ in self.images))
+
+
+def read_streams(bags: Sequence[Path]) -> Streams:
+    """Reads episodes and predictions; those of one time belong together.
+
+    Raises:
+        EpisodeError: one cannot be read, or none holds an image.
+    """
+    streams = Streams()
+    for bag in bags:
+        for message in BagReader(bag).messages():
+            try:
+                _take(streams, message)
+            except MtvWorldError as error:
+                raise EpisodeError(f"'{bag}', topic {message.topic}: {error}") from error
+    if not streams.images:
+        raise EpisodeError(
+            f"'{', '.join(map(str, bags))}' holds no images of cameras or of a node"
+        )
+    for found in (*streams.images.values(), *streams.masks.values()):
+        found.sort(key=lambda item: item[0])
+    streams.joints.sort(key=lambda item: item[1])
+    for rows in (streams.success, streams.words):
+        rows.sort(key=lambda item: item[0])
+    return streams
+
+
+def _take(streams: Streams, message: BagMessage) -> None:
+    if match := _IMAGES.match(message.topic):
+        _take_image(streams, message, match)
+    elif message.topic.endswith('/success') and message.msgtype == 'std_msgs/msg/Float64':
+        value = float(deserialize(message.msgtype, message.data).data)
+        streams.success.append((message.stamp_ns, value))
+    elif message.topic.endswith('/report'):
+        report = deserialize(message.msgtype, message.data)
+        texts = [f'{one.message} {_reasons(one)}'.strip() for one in report.status]
+        streams.words.extend((message.stamp_ns, text) for text in texts)
+    elif message.topic == '/instruction':
+        text = deserialize(message.msgtype, message.data).data
+        streams.words.append((message.stamp_ns, f'instruction: {text}'))
+    elif message.msgtype == 'sensor_msgs/msg/JointState':
+        state = deserialize(message.msgtype, message.data)
+        row = np.asarray(state.position, np.float64)
+        kind = 'imagined' if message.topic.endswith('/predicted/joint_states') else 'real'
+        streams.joints.append((kind, header_stamp(state), tuple(state.name), row))
+
+
+def _reasons(status: Any) -> str:
+    values: Mapping[str, str] = {pair.key: pair.value for pair in status.values}
+    shown = ('success', 'success_reasons', 'state')
+    return ' · '.join(f'{key}: {values[key]}' for key in shown if values.get(key))
+
+
+def _take_image(streams: Streams, message: BagMessage, match: re.Match[str]) -> None:
+    image = deserialize(message.msgtype, message.data)
+    key = (_KINDS[match['stream']], match['view'])
+    is_mask = match['stream'] == 'mask' or '/mask/' in message.topic
+    data = np.asarray(image.data, np.uint8)
+    if message.msgtype.endswith('CompressedImage'):
+        read = compressed_to_ids if is_mask else compressed_to_rgb
+        frame = read(image.format, data)
+    elif is_mask:
+        frame = data.reshape(image.height, image.step)[:, : image.width]
+    else:
+        size = {'height': image.height, 'width': image.width, 'step': image.step}
+        frame = raw_to_rgb(data, encoding=image.encoding, **size)
+    held = streams.masks if is_mask else streams.images
+    held.setdefault(key, []).append((header_stamp(image), frame))

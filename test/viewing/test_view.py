@@ -1,0 +1,143 @@
+"""`mtv-world view`: what bags and evaluations show, in a file of the viewer and in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import socket
+import urllib.request
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.viewing.streams import read_streams
+
+EPISODE = share_path('resource', 'demo_episode')
+START_NS = 1_700_000_000_000_000_000
+
+
+def write_predictions(path: Path) -> Path:
+    """A bag under the node's topics, of the episode's time."""
+    frame = np.full((72, 96, 3), 90, np.uint8)
+    labels = np.zeros((72, 96), np.uint8)
+    labels[10:20, 30:50] = 2
+    with BagWriter(path) as writer:
+        for k in range(3):
+            stamp = START_NS + k * 200_000_000
+            header = messages.make_header(stamp, 'low')
+            for stream in ('predicted', 'trajectory'):
+                image = messages.make(
+                    messages.COMPRESSED_IMAGE,
+                    header=header,
+                    format='rgb8; jpeg compressed bgr8',
+                    data=np.frombuffer(messages.encode_jpeg(frame, 90), np.uint8),
+                )
+                topic = f'/world_model/low/{stream}/image_raw/compressed'
+                data = messages.serialize(messages.COMPRESSED_IMAGE, image)
+                writer.write_raw(topic, messages.COMPRESSED_IMAGE, stamp, data)
+            mask = messages.make(
+                messages.IMAGE,
+                header=header,
+                height=72,
+                width=96,
+                encoding='mono8',
+                is_bigendian=0,
+                step=96,
+                data=labels.ravel(),
+            )
+            data = messages.serialize(messages.IMAGE, mask)
+            writer.write_raw('/world_model/low/mask/image_raw', messages.IMAGE, stamp, data)
+        value = messages.make('std_msgs/msg/Float64', data=0.75)
+        data = messages.serialize('std_msgs/msg/Float64', value)
+        writer.write_raw('/world_model/success', 'std_msgs/msg/Float64', stamp, data)
+    return path
+
+
+def test_an_episode_and_its_predictions_are_of_one_time(tmp_path: Path) -> None:
+    streams = read_streams([EPISODE, write_predictions(tmp_path / 'predictions')])
+    assert streams.views == ('low', 'high')
+    assert streams.kinds == ('real', 'trajectory', 'imagined')
+    assert len(streams.images['real', 'high']) == len(streams.masks['real', 'low']) == 71
+    assert [s for s, _ in streams.images['imagined', 'low']] == [
+        START_NS + k * 200_000_000 for k in range(3)
+    ]
+    assert streams.images['imagined', 'low'][0][1].shape == (72, 96, 3)
+    assert set(np.unique(streams.masks['imagined', 'low'][0][1])) == {0, 2}
+    assert [value for _, value in streams.success] == [0.75]
+    assert any(text.startswith('instruction: ') for _, text in streams.words)
+    assert {kind for kind, *_ in streams.joints} == {'real'}
+
+
+def test_a_bag_without_images_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        value = messages.serialize(
+            'std_msgs/msg/Float64', messages.make('std_msgs/msg/Float64', data=1.0)
+        )
+        writer.write_raw('/success', 'std_msgs/msg/Float64', 1, value)
+    with pytest.raises(EpisodeError, match='holds no images'):
+        read_streams([tmp_path / 'bag'])
+
+
+def test_the_command_writes_a_file_for_the_viewer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rerun = pytest.importorskip('rerun')
+    del rerun
+    predictions = write_predictions(tmp_path / 'predictions')
+    file = tmp_path / 'out' / 'view.rrd'
+    words = ['view', str(predictions), '--save', str(file)]
+    assert main(words) == 0
+    assert file.read_bytes()[:4] == b'RRF2' and file.stat().st_size > 3000
+    assert f'written: {file}' in capsys.readouterr().out
+    assert main(words) == 1
+    assert "view.rrd' exists; give another --save FILE" in capsys.readouterr().err
+
+
+def test_browsers_get_the_viewer_and_a_port_in_use_is_told(tmp_path: Path) -> None:
+    pytest.importorskip('rerun')
+    from mtv_world_ros.viewing import rerun_log
+
+    with socket.socket() as taken:
+        taken.bind(('127.0.0.1', 0))
+        port = taken.getsockname()[1]
+        taken.listen()
+        with pytest.raises(ConfigError, match=f'port {port} cannot be used .*another --port'):
+            rerun_log.serve(rerun_log.recording('a'), None, port)
+    streams = read_streams([write_predictions(tmp_path / 'predictions')])
+    stream = rerun_log.recording('b')
+    address = rerun_log.serve(stream, rerun_log.layout({'/bag': streams}), port)
+    rerun_log.log_streams(stream, streams, '/bag')
+    page = urllib.request.urlopen(address.partition('?')[0]).read()
+    assert b're_viewer' in page
+
+
+def test_without_the_extra_one_line_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__('sys').modules, 'rerun', None)
+    assert main(['view', str(EPISODE), '--save', str(tmp_path / 'x.rrd')]) == 1
+    assert "pip install 'mtv_world_ros[view]'" in capsys.readouterr().err
+    assert main(['view', 'nowhere']) == 1
+    assert "there is no 'nowhere'" in capsys.readouterr().err
+
+
+def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path: Path) -> None:
+    from mtv_world_ros.evaluation.video import decode_video
+    from mtv_world_ros.viewing.sheets import compared, write_pictures
+
+    predictions = write_predictions(tmp_path / 'predictions')
+    alone = compared(read_streams([predictions]))
+    assert alone.views == ('low',) and alone.times.tolist() == [0.0, 0.2, 0.4]
+    assert (alone.real == 225).all() and abs(alone.imagined.astype(int) - 90).max() < 4
+    both = compared(read_streams([EPISODE, predictions]))
+    assert both.real.shape == (1, 3, 72, 96, 3) and both.real.std() > 20
+    sheet, video = write_pictures([EPISODE, predictions], predictions)
+    assert sheet.stat().st_size > 5000 and len(decode_video(video.read_bytes())) == 3
+    # the bag can still be read with the pictures beside it
+    assert read_streams([predictions]).kinds == ('trajectory', 'imagined')
+    with pytest.raises(EpisodeError, match='no imagined frames'):
+        compared(read_streams([EPISODE]))
