@@ -100,8 +100,6 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
         view_frames=len(config.video.views) * config.video.num_frames,
     )
     parameters = sum(p.numel() for p in plain.transformer.parameters())
-    stock = _stock(plain)
-    plain.close()
     video = config.video
     chunk = _told(
         f'A chunk: {len(video.views)} views of 1 + {video.num_frames} frames, '
@@ -110,14 +108,9 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
         f'{work.flop / 1e12:.3f} TFLOP; a large {options.dtype} matrix product reaches '
         f'{matrix / 1e12:.2f} TFLOP/s here.'
     )
-    return '\n\n'.join(
-        [
-            chunk,
-            *_served(config, options, work, stock),
-            'All options, one after the other:',
-            _compared(config, options, work),
-        ]
-    )
+    served, compared = _served(config, options, work, plain), _compared(config, work, plain)
+    plain.close()
+    return '\n\n'.join([chunk, *served, 'All options, each in turns with plain:', compared])
 
 
 def _told(text: str) -> str:
@@ -129,12 +122,6 @@ def _told(text: str) -> str:
 def _reason(error: Exception) -> str:
     told = (str(error).splitlines() or [''])[0].replace('|', '/')
     return f'{type(error).__name__}: {told}'
-
-
-def _stock(bench: Bench) -> dict[int, float]:
-    """Seconds of diffusers' own pipeline by number of steps."""
-    pipeline = bench.stock()
-    return {n: seconds(bench, lambda n=n: pipeline(n)) for n in bench.options.steps}
 
 
 @dataclass(frozen=True)
@@ -152,23 +139,21 @@ class Work:
 
 
 def _served(
-    config: TrainingConfig, options: argparse.Namespace, work: Work, stock: dict[int, float]
+    config: TrainingConfig, options: argparse.Namespace, work: Work, plain: Bench
 ) -> list[str]:
-    """Stages and totals under `--serving`, beside the stock pipeline."""
+    """Stages and totals under `--serving`, in turns with the stock pipeline."""
     head = f'Served with `{options.serving}`:' if options.serving else 'Served plainly:'
     try:
         bench = Bench(config, options, ServingOptions.parse(options.serving))
         try:
-            return [_told(text) for text in (head, *_whole(bench, options, work, stock))]
+            return [_told(text) for text in (head, *_whole(bench, work, plain))]
         finally:
             bench.close()
     except Exception as error:  # the other options are measured nevertheless
         return [_told(f'{head} {_reason(error)}')]
 
 
-def _whole(
-    bench: Bench, options: argparse.Namespace, work: Work, stock: dict[int, float]
-) -> list[str]:
+def _whole(bench: Bench, work: Work, plain: Bench) -> list[str]:
     given = bench.encode()
     step = seconds(bench, lambda: bench.step(given))
     rows = [
@@ -176,13 +161,13 @@ def _whole(
         ['one step of the transformer', _ms(step)],
         ['decode', _ms(seconds(bench, lambda: bench.decode(given.control)))],
     ]
-    totals = []
-    for steps, theirs in stock.items():
-        ours = seconds(bench, lambda n=steps: bench.chunk(n))
+    memory = _memory(bench.device)
+    stock, totals = plain.stock(), []
+    for steps in bench.options.steps:
+        ours, theirs = in_turns(bench, lambda n=steps: bench.chunk(n), lambda n=steps: stock(n))
         rate = f'{work.view_frames / ours:.1f}'
         totals.append([str(steps), _ms(ours), rate, _ms(theirs), f'{theirs / ours:.2f}'])
     header = ['steps', 'chunk [ms]', 'view-frames/s', 'stock pipeline [ms]', 'ratio']
-    memory = _memory(bench.device)
     return [
         table(['stage', 'median [ms]'], rows),
         f'The transformer: {work.share(step)} of that. Most memory held: {memory}.',
@@ -190,30 +175,29 @@ def _whole(
     ]
 
 
-def _compared(config: TrainingConfig, options: argparse.Namespace, work: Work) -> str:
-    rows = []
+def _compared(config: TrainingConfig, work: Work, plain: Bench) -> str:
+    options, rows = plain.options, []
     for text in ['', *options.compare]:
         try:
-            rows.append([text or 'plain', *_row(config, options, work, text)])
+            rows.append([text or 'plain', *_row(config, work, plain, text)])
         except Exception as error:  # one that does not run must not cost the others' numbers
-            rows.append([text or 'plain', *['-'] * 5, _reason(error)])
+            rows.append([text or 'plain', *['-'] * 6, _reason(error)])
         _told(' | '.join(rows[-1]))
-    header = ['serving', 'step [ms]', 'of the matrix rate', 'decode [ms]']
+    header = ['serving', 'step [ms]', 'plain / this', 'of the matrix rate', 'decode [ms]']
     header += [f'chunk, {options.steps[0]} steps [ms]', 'view-frames/s', 'memory held']
     return table(header, rows)
 
 
-def _row(
-    config: TrainingConfig, options: argparse.Namespace, work: Work, serving: str
-) -> list[str]:
+def _row(config: TrainingConfig, work: Work, plain: Bench, serving: str) -> list[str]:
+    options, theirs = plain.options, plain.encode()
     bench = Bench(config, options, ServingOptions.parse(serving))
     try:
         given = bench.encode()
-        step = seconds(bench, lambda: bench.step(given))
+        step, usual = in_turns(bench, lambda: bench.step(given), lambda: plain.step(theirs))
         decode = seconds(bench, lambda: bench.decode(given.control))
         chunk = seconds(bench, lambda: bench.chunk(options.steps[0]))
         rate = f'{work.view_frames / chunk:.1f}'
-        times = [_ms(step), work.share(step), _ms(decode), _ms(chunk), rate]
+        times = [_ms(step), f'{usual / step:.2f}', work.share(step), _ms(decode), _ms(chunk), rate]
         return [*times, _memory(bench.device)]
     finally:
         bench.close()
@@ -233,14 +217,23 @@ def matrix_rate(bench: Bench) -> float:
 
 def seconds(bench: Bench, work: Callable[[], object]) -> float:
     """Median time of a piece of work, after one run to warm up."""
-    spent = []
+    return in_turns(bench, work)[0]
+
+
+def in_turns(bench: Bench, *works: Callable[[], object]) -> list[float]:
+    """Median times of pieces of work that take turns, after one run of each to warm up.
+
+    Whatever else slows the machine, heat included, slows all of them alike.
+    """
+    spent: list[list[float]] = [[] for _ in works]
     for _ in range(1 + bench.options.repeats):
-        _wait(bench.device)
-        begun = time.perf_counter()
-        work()
-        _wait(bench.device)
-        spent.append(time.perf_counter() - begun)
-    return statistics.median(spent[1:])
+        for work, times in zip(works, spent, strict=True):
+            _wait(bench.device)
+            begun = time.perf_counter()
+            work()
+            _wait(bench.device)
+            times.append(time.perf_counter() - begun)
+    return [statistics.median(times[1:]) for times in spent]
 
 
 def _wait(device: torch.device) -> None:
