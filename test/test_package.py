@@ -28,6 +28,7 @@ DISTRIBUTIONS = {
     'markupsafe': 'Jinja2',  # which requires it
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',
+    'rerun': 'rerun-sdk',
     'pydantic_core': 'pydantic',  # which requires it
     'yaml': 'PyYAML',
 }
