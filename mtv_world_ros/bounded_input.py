@@ -33,6 +33,7 @@ class Limits:
     Attributes:
         yaml_bytes: of a YAML text.
         yaml_nodes: values in it, once aliases and merges are written out.
+        urdf_bytes: of a robot's URDF.
         nesting: levels of lists and maps, in YAML, JSON and answers of policy servers.
         json_bytes: of a JSON file; tokenizers have tens of megabytes.
         image_bytes: of an image file in a message.
@@ -48,6 +49,7 @@ class Limits:
 
     yaml_bytes: int = 4 * 2**20
     yaml_nodes: int = 200_000
+    urdf_bytes: int = 16 * 2**20
     nesting: int = 64
     json_bytes: int = 256 * 2**20
     image_bytes: int = 64 * 2**20

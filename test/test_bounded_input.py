@@ -113,6 +113,17 @@ def test_pipes_devices_and_folders_are_no_files(tmp_path) -> None:
         load_calibration(tmp_path / 'pipe.yaml')
 
 
+def test_a_urdf_that_cannot_be_opened_is_a_clear_error(tmp_path) -> None:
+    """Found by the fuzz: `Path.is_file` raises for a name that is too long."""
+    robot = bundled('robots', 'yam_bimanual', 'robot_file').read_text()
+    values = yaml.safe_load(robot)
+    os.mkfifo(tmp_path / 'pipe.urdf')
+    for name in ('9' * 5000, 'pipe.urdf', 'missing.urdf'):
+        (tmp_path / 'robot.yaml').write_text(yaml.safe_dump(values | {'urdf': name}))
+        with pytest.raises(ConfigError, match='URDF file'):
+            load_robot(tmp_path / 'robot.yaml')
+
+
 def test_json_is_bounded(tmp_path, monkeypatch) -> None:
     file = tmp_path / 'deep.json'
     file.write_text('[' * 1_000_000)

@@ -12,6 +12,7 @@ import pinocchio as pin
 from pydantic import Field, model_validator
 import yaml
 
+from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
@@ -215,10 +216,16 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
         ConfigError: there is no such file.
         RobotError: it is not a URDF that can be used.
     """
-    if not path.is_file():
-        raise ConfigError(f"URDF file '{path}' does not exist; 'urdf' is relative to the YAML")
     try:
-        root = ElementTree.fromstring(path.read_text(encoding='utf-8'))
+        text = read_text(path, 'urdf_bytes')
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"URDF file '{path}' does not exist; 'urdf' is relative to the YAML"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"URDF file '{path}' cannot be read: {error}") from error
+    try:
+        root = ElementTree.fromstring(text)
         # Pinocchio must see mimic joints as ordinary ones: RobotModel moves them itself.
         mimics = [mimic for joint in root.iter('joint') for mimic in _take_mimics(joint)]
         model = pin.buildModelFromXML(ElementTree.tostring(root, encoding='unicode'))
