@@ -9,6 +9,7 @@ import sys
 
 from mtv_world_ros.cli import (
     calibrate,
+    calibrate_camera,
     collect,
     demo,
     distill,
@@ -44,6 +45,7 @@ COMMANDS = (
     view,
     robot,
     doctor,
+    calibrate_camera,
     recover,
     import_bag,
     import_dataset,

@@ -213,7 +213,8 @@ class Inspector:
         distance = float(np.hypot(x, y))
         text = (
             f'the robot is drawn {distance:.1f} px beside the moving pixels (they are at '
-            f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset'
+            f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset (`mtv-world '
+            'calibrate-camera` estimates the pose)'
         )
         border = max(abs(x), abs(y)) >= self._config.residual.reach * camera.width - 1
         if border or distance > self._broken * camera.width:

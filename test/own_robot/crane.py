@@ -114,13 +114,15 @@ def make_cameras() -> dict[str, CameraModel]:
     }
 
 
-def make_positions(seconds: float = 8.0, seed: int = 0, fps: float = FPS) -> FloatArray:
+def make_positions(
+    seconds: float = 8.0, seed: int = 0, fps: float = FPS, speed: float = 1.0
+) -> FloatArray:
     """(T, 6) smooth motion of all joints within their limits."""
     generator = np.random.default_rng(seed)
     t = np.arange(round(seconds * fps)) / fps
     middle = np.array([0.2, 0.3, 1.1, 0.0, 0.6, 0.02])
     reach = np.array([0.9, 0.45, 0.6, 0.8, 0.5, 0.018])
-    rate = generator.uniform(0.9, 1.6, 6)
+    rate = speed * generator.uniform(0.9, 1.6, 6)
     start = generator.uniform(0, 2 * np.pi, 6)
     return middle + reach * np.sin(rate * t[:, None] + start)
 
@@ -148,13 +150,14 @@ def render(robot: RobotModel, camera: CameraModel, positions: FloatArray) -> Byt
 
 
 def _background(camera: CameraModel, T_base_camera: FloatArray) -> ByteArray:
-    """A floor and a wall of coloured tiles, seen by rays."""
+    """A room of coloured tiles, seen by rays."""
     rows, columns = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.K).T
     rays = rays @ T_base_camera[:3, :3].T
-    with np.errstate(divide='ignore', invalid='ignore'):
-        down = -T_base_camera[2, 3] / rays[..., 2]
-    at = T_base_camera[:3, 3] + np.where((down > 0) & (down < 8), down, 8.0)[..., None] * rays
+    low, high = np.array([-2.5, -2.5, -0.01]), np.array([2.5, 2.5, 3.0])
+    with np.errstate(divide='ignore'):
+        ways = (np.where(rays > 0, high, low) - T_base_camera[:3, 3]) / rays
+    at = T_base_camera[:3, 3] + ways.min(axis=-1, keepdims=True) * rays
     tiles = np.floor((at + 0.013) / 0.17).astype(np.int64)
     code = (tiles[..., 0] * 73_856_093) ^ (tiles[..., 1] * 19_349_663) ^ (tiles[..., 2] * 83_492_7)
     return np.stack([90 + (code >> shift) % 100 for shift in (0, 3, 7)], -1).astype(np.uint8)

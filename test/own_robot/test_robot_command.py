@@ -30,7 +30,7 @@ def test_a_urdf_becomes_a_robot_file_with_a_picture(crane, tmp_path, capsys):
     assert guessed.base_link == written.base_link == 'plinth'
     assert np.abs(guessed.tools[0].T_link_tool - written.tools[0].T_link_tool).max() < 0.01
     image = cv2.imread(str(picture))
-    assert image.shape == (960, 960, 3)
+    assert image is not None and image.shape == (960, 960, 3)
     assert (image < 200).any(axis=-1).mean() > 0.02
     assert main(command) == 1  # nothing that exists is overwritten
     assert 'exists' in capsys.readouterr().err

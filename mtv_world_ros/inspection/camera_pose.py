@@ -1,0 +1,116 @@
+"""Estimated camera poses: how they are changed, compared, and how uncertain they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data.episode import Track
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.inspection.clocks import JointTrack
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraEstimate:
+    """An estimated pose.
+
+    Attributes:
+        camera: with the estimated pose, at the size of the recorded images.
+        std_mm: standard error of the camera's place [mm].
+        std_deg: standard error of its direction and roll [degrees].
+        fit: correlation of drawn and seen motion, up to 1.
+        num_pairs: of frames.
+    """
+
+    camera: CameraModel
+    std_mm: float
+    std_deg: float
+    fit: float
+    num_pairs: int
+
+
+def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
+    """Returns a pose (4, 4) turned about a point by (3,) [rad] and shifted by (3,) [m].
+
+    Turns and shifts are along the pose's own axes. Turned about what a camera looks at, its
+    picture hardly shifts, so that the parameters act on their own.
+    """
+    middle = T.copy()
+    middle[:3, 3] = centre
+    change = np.eye(4)
+    change[:3, :3] = cv2.Rodrigues(np.asarray(parameters[:3], float))[0]
+    change[:3, 3] = parameters[3:]
+    return middle @ change @ np.linalg.inv(middle) @ T
+
+
+def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:
+    """Returns the camera elsewhere."""
+    return replace(camera, T_mount_camera=T_mount_camera)
+
+
+def shrunk(camera: CameraModel, width: int) -> CameraModel:
+    """Returns the camera for images of at most a width."""
+    if camera.width <= width:
+        return camera
+    return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
+
+
+def grey(frame: ByteArray, camera: CameraModel) -> ByteArray:
+    """(H, W) uint8 at the camera's size."""
+    size = (camera.width, camera.height)
+    return np.asarray(
+        cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY),
+        np.uint8,
+    )
+
+
+def covered_frames(track: Track, joints: JointTrack) -> np.ndarray:
+    """Indices of the frames within the joint states.
+
+    Raises:
+        CalibrationError: there are fewer than ten.
+    """
+    indices = np.flatnonzero(joints.covers(track.stamps_ns))
+    if len(indices) < 10:
+        raise CalibrationError(
+            f'only {len(indices)} frames are within the joint states; at least 10 are needed'
+        )
+    return indices
+
+
+def jackknife(
+    estimate: Callable[[np.ndarray], FloatArray], num_items: int, num_groups: int = 5
+) -> tuple[float, float]:
+    """Returns standard errors [mm, degrees] of a pose by leaving out a group of items at a time.
+
+    Args:
+        estimate: the pose (4, 4) of some of the items, by their numbers.
+        num_items: that it was estimated from.
+        num_groups: groups of neighbouring items, left out in turn.
+    """
+    groups = np.array_split(np.arange(num_items), num_groups)
+    poses = [estimate(np.setdiff1d(np.arange(num_items), group)) for group in groups]
+    return spread(poses)
+
+
+def spread(poses: Sequence[FloatArray]) -> tuple[float, float]:
+    """Jackknife standard errors [mm, degrees] of poses that each left out one group."""
+    places = np.array([T[:3, 3] for T in poses])
+    turns = np.array([cv2.Rodrigues(poses[0][:3, :3].T @ T[:3, :3])[0].ravel() for T in poses])
+    factor = (len(poses) - 1) / len(poses)
+    return tuple(  # type: ignore[return-value]
+        float(np.sqrt(factor * ((rows - rows.mean(axis=0)) ** 2).sum())) * unit
+        for rows, unit in ((places, 1000.0), (turns, 180 / np.pi))
+    )
+
+
+def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Returns how far two poses are apart [mm, degrees]."""
+    turn = cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0]
+    apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    return 1000 * apart, float(np.degrees(np.linalg.norm(turn)))

@@ -1,0 +1,317 @@
+"""Pose of a camera that stands still, from how the robot moves through its pictures.
+
+Between two frames the picture changes where the robot was and where it is. The robot's
+silhouettes, drawn by joint states and a pose, say where that should be; the pose is the one at
+which drawn and seen changes correlate most. It needs no markers and no feature on the robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from mtv_world_ros.data.episode import Track
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.inspection.camera_pose import (
+    CameraEstimate,
+    covered_frames,
+    grey,
+    jackknife,
+    moved,
+    shrunk,
+    with_pose,
+)
+from mtv_world_ros.inspection.clocks import JointTrack
+
+#: widths of the images and blurs [px] of the steps of the search, from coarse to fine
+_COARSE, _WIDE, _MIDDLE, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (240, 1.5)
+#: units of the turns [rad] and shifts [m]: each moves the drawn robot by about a pixel
+_UNITS = np.array([0.01] * 3 + [0.005] * 3)
+#: difference of drawn and seen change from which on a pixel counts less
+_OUTLIER = 0.3
+_NUM_FRAMES = 24
+#: grey levels from which a pixel counts as changed: so few that a pixel at the robot's edge does,
+#: as in the drawn silhouettes
+_CHANGED = 12.0
+#: without a guess: cameras tried around the robot, and how many of the best are looked at closely
+_NUM_TRIED, _NUM_KEPT = 2500, 10
+#: correlation below which a found pose explains the pictures no better than chance
+_LEAST_FIT = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Changes:
+    """What changed between frames, at one size of the images.
+
+    Attributes:
+        camera: its intrinsics at that size.
+        pairs: (P, 2) rows of the frames.
+        seen: (P, H, W) how much each pixel changed, 0 .. 1.
+        blur: standard deviation [px].
+    """
+
+    camera: CameraModel
+    pairs: np.ndarray
+    seen: NDArray[np.float32]
+    blur: float
+
+
+class FixedCamera:
+    """Estimates the pose of one view.
+
+    Args:
+        track: its frames.
+        camera: its intrinsics; the pose is the guess, where there is one.
+        robot: gives the links' poses.
+        shapes: of the links.
+        joints: measured positions.
+
+    Raises:
+        CalibrationError: the arm does not move, or too few frames are within the joint states.
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        camera: CameraModel,
+        robot: RobotModel,
+        shapes: Sequence[LinkShape],
+        joints: JointTrack,
+    ) -> None:
+        indices = covered_frames(track, joints)
+        chosen = indices[np.unique(np.linspace(0, len(indices) - 1, _NUM_FRAMES).astype(int))]
+        self._positions = joints.at(track.stamps_ns[chosen])
+        self._frames = [np.asarray(track.frames[int(i)]) for i in chosen]
+        self._camera = camera
+        poses = robot.forward_kinematics(self._positions)
+        moving = moving_links(robot)
+        self._parts = [part for part in shapes if part.link in moving]
+        self._poses = {part.link: poses[part.link] for part in self._parts}
+        self._points = np.concatenate(
+            [_sample(part.points) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+             for part in self._parts for T in [self._poses[part.link]]],
+            axis=1,
+        )  # fmt: skip
+        self.centre = self._points.reshape(-1, 3).mean(axis=0)
+        self._pairs = self._far_pairs()
+
+    def estimate(self, *, guess: bool = True, seed: int = 0) -> CameraEstimate:
+        """Estimates the pose, in the robot's base link.
+
+        Args:
+            guess: start from the camera's pose; False = from cameras all around the robot.
+            seed: of those.
+
+        Raises:
+            CalibrationError: no pose explains the pictures.
+        """
+        T = self._camera.T_mount_camera
+        starts = [T] if guess else self._search(seed)
+        wide, middle = self._changes(*_WIDE), self._changes(*_MIDDLE)
+        found = [self._aligned(self._aligned(start, wide), middle) for start in starts]
+        T = max(found, key=lambda pose: self._fit(pose, middle))
+        fine = self._changes(*_FINE)
+        T = self._aligned(T, fine)
+        fit = self._fit(T, fine)
+        if fit < _LEAST_FIT:
+            raise CalibrationError(
+                f"view '{self._camera.view}': no pose was found at which the drawn robot moves "
+                f'like the pictures (correlation {fit:.2f}); is it the right robot, K and clock, '
+                'and does the arm move through the view? A guess nearer to the truth may help'
+            )
+
+        def without(kept: np.ndarray) -> FloatArray:
+            some = _Changes(
+                camera=fine.camera, pairs=fine.pairs[kept], seen=fine.seen[kept], blur=fine.blur
+            )
+            return self._aligned(T, some, iterations=3)
+
+        std_mm, std_deg = jackknife(without, len(fine.pairs))
+        return CameraEstimate(
+            camera=with_pose(self._camera, T),
+            std_mm=std_mm,
+            std_deg=std_deg,
+            fit=fit,
+            num_pairs=len(fine.pairs),
+        )
+
+    def _far_pairs(self) -> np.ndarray:
+        """(P, 2) pairs of frames between which the robot moves most."""
+        count = len(self._positions)
+        rows, columns = np.triu_indices(count, 1)
+        apart = np.linalg.norm(self._points[rows] - self._points[columns], axis=-1).mean(axis=1)
+        order = np.argsort(apart)[::-1]
+        used = np.zeros(count, int)
+        pairs = []
+        for index in order:
+            pair = rows[index], columns[index]
+            if apart[index] > 0.02 and used[list(pair)].max() < 3:
+                used[list(pair)] += 1
+                pairs.append(pair)
+        if len(pairs) < 8:
+            raise CalibrationError(
+                f"view '{self._camera.view}': the arm hardly moves in this recording; record one "
+                'in which all joints move'
+            )
+        return np.array(pairs)
+
+    def _changes(self, width: int, blur: float) -> _Changes:
+        small = shrunk(self._camera, width)
+        greys = [grey(frame, small).astype(np.float32) for frame in self._frames]
+        seen = []
+        for i, j in self._pairs:
+            changed = (np.abs(greys[i] - greys[j]) > _CHANGED).astype(np.uint8)
+            changed = cv2.medianBlur(changed, 3).astype(np.float32)  # noise is single pixels
+            seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
+        return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
+
+    def _fit(self, T: FloatArray, changes: _Changes) -> float:
+        """Correlation of drawn and seen changes, -1 .. 1."""
+        drawn = self._drawn(T, changes)
+        return float(np.corrcoef(drawn.ravel(), changes.seen.ravel())[0, 1])
+
+    def _drawn(self, T: FloatArray, changes: _Changes) -> NDArray[np.float32]:
+        """(P, H, W) where the pictures of each pair should differ, 0 .. 1."""
+        camera = with_pose(changes.camera, T)
+        rows = np.unique(changes.pairs)
+        T_all = np.repeat(T[None], len(rows), axis=0)
+        drawn = fill(
+            [project_part(p, self._poses[p.link][rows], camera, T_all) for p in self._parts],
+            camera,
+        )
+        place = np.searchsorted(rows, changes.pairs)
+        differs = cv2.absdiff(drawn[place[:, 0]], drawn[place[:, 1]]).astype(np.float32)
+        return np.stack([cv2.GaussianBlur(one, (0, 0), changes.blur) for one in differs])
+
+    def _aligned(self, T: FloatArray, changes: _Changes, iterations: int = 10) -> FloatArray:
+        """The pose nearby at which drawn and seen changes differ least (Levenberg-Marquardt).
+
+        Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
+        """
+        damping = 0.01
+
+        def errors(pose: FloatArray) -> NDArray[np.float32]:
+            return (self._drawn(pose, changes) - changes.seen).ravel()
+
+        def cost(values: NDArray[np.float32]) -> float:
+            return float(np.log1p((values / _OUTLIER) ** 2).mean())
+
+        now = errors(T)
+        for _ in range(iterations):
+            steps = np.diag(_UNITS)
+            slopes = np.stack(
+                [(errors(moved(T, s, self.centre)) - errors(moved(T, -s, self.centre))) / 2
+                 for s in steps]
+            )  # fmt: skip
+            weighted = slopes / (1 + (now / _OUTLIER) ** 2)
+            normal, gradient = weighted @ slopes.T, weighted @ now
+            damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
+            step = -np.linalg.solve(damped, gradient)
+            step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
+            tried = moved(T, step * _UNITS, self.centre)
+            there = errors(tried)
+            if cost(there) < cost(now):
+                T, now, damping = tried, there, damping / 3
+            else:
+                damping *= 10
+            if float(np.abs(step).max()) < 0.01:
+                break
+        return T
+
+    def _refined(
+        self,
+        T: FloatArray,
+        changes: _Changes,
+        *,
+        turn: float,
+        shift: float,
+        evaluations: int = 220,
+    ) -> FloatArray:
+        """The pose nearby that fits best; `turn` [rad] and `shift` [m] are first steps."""
+        steps = np.array([turn] * 3 + [shift] * 3)
+        simplex = np.vstack([np.zeros(6), np.diag(steps)])
+        result = minimize(
+            lambda p: -self._fit(moved(T, p, self.centre), changes),
+            np.zeros(6),
+            method='Nelder-Mead',
+            options={
+                'initial_simplex': simplex,
+                'maxfev': evaluations,
+                'xatol': 1e-4,
+                'fatol': 1e-5,
+                'adaptive': True,
+            },
+        )
+        return moved(T, np.asarray(result.x), self.centre)
+
+    def _search(self, seed: int) -> list[FloatArray]:
+        """The best of many upright cameras around the robot."""
+        generator = np.random.default_rng(seed)
+        changes = self._changes(*_COARSE)
+        reach = float(np.linalg.norm(self._points.reshape(-1, 3) - self.centre, axis=1).max())
+        narrowest = min(self._camera.width / self._camera.K[0, 0],
+                        self._camera.height / self._camera.K[1, 1])  # fmt: skip
+        tried = []
+        for _ in range(_NUM_TRIED):
+            away = reach / narrowest * generator.uniform(0.7, 3.5)
+            T = _looking(self.centre, away, reach, generator)
+            tried.append((self._rough_fit(T, changes), len(tried), T))
+        tried.sort(reverse=True)
+        best: list[FloatArray] = []
+        for _, _, T in tried:
+            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other in best):
+                best.append(T)
+            if len(best) == _NUM_KEPT:
+                break
+        improved = [self._refined(T, changes, turn=0.25, shift=0.1, evaluations=80) for T in best]
+        improved.sort(key=lambda T: -self._fit(T, changes))
+        return improved[:3]
+
+    def _rough_fit(self, T: FloatArray, changes: _Changes) -> float:
+        """As `_fit`, with points in place of silhouettes on a quarter of the size."""
+        width, height = changes.camera.width // 4, changes.camera.height // 4
+        pixels, _ = project(with_pose(changes.camera, T), T, self._points)
+        cells = np.floor(np.nan_to_num(pixels, nan=-99.0) / 4).astype(int)
+        inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
+        flat = np.where(inside, cells[..., 1] * width + cells[..., 0], width * height)
+        there = np.zeros((len(flat), width * height + 1), np.float32)
+        there[np.arange(len(flat))[:, None], flat] = 1
+        differs = np.abs(np.diff(there[changes.pairs, :-1], axis=1)[:, 0])
+        differs -= differs.mean(axis=1, keepdims=True)
+        cropped = changes.seen[:, : height * 4, : width * 4]
+        blocks = cropped.reshape(len(cropped), height, 4, width, 4).mean(axis=(2, 4))
+        seen = blocks.reshape(len(blocks), -1)
+        seen = seen - seen.mean(axis=1, keepdims=True)
+        norm = np.linalg.norm(differs) * np.linalg.norm(seen)
+        return float((differs * seen).sum() / (norm + 1e-9))
+
+
+def _looking(
+    centre: FloatArray, away: float, reach: float, generator: np.random.Generator
+) -> FloatArray:
+    """A camera somewhere around a point, not below it, that looks near it, upright."""
+    turn, up = generator.uniform(0, 2 * np.pi), np.arcsin(generator.uniform(-0.15, 0.98))
+    ahead = -np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
+    right = np.cross(ahead, (0, 0, 1.0))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    aside = generator.normal(0, 0.25 * reach, 2)
+    T[:3, 3] = centre - away * ahead + T[:3, :2] @ aside
+    return T
+
+
+def _sample(points: FloatArray, count: int = 12) -> FloatArray:
+    """(count, 3) points in a convex part: some of its corners, drawn towards the middle."""
+    chosen = points[np.linspace(0, len(points) - 1, count).astype(int)]
+    shares = np.linspace(0.2, 0.9, count)[:, None]
+    return points.mean(axis=0) + shares * (chosen - points.mean(axis=0))
