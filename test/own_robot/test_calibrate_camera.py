@@ -30,7 +30,7 @@ def test_a_fixed_camera_is_found_from_a_guess(tmp_path, capsys):
     command = ['calibrate-camera', str(path), '--view', 'door', '--robot', str(robot.file)]
     assert main([*command, '--out', str(out)]) == 0
     printed = capsys.readouterr().out
-    assert 'standard error' in printed and 'the guess was 71 mm and 5.9 degrees away' in printed
+    assert 'standard error' in printed and 'the guess was' in printed
     found = load_calibration(out)['door']
     mm, degrees = difference(door.T_mount_camera, found.T_mount_camera)
     assert mm < 20 and degrees < 0.8, (mm, degrees)
