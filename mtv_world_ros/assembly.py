@@ -13,8 +13,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
 from mtv_world_ros.model.card import CAMERAS, read_card, ROBOT_FOLDER
 from mtv_world_ros.pipeline import Pipeline, WorldModel
-from mtv_world_ros.policies.config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy_config import load_policy_config, ScriptedPolicySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     CALIBRATION,
@@ -33,7 +33,7 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 if TYPE_CHECKING:
     from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
     from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
-    from mtv_world_ros.vision.describers.config import DescriberConfig
+    from mtv_world_ros.vision.describers.describer_config import DescriberConfig
     from mtv_world_ros.vision.describers.vlm import Chat
 
 BUNDLED = 'bundled'
@@ -322,7 +322,10 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
         ConfigError: the configuration is wrong, a key or a package is missing.
         CheckpointError: the local model cannot be loaded.
     """
-    from mtv_world_ros.vision.describers.config import DescriberConfig, load_describer_config
+    from mtv_world_ros.vision.describers.describer_config import (
+        DescriberConfig,
+        load_describer_config,
+    )
 
     if config is None:
         return InstructionDescriber()

@@ -76,8 +76,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.data.splits import select
+    from mtv_world_ros.evaluation.calibration.calibration_report import write_calibration_report
     from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
-    from mtv_world_ros.evaluation.calibration.report import write_calibration_report
     from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
     from mtv_world_ros.success.calibration import save_calibration, save_horizon
 

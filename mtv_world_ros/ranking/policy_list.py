@@ -16,10 +16,14 @@ from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, MtvWorldError, PolicyError, PolicyServerError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.policies.config import policy_config, PolicyConfig, ScriptedPolicySettings
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
 from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy_config import (
+    policy_config,
+    PolicyConfig,
+    ScriptedPolicySettings,
+)
 from mtv_world_ros.policies.server_process import PORT, ServerProcess
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import parse_variant

@@ -33,6 +33,7 @@ from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
+from mtv_world_ros.training.distributed import memory_errors_named, Processes
 from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.latent_cache.clips import CachedSource
 from mtv_world_ros.training.objective import (
@@ -43,7 +44,6 @@ from mtv_world_ros.training.objective import (
     sample_loss,
     sigma_weights,
 )
-from mtv_world_ros.training.processes import memory_errors_named, Processes
 from mtv_world_ros.training.resume import (
     architecture,
     check_card,

@@ -11,6 +11,10 @@ from scipy.optimize import minimize
 from scipy.special import expit, log_expit
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.evaluation.calibration.calibration_report import (
+    markdown,
+    write_calibration_report,
+)
 from mtv_world_ros.evaluation.calibration.fit import (
     AFTER,
     AFTER_KINDS,
@@ -20,7 +24,6 @@ from mtv_world_ros.evaluation.calibration.fit import (
     FITTED,
     Sample,
 )
-from mtv_world_ros.evaluation.calibration.report import markdown, write_calibration_report
 from mtv_world_ros.evaluation.metrics.success_agreement import (
     agreement,
     area_under_roc,

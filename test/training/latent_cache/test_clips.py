@@ -19,9 +19,9 @@ from mtv_world_ros.model.conditioning import condition, encode_chunk
 from mtv_world_ros.training.base import Base, load_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import load_training_config, TrainingConfig
+from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.latent_cache.clips import cached, CachedSource
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
-from mtv_world_ros.training.processes import Processes
 
 CPU = torch.device('cpu')
 

@@ -19,7 +19,7 @@ import yaml
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.processes import Processes
+from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.trainer import Trainer
 
 SCRIPT = Path(__file__).with_name('train_recorded.py')
@@ -113,7 +113,7 @@ def test_processes_wait_for_the_main_one_longer_than_nccl_does(
         given.update(options)
         return SimpleNamespace(process_index=0, num_processes=1)
 
-    monkeypatch.setattr('mtv_world_ros.training.processes.PartialState', state)
+    monkeypatch.setattr('mtv_world_ros.training.distributed.PartialState', state)
     Processes('cuda')
     assert given['timeout'] > 10 * timedelta(minutes=10) and given['cpu'] is False
 
