@@ -87,6 +87,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='the prediction-powered rates use the true outcomes of the first M of each task',
     )
     parser.add_argument('--max-chunks', type=int, default=8, help='answers of a policy at most')
+    parser.add_argument(
+        '--hold',
+        type=int,
+        default=0,
+        metavar='N',
+        help='an episode also ends when the task is done, or the estimate abstains, after N '
+        'answers in a row; default: only the policy and --max-chunks end it',
+    )
     add_overwrite(parser)
     add_checkpoint(parser)
     add_dtype(parser)
@@ -117,7 +125,11 @@ def _rank(arguments: argparse.Namespace) -> int:
         _checkpoint(arguments, name, out) for name, out in zip(names, folders, strict=True)
     ]
     listed = _listed(arguments)
-    config = RolloutConfig(num_inference_steps=arguments.steps, max_chunks=arguments.max_chunks)
+    config = RolloutConfig(
+        num_inference_steps=arguments.steps,
+        max_chunks=arguments.max_chunks,
+        hold=arguments.hold,
+    )
     if listed:
         policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())
         config = replace(config, make_policy=policies)

@@ -132,8 +132,10 @@ class Result:
         no_picture: the rule that sees the commands and the first frame alone.
         num_chunks: answers executed in the simulator.
         num_imagined: answers executed in imagination.
-        is_over: the policy ended the episode before the limit, in both.
+        is_over: something else than the limit ended the episode, in both.
         seconds: time by stage [s].
+        end: why the simulated episode ended; empty = not known.
+        imagined_end: why the imagined one ended.
         last_frames: PNG of the last real and imagined frames in base64, where it is not yet
             written to its file.
     """
@@ -151,6 +153,8 @@ class Result:
     num_imagined: int
     is_over: bool
     seconds: Mapping[str, float]
+    end: str = ''
+    imagined_end: str = ''
     last_frames: str = ''
 
     def as_json(self) -> dict[str, Any]:

@@ -101,6 +101,8 @@ class _Store:
             **checkpoint.settings,
             'steps': config.num_inference_steps,
             'max_chunks': config.max_chunks,
+            # what was ranked before episodes could end so goes on
+            **({'hold': config.hold} if config.hold else {}),
         }
         check_same_settings(self._out / FOLDER, self._settings, overwrite)
         for job in () if overwrite else jobs:

@@ -47,6 +47,7 @@ def tables(summary: Summary) -> list[Table]:
         _powered(summary),
         _confusion(summary),
         _speed(summary),
+        *_ends(summary),
         *_failures(summary),
     ]
 
@@ -224,6 +225,32 @@ def _speed(summary: Summary) -> Table:
     ]
     caption = 'Speed of one process, wall time, means over the rollouts'
     return Table(caption=caption, head=['', ''], rows=rows)
+
+
+def _ends(summary: Summary) -> list[Table]:
+    """Why episodes ended, in both worlds."""
+    pairs = [(result.end, result.imagined_end) for result in summary.results]
+    known = sorted({end for pair in pairs for end in pair if end})
+    if not known:
+        return []
+    rows = [
+        [
+            policy,
+            *(
+                f'{sum(r.end == end for r in found)} / {sum(r.imagined_end == end for r in found)}'
+                for end in known
+            ),
+        ]
+        for policy in summary.policies
+        for found in [summary.chosen(policy, None)]
+    ]
+    return [
+        Table(
+            caption='How episodes ended, in the simulator / in imagination',
+            head=['policy', *known],
+            rows=rows,
+        )
+    ]
 
 
 def _failures(summary: Summary) -> list[Table]:

@@ -41,14 +41,19 @@ class RolloutConfig:
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         max_chunks: answers of the policy at most.
+        hold: an episode also ends when the task is done, or the estimate abstains, after this
+            number of answers in a row; 0 = then it goes on.
         make_policy: makes a policy for an episode.
     """
 
     num_inference_steps: int = 1
     max_chunks: int = 8
+    hold: int = 0
     make_policy: MakePolicy = scripted_policy
 
     def __post_init__(self) -> None:
+        if self.hold < 0:
+            raise ConfigError(f'--hold is {self.hold}; it must be 0 or more')
         if self.num_inference_steps < 0 or self.max_chunks < 1:
             raise ConfigError(
                 f'{self.num_inference_steps} denoising steps and {self.max_chunks} chunks: steps '
@@ -101,7 +106,8 @@ class RolloutRunner:
         seen = judge(observed, world.chunks)
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
-        imagined = ImaginedWorld(self._begin(real, job))
+        episode = self._begin(real, job)
+        imagined = ImaginedWorld(episode, world.start)
         run = self._run(real.policy, imagined, real.instruction, job)
         imagining_s = time.perf_counter() - begun
         return Result(
@@ -117,6 +123,8 @@ class RolloutRunner:
             num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
             is_over=real.run.is_over and run.is_over,
+            end=real.run.end,
+            imagined_end=run.end,
             seconds={
                 'policy': real.run.policy_s,
                 'physics': world.physics_s,
@@ -125,7 +133,7 @@ class RolloutRunner:
                 'imagining': imagining_s,
             },
             last_frames=base64.b64encode(
-                last_frames_png(observed.observation.frames, imagined.observation.frames)
+                last_frames_png(observed.observation.frames, episode.observation.frames)
             ).decode(),
         )
 
@@ -146,6 +154,7 @@ class RolloutRunner:
             instruction,
             chunk_s=self.pipeline.spec.chunk_seconds,
             max_chunks=self.config.max_chunks,
+            hold=self.config.hold,
         )
 
 

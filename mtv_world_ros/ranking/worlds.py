@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import ceil
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from math import ceil, isfinite
 import time
 from typing import Protocol
 
@@ -21,6 +22,8 @@ from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
+from mtv_world_ros.ranking.jobs import Judged
+from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.sim.collect.record import START_NS
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final
@@ -41,6 +44,19 @@ class World(Protocol):
         """Executes an answer to the present observation, no longer than a chunk."""
         ...
 
+    def is_done(self) -> bool | None:
+        """Tells whether the task is done now; None = cannot tell."""
+        ...
+
+
+class End(StrEnum):
+    """Why an episode ended."""
+
+    POLICY = 'the policy ended it'
+    HELD = 'success held'
+    ABSTAINS = 'the estimate abstains'
+    TIME_OUT = 'time out'
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyRun:
@@ -48,19 +64,30 @@ class PolicyRun:
 
     Attributes:
         num_chunks: answers that were executed.
-        is_over: the policy ended it, not the limit.
+        end: why there were no more.
         policy_s: time that the policy took [s].
     """
 
     num_chunks: int
-    is_over: bool
+    end: End
     policy_s: float
+
+    @property
+    def is_over(self) -> bool:
+        """Whether something else than the limit ended it."""
+        return self.end != End.TIME_OUT
 
 
 def run_policy(
-    policy: Policy, world: World, instruction: str, *, chunk_s: float, max_chunks: int
+    policy: Policy,
+    world: World,
+    instruction: str,
+    *,
+    chunk_s: float,
+    max_chunks: int,
+    hold: int = 0,
 ) -> PolicyRun:
-    """Runs a policy that was reset until it ends the episode, or up to a limit of answers.
+    """Runs a policy that was reset until the episode ends, or up to a limit of answers.
 
     Args:
         policy: decides.
@@ -68,45 +95,67 @@ def run_policy(
         instruction: what the robot is told.
         chunk_s: the policy is asked again after this time, or where its answer ends [s].
         max_chunks: answers at most.
+        hold: the episode also ends when the task is done, or nobody can tell whether it is, after
+            this number of answers in a row; 0 = then it goes on.
 
     Raises:
         PolicyError: the policy cannot answer.
         TrajectoryError: its answer does not fit the robot.
     """
-    policy_s = 0.0
+    policy_s, verdicts = 0.0, []
     for number in range(max_chunks):
         begun = time.perf_counter()
         answer = policy.act(world.observation, instruction)
         policy_s += time.perf_counter() - begun
         if answer is None:
-            return PolicyRun(num_chunks=number, is_over=True, policy_s=policy_s)
+            return PolicyRun(num_chunks=number, end=End.POLICY, policy_s=policy_s)
         world.execute(first_part(answer, world.observation.positions, chunk_s))
-    return PolicyRun(num_chunks=max_chunks, is_over=False, policy_s=policy_s)
+        verdicts.append(world.is_done() if hold else False)
+        end = _end_of(verdicts[-hold:]) if len(verdicts) >= hold > 0 else None
+        if end is not None:
+            return PolicyRun(num_chunks=number + 1, end=end, policy_s=policy_s)
+    return PolicyRun(num_chunks=max_chunks, end=End.TIME_OUT, policy_s=policy_s)
+
+
+def _end_of(verdicts: Sequence[bool | None]) -> End | None:
+    """How an episode ends after these verdicts; None = it goes on."""
+    if all(verdicts):
+        return End.HELD
+    return End.ABSTAINS if all(verdict is None for verdict in verdicts) else None
 
 
 class ImaginedWorld:
-    """Predicted frames, commanded joints, estimates.
+    """Predicted frames at the cameras' size, commanded joints, estimates.
 
     Attributes:
+        observation: what is seen now: the real one, then the last predicted frame.
         success: the estimate at the end; None before the first answer.
 
     Args:
         episode: that answers are imagined in.
+        start: the real observation that it begins with.
     """
 
-    def __init__(self, episode: ImaginedEpisode) -> None:
-        self._episode = episode
+    def __init__(self, episode: ImaginedEpisode, start: Observation) -> None:
+        self._episode, self._start = episode, start
+        self.observation = start
         self.success: SuccessEstimate | None = None
-
-    @property
-    def observation(self) -> Observation:
-        """The last predicted frame."""
-        return self._episode.observation
 
     def execute(self, answer: JointTrajectory) -> None:
         """Imagines an answer."""
         for prediction in self._episode.extend(answer):
             self.success = prediction.success
+        height, width = self._start.frames.shape[1:3]
+        seen = self._episode.observation
+        # a policy meets one size of images, whoever shows them
+        self.observation = replace(
+            seen, cameras=self._start.cameras, frames=resize_frames(seen.frames, width, height)
+        )
+
+    def is_done(self) -> bool | None:
+        """Tells what the estimate says at the end of the last answer; None = it abstains."""
+        success = Judged.of(self.success).success
+        return bool(success) if isfinite(success) else None
 
 
 def judge(episode: ImaginedEpisode, chunks: Sequence[SeenChunk]) -> SuccessEstimate | None:
@@ -185,6 +234,10 @@ class SimulatedWorld:
         self.commands.append(commands)
         self._target = commands[-1]
         self.observation = shown[-1]
+
+    def is_done(self) -> bool:
+        """Tells whether the task's predicate holds now."""
+        return self.outcome()[1]
 
     def outcome(self) -> tuple[bool, bool]:
         """Returns whether the task was ever done, and is done at the end."""

@@ -1,10 +1,19 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.errors import ConfigError, PolicyError, TrajectoryError
 from mtv_world_ros.ranking.jobs import make_jobs
 from mtv_world_ros.ranking.rank import Checkpoint, run_jobs
-from mtv_world_ros.ranking.runner import ComparisonRunner, Results, RolloutConfig, WantedJob
+from mtv_world_ros.ranking.runner import (
+    ComparisonRunner,
+    Results,
+    RolloutConfig,
+    RolloutRunner,
+    WantedJob,
+)
 
 TASK = 'place_block_a2b_left'
 
@@ -29,6 +38,58 @@ def test_a_perfect_imagination_is_judged_like_the_simulator_s_own_frames(results
     assert results['expert'].imagined.success == 1.0
     stopped = results['expert-stop-0.3'].imagined
     assert stopped.success == 0.0 or np.isnan(stopped.probability)
+
+
+def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
+    """In both worlds; and limits of joints are checked in both."""
+    (job,) = make_jobs(('expert',), (TASK,), 1, 0, expert)
+
+    class Watching:
+        name = 'expert'
+
+        def __init__(self, policy):
+            self.policy, self.seen, self.seeds = policy, [], []
+
+        def reset(self, *, seed):
+            self.seeds.append(seed)
+            self.seen.append([])
+            self.policy.reset(seed=seed)
+
+        def act(self, observation, instruction):
+            self.seen[-1].append(observation)
+            return self.policy.act(observation, instruction)
+
+    def make_policy(*place):
+        made.append(Watching(runner.config.make_policy(*place)))
+        return made[-1]
+
+    made = []
+    watched = RolloutRunner(runner.pipeline, replace(runner.config, make_policy=make_policy))
+    result = watched.score(job)
+    (policy,) = made
+    real, imagined = policy.seen
+    assert policy.seeds == [job.seed, job.seed]
+    assert (result.end, result.imagined_end) == ('the policy ended it',) * 2
+    (size,) = {seen.frames.shape for seen in (*real, *imagined)}
+    assert size[1] > runner.pipeline.spec.height
+    np.testing.assert_array_equal(real[0].frames, imagined[0].frames)
+    assert [camera.width for camera in imagined[1].cameras] == [size[2]] * 2
+    assert [a.stamp_ns for a in real] == [b.stamp_ns for b in imagined]
+    # predicted at the model's size: alike, but not as sharp
+    difference = np.abs(real[1].frames.astype(float) - imagined[1].frames)
+    assert 0 < difference.mean() < 12
+
+    class Beyond(Watching):
+        def act(self, observation, instruction):
+            return JointTrajectory(
+                joint_names=runner.pipeline.robot.joint_names,
+                times=[1.0],
+                positions=[[99.0] * len(observation.positions)],
+            )
+
+    beyond = replace(runner.config, make_policy=lambda *place: Beyond(made[0].policy))
+    with pytest.raises(TrajectoryError, match='limit'):
+        RolloutRunner(runner.pipeline, beyond).simulate(job)
 
 
 def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, monkeypatch):

@@ -4,7 +4,7 @@ import pytest
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.policies.policy import first_part
-from mtv_world_ros.ranking.worlds import run_policy
+from mtv_world_ros.ranking.worlds import End, run_policy
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -35,17 +35,20 @@ class _Policy:
 
 
 class _World:
-    def __init__(self):
-        self.executed = []
+    def __init__(self, verdicts=()):
+        self.executed, self._verdicts = [], iter(verdicts)
         self.observation = _observation()
 
     def execute(self, answer):
         self.executed.append(float(answer.times[-1]))
         self.observation = _observation(self.observation.stamp_ns + round(answer.times[-1] * 1e9))
 
+    def is_done(self):
+        return next(self._verdicts)
 
-def _run(policy, world, max_chunks):
-    return run_policy(policy, world, 'go', chunk_s=1.2, max_chunks=max_chunks)
+
+def _run(policy, world, max_chunks, **more):
+    return run_policy(policy, world, 'go', chunk_s=1.2, max_chunks=max_chunks, **more)
 
 
 def test_the_policy_sees_what_its_answer_led_to_and_ends_the_episode():
@@ -60,6 +63,23 @@ def test_an_endless_policy_is_cut_off_at_the_limit():
     policy, world = _Policy(100), _World()
     run = _run(policy, world, 3)
     assert (run.num_chunks, run.is_over, len(world.executed)) == (3, False, 3)
+
+
+@pytest.mark.parametrize(
+    ('verdicts', 'end', 'num_chunks'),
+    [
+        ((False, True, False, True, True, True), End.HELD, 5),
+        ((None, True, None, None), End.ABSTAINS, 4),
+        ((None, True, None, False, True, False), End.TIME_OUT, 6),
+    ],
+)
+def test_an_episode_ends_when_success_or_doubt_is_held(verdicts, end, num_chunks):
+    run = _run(_Policy(100), _World(verdicts), 6, hold=2)
+    assert (run.end, run.num_chunks) == (end, num_chunks)
+
+
+def test_without_hold_nobody_is_asked_whether_it_is_done():
+    assert _run(_Policy(2), _World(), 6).end == End.POLICY
 
 
 def test_an_answer_is_cut_with_a_point_at_the_cut():
