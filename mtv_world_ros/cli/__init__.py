@@ -15,6 +15,7 @@ from mtv_world_ros.cli import (
     distill,
     doctor,
     evaluate,
+    export_dataset,
     imagine,
     import_bag,
     import_dataset,
@@ -49,6 +50,7 @@ COMMANDS = (
     recover,
     import_bag,
     import_dataset,
+    export_dataset,
     import_weights,
 )
 #: of the extra `evaluate`, which several commands need

@@ -72,7 +72,7 @@ class LeRobotDataset:
     """
 
     def __init__(self, root: Path) -> None:
-        _pyarrow()
+        pyarrow_modules()
         self.root = root
         info = self._info()
         self.version = str(info.get('codebase_version', ''))
@@ -272,20 +272,21 @@ def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
 
 
 def _read_table(file: Path, **options: Any) -> Any:
-    pyarrow, parquet = _pyarrow()
+    pyarrow, parquet = pyarrow_modules()
     try:
         return parquet.read_table(file, **options)
     except (OSError, pyarrow.ArrowException) as error:
         raise EpisodeError(f"cannot read '{file}': {' '.join(str(error).split())}") from error
 
 
-def _pyarrow() -> tuple[Any, Any]:
+def pyarrow_modules() -> tuple[Any, Any]:
+    """Returns `pyarrow` and `pyarrow.parquet`, which are optional."""
     try:
         import pyarrow
         from pyarrow import parquet
     except ImportError as error:
         raise ConfigError(
-            "reading LeRobot datasets needs pyarrow: pip install 'mtv_world_ros[import]'"
+            "LeRobot datasets need pyarrow: pip install 'mtv_world_ros[import]'"
         ) from error
     return pyarrow, parquet
 
