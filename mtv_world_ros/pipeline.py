@@ -429,7 +429,7 @@ class ImaginedEpisode:
         )
         foreseen = None
         if objects is not None and objects.positions is not None:
-            left_s = (pipeline.spec.num_frames - len(masks.masks[0, 0])) / pipeline.spec.fps
+            left_s = (pipeline.spec.num_frames - footage.num_frames) / pipeline.spec.fps
             num = len(objects.positions) - round(left_s / objects.tracked.step_s)
             foreseen = foreseen_of(pipeline.robot, objects, num)
         return pipeline.estimator.estimate(footage, self.instruction, state.memory, foreseen)

@@ -21,6 +21,8 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
+from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
 from mtv_world_ros.pipeline import ObservedEpisode, Pipeline
 
 SPEC = WorldModelSpec(
@@ -320,6 +322,16 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
     episode.observe(recording.frames[:, 17:25], recording.positions[16:25])
     list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
     assert log == [0, 16, 32, 0, 16]
+
+
+def test_an_episode_in_which_nobody_names_an_object_is_imagined(
+    recording: Recording, world_model: CountingWorldModel
+) -> None:
+    pipeline = assemble({**CARD, 'rendering': {'object_motion': True}}, world_model, robot=YAM)
+    predictor = ObjectMotionPredictor(ObjectMotionNetwork(), pipeline.robot)
+    episode = replace(pipeline, object_motion=predictor).begin(observe(recording))
+    chunks = list(episode.extend(commands(recording, 3.2)))
+    assert len(chunks) == 2 and chunks[-1].masks.names == ()
 
 
 def test_control_frame_zero_shows_the_observed_state(
