@@ -68,7 +68,7 @@ class Robot:
         self.reports += [values_of(status) for status in message.status]
 
     def _on_state(self, message: DiagnosticArray) -> None:
-        self.state = values_of(message.status[0])
+        self.state = values_of(next(iter(message.status)))
 
     def connect(self) -> None:
         """Waits for the node and tells it the instruction."""
@@ -186,12 +186,17 @@ def measure(options: argparse.Namespace) -> list[list[str]]:
     return rows
 
 
+def add_seconds(parser: argparse.ArgumentParser) -> None:
+    """Adds the option."""
+    parser.add_argument('--seconds', type=float, default=19.0)
+
+
 def main() -> int:
     """Measures and prints the page."""
     options = page.parse_arguments(
         __doc__,
         repeats=1,
-        more=lambda parser: parser.add_argument('--seconds', type=float, default=19.0),
+        more=add_seconds,
     )
     os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

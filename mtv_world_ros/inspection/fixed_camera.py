@@ -217,7 +217,7 @@ class FixedCamera:
             damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
             step = -np.linalg.solve(damped, gradient)
             step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
-            tried = moved(T, step * _UNITS, self.centre)
+            tried = moved(T, np.asarray(step * _UNITS, np.float64), self.centre)
             there = errors(tried)
             if cost(there) < cost(now):
                 T, now, damping = tried, there, damping / 3

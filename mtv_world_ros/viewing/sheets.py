@@ -68,7 +68,13 @@ def compared(streams: Streams) -> Comparison:
         kind: np.stack([_at(streams, kind, view, stamps, size, reach) for view in views])
         for kind in KINDS
     }
-    return Comparison(views=views, times=(stamps - stamps[0]) * 1e-9, **frames)
+    return Comparison(
+        views=views,
+        times=(stamps - stamps[0]) * 1e-9,
+        real=frames['real'],
+        trajectory=frames['trajectory'],
+        imagined=frames['imagined'],
+    )
 
 
 def _at(

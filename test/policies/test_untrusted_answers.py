@@ -130,7 +130,7 @@ def test_mutated_answers_end_in_an_answer_or_a_refusal(as_lerobot, seed) -> None
 
 def packed_array(data, dtype, shape) -> bytes:
     values = {b'__ndarray__': True, b'data': data, b'dtype': dtype, b'shape': shape}
-    return msgpack.packb(values)
+    return bytes(msgpack.packb(values) or b'')
 
 
 def deep(levels: int) -> bytes:

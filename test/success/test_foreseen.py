@@ -13,6 +13,12 @@ TASKS = load_tasks(share_path('config', 'tasks'))
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)
 
 
+def matched():
+    found = match_task(TASKS, LEFT)
+    assert found is not None
+    return found
+
+
 def foreseen(*ends):
     """Motions of 9 steps in which the red block ends at each of `ends`, the gripper open."""
     points = np.array([[[red, BLUE] for red in path(RED, end)] for end in ends], float)
@@ -41,7 +47,7 @@ def held(*ends):
 
 
 def test_the_share_of_motions_that_end_at_the_goal_is_told():
-    task, bound = match_task(TASKS, LEFT)
+    task, bound = matched()
     unknown = np.full((2, 3), np.nan)
     done = held(GOAL, RED, GOAL, BLUE).succeeds(task, bound, unknown)
     np.testing.assert_array_equal(done, [True, False, True, False])
@@ -50,7 +56,7 @@ def test_the_share_of_motions_that_end_at_the_goal_is_told():
 
 
 def test_objects_that_were_not_found_leave_it_open():
-    task, bound = match_task(TASKS, LEFT)
+    task, bound = matched()
     seen = held(GOAL)
     lost = replace(seen, points=np.where(np.array([True, False])[:, None], np.nan, seen.points))
     for motions in (lost, replace(seen, names=('green cup', 'bowl'))):

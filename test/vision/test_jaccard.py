@@ -226,7 +226,10 @@ def counted_f(pred, true):
 def test_boundaries_score_as_counted_pixel_by_pixel(seed):
     rng = np.random.default_rng(seed)
     shape = (40, 130)  # a diagonal of 136: 2 px apart still match
-    pred, true = (square(*rng.integers(0, 20, 2), int(rng.integers(5, 25)), shape) for _ in '12')
+    pred, true = (
+        square(int(rng.integers(20)), int(rng.integers(20)), int(rng.integers(5, 25)), shape)
+        for _ in '12'
+    )
     true[5:9, 100:130] = pred[30:40, 60] = True  # at the border; a line
     assert boundary_f(pred, true) == pytest.approx(counted_f(pred, true), abs=1e-12)
 
