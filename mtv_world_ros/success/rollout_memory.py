@@ -133,6 +133,11 @@ class RolloutMemory:
         """O names."""
         return self.start_masks.names
 
+    @property
+    def num_frames(self) -> int:
+        """N."""
+        return self.points.shape[1]
+
     def start_point(self, item: int) -> FloatArray:
         """Returns where an object was in the rollout's first frame (3,) [m], NaN = not known."""
         return self.points[item, 0]
