@@ -428,7 +428,7 @@ class ImaginedEpisode:
             pipeline.robot, state.observation.cameras, positions, start_masks, masks
         )
         foreseen = None
-        # where the rollout began earlier, objects may have been found half hidden, or off the table
+        # where the rollout began earlier, objects were found half hidden, or off the table
         begun = state.memory is None or state.memory.num_frames == 1 + state.num_imagined
         if begun and objects is not None and objects.positions is not None:
             left_s = (pipeline.spec.num_frames - footage.num_frames) / pipeline.spec.fps
