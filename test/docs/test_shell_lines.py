@@ -216,7 +216,10 @@ def check_values(given: dict[str, Any]) -> None:
     if given.get('control'):
         check_control(given['control'])
     for name in each(given.get('policies') or ()):
-        parse_variant(name)
+        if name.endswith('.yaml'):
+            assert (ROOT / name).is_file(), name
+        else:
+            parse_variant(name)
     if given.get('policy') and given['policy'].startswith('expert'):
         parse_variant(given['policy'])
     for key in ('task', 'tasks'):
@@ -225,7 +228,7 @@ def check_values(given: dict[str, Any]) -> None:
     kinds_named(given.get('zero_shot') or '')
     ServingOptions.parse(given.get('serving') or '')
     assert given.get('segmenter') in (None, *SEGMENTERS)
-    if given.get('robot'):
+    if given.get('robot') and not given['robot'].startswith('my_'):  # those are the reader's own
         robot_path(given['robot'])
 
 

@@ -15,7 +15,8 @@ CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
 @pytest.fixture
 def make(make_pipeline):
     """Makes a pipeline in any process."""
-    return partial(assemble, CARD, PersistenceWorldModel(make_pipeline().spec))
+    pipeline = make_pipeline()
+    return partial(assemble, CARD, PersistenceWorldModel(pipeline.spec), robot=pipeline.robot)
 
 
 def test_two_workers_find_what_one_finds(make, episodes, tmp_path):

@@ -148,7 +148,7 @@ def test_one_view_from_the_command_line_trains_and_evaluates(
     assert main([*evaluation, '--out', str(scores), '--steps', '1', '--threads', '1']) == 0
     assert list(json.loads((scores / 'metrics.json').read_text())['views']) == ['low']
     assert main([*command, '--control', 'policy2vec']) == 1
-    assert "'ee_mlp'" in capsys.readouterr().err
+    assert 'give --preset and --set as before, or another --out' in capsys.readouterr().err
 
 
 def test_training_needs_a_dataset_and_a_folder(capsys: pytest.CaptureFixture) -> None:
@@ -160,7 +160,9 @@ def test_a_run_of_another_control_is_not_resumed(
     episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
 ) -> None:
     run(with_control(tiny, 'policy2vec'), episode, tmp_path, robot)
-    with pytest.raises(TrainingError, match="control 'policy2vec', this run has 'trajectory_vid"):
+    with pytest.raises(
+        TrainingError, match='video.control policy2vec, this preset has trajectory_video'
+    ):
         run(tiny, episode, tmp_path, robot)
 
 

@@ -48,6 +48,7 @@ class Student(nn.Module):
     """A transformer of a gain and an offset for every noise level, as the level is written."""
 
     dtype = torch.float32
+    start_image = 'both'
 
     def __init__(self, prediction: str, num_steps: int) -> None:
         super().__init__()

@@ -343,7 +343,7 @@ def test_calibration_is_read_back_as_it_was_stored(tmp_path):
         ({'weights': [1.0]}, 'not equally many'),
         ({'bias': None}, 'cannot be used'),
         ({'wieghts': []}, "unknown key 'wieghts'"),
-        ({'scales': [0.0] * 6}, 'scale is not positive'),
+        ({'scales': [0.0] * 7}, 'scale is not positive'),
     ],
 )
 def test_broken_calibration_says_what_to_do(tmp_path, change, message):

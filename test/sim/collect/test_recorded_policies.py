@@ -31,7 +31,7 @@ def test_kinds_are_those_of_the_recorded_policy(dataset):
     [
         (['train', '{set}', '--out', '{out}'], 'training'),
         (['train-motion', '{set}', '--out', '{out}'], 'training'),
-        (['calibrate', 'bundled', '{set}', '--out', '{out}'], 'calibration'),
+        (['calibrate', 'bundled', '{set}', '--no-store', '--out', '{out}'], 'calibration'),
     ],
 )
 def test_a_test_kind_in_a_training_or_calibration_set_is_refused(
