@@ -215,13 +215,13 @@ def check_values(given: dict[str, Any]) -> None:
     )
     if given.get('control'):
         check_control(given['control'])
-    for name in each(given.get('policies') or ()):
-        if name.endswith('.yaml'):
-            assert (ROOT / name).is_file(), name
-        else:
+    names = [*each(given.get('policies') or ()), given.get('policy') or '']
+    assert all(
+        (ROOT / name).is_file() for name in each(given.get('policies') or ()) if '/' in name
+    )
+    for name in names:
+        if name.startswith('expert') or (name in names[:-1] and '/' not in name):
             parse_variant(name)
-    if given.get('policy') and given['policy'].startswith('expert'):
-        parse_variant(given['policy'])
     for key in ('task', 'tasks'):
         if given.get(key) not in (None, '', 'all') and not given[key].endswith('.yaml'):
             tasks_named(given[key])

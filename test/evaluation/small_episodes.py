@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory, WorldModelSpec
@@ -197,3 +198,10 @@ def oracle(recordings: list[Recording]) -> OracleWorldModel:
 def blurred_oracle(recordings: list[Recording]) -> OracleWorldModel:
     """Knows the recorded future but draws it out of focus."""
     return OracleWorldModel(recordings, blur=1.0)
+
+
+def persistence(spec: WorldModelSpec) -> Pipeline:
+    """A pipeline whose world model holds the first frame; a worker process can make it, too."""
+    card = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
+    yam = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return assemble(card, PersistenceWorldModel(spec), robot=yam)

@@ -1,22 +1,19 @@
 from functools import partial
 
 import pytest
+from small_episodes import persistence
 
-from mtv_world_ros.assembly import assemble
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.evaluate import evaluate, make_jobs, Parallel
-from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import plain
 
 QUIET = {'show_progress': False}
-CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
 
 
 @pytest.fixture
 def make(make_pipeline):
     """Makes a pipeline in any process."""
-    pipeline = make_pipeline()
-    return partial(assemble, CARD, PersistenceWorldModel(pipeline.spec), robot=pipeline.robot)
+    return partial(persistence, make_pipeline().spec)
 
 
 def test_two_workers_find_what_one_finds(make, episodes, tmp_path):

@@ -38,7 +38,7 @@ def gaussian_flow(latents: Tensor, sigma: Tensor) -> Tensor:
 class Teacher:
     """A transformer that knows the flow."""
 
-    dtype, prediction = torch.float32, 'flow'
+    dtype, prediction, start_image = torch.float32, 'flow', 'both'
 
     def __call__(self, latents: Tensor, timestep: Tensor, **_: object) -> Tensor:
         return gaussian_flow(latents, timestep[0] / 1000)
