@@ -146,7 +146,7 @@ def test_refuses_a_trajectory_from_another_clock(node, client):
 
 
 BAD_IMAGES = {
-    'encoding': ('image_encoding', {'encoding': 'yuv422'}),
+    'encoding': ('image_encoding', {'encoding': 'yuv420'}),
     'depth': ('image_encoding', {'encoding': '16UC1'}),
     'step too small': ('image_data', {'step': 3 * 96 - 1}),
     'step of another image': ('image_data', {'step': 4 * 96}),
