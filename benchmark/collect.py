@@ -20,8 +20,8 @@ from page import parse_arguments, publish, table
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.sim.collect.episode_jobs import jobs_of
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, ROBOT_FILE, Spent
-from mtv_world_ros.sim.collect.jobs import jobs_of
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.randomize import draw_scene

@@ -40,17 +40,17 @@ from mtv_world_ros.assembly import (
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
 from mtv_world_ros.evaluation.references import ACTIONS
 from mtv_world_ros.evaluation.report.comparison import write_comparison
-from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.report.tables import estimates_json
 from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.runtime import choose_dtype
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.run import spread, train
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_run import spread, train
 
 
 def parse() -> argparse.Namespace:

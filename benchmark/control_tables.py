@@ -10,7 +10,7 @@ import numpy as np
 from page import table
 
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.report.tables import cell
 
 

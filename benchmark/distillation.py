@@ -22,8 +22,8 @@ import torch
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.model.runtime import choose_dtype
-from mtv_world_ros.training.config import load_training_config
-from mtv_world_ros.training.distill import distill, DistillConfig
+from mtv_world_ros.training.distillation import distill, DistillConfig
+from mtv_world_ros.training.training_config import load_training_config
 
 
 def student(steps: int, options: argparse.Namespace) -> Path:

@@ -23,8 +23,8 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
-from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 
 
 def main() -> None:

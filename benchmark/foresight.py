@@ -35,7 +35,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_trajectory_message,
     values_of,
 )
-from mtv_world_ros.ros.messages.images import to_image
+from mtv_world_ros.ros.messages.image_messages import to_image
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline

@@ -12,11 +12,11 @@ from control_tables import cell
 from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
-from mtv_world_ros.evaluation.report.summary import Summary
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.files import share_path
-from mtv_world_ros.training.run import spread
+from mtv_world_ros.training.training_run import spread
 
 #: columns of a table, and what `Summary.estimates` calls them
 COLUMNS = {'J moving': 'j_moving', 'J objects': 'j_object_mean', 'skill': 'skill'}

@@ -40,8 +40,8 @@ NODES = ('world_model', 'policy', 'runner', 'recorder')
 MODULES = {
     'ros.world_model.node': 'world_model',
     'ros.policy.node': 'policy',
-    'ros.episodes.runner': 'runner',
-    'ros.episodes.recorder': 'recorder',
+    'ros.episodes.episode_runner': 'runner',
+    'ros.episodes.episode_recorder': 'recorder',
 }
 SIM_EPISODES = 2
 

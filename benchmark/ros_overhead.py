@@ -37,7 +37,7 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.ros.messages.conversions import to_joint_state, values_of
-from mtv_world_ros.ros.messages.images import to_image
+from mtv_world_ros.ros.messages.image_messages import to_image
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.node import main as node_main

@@ -25,7 +25,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.ros.messages.images import to_image
+from mtv_world_ros.ros.messages.image_messages import to_image
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.view_publisher import ViewPublisher

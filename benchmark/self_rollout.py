@@ -28,8 +28,8 @@ from mtv_world_ros.data.recording import cached_recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.model.runtime import choose_dtype
-from mtv_world_ros.training.config import load_training_config
-from mtv_world_ros.training.run import spread, train
+from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_run import spread, train
 
 #: RGB difference (of 255) from which a pixel counts as changed
 _CHANGE = 24

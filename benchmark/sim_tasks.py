@@ -30,8 +30,8 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
 from mtv_world_ros.sim.collect.dataset_readme import commands
+from mtv_world_ros.sim.collect.episode_jobs import episode_seed
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig, ROBOT_FILE
-from mtv_world_ros.sim.collect.jobs import episode_seed
 from mtv_world_ros.sim.collect.record import simulate
 from mtv_world_ros.sim.episode_measures import EpisodeMeasures, measure
 from mtv_world_ros.sim.expert.expert import Expert

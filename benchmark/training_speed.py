@@ -35,11 +35,11 @@ from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions, transformer_arguments
-from mtv_world_ros.training.config import load_training_config
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.objective import Draws
-from mtv_world_ros.training.run import load_recordings, spread
 from mtv_world_ros.training.trainer import batch_loss, Trainer
+from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_run import load_recordings, spread
 
 _WARM_UP = 2
 

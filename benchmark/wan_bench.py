@@ -20,11 +20,11 @@ from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, sample_latents
 from mtv_world_ros.model.serving.context_parallel import Followers
-from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import prepare
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig
 
 _IMAGE_TOKENS = 257
 #: of a stock Wan image-to-video transformer: noisy 16, mask 4, image 16

@@ -122,7 +122,7 @@ def load_pipeline(
     from mtv_world_ros.model.checkpoint import load_checkpoint
     from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
-    from mtv_world_ros.model.serving.options import ServingOptions
+    from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
 
     options = ServingOptions.parse(serving)

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.bounded_input import Limits, limits, parse_yaml, read_bytes, read_json
-from mtv_world_ros.data.bag.images import compressed_to_rgb
+from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import CalibrationError, ConfigError, ObservationError, TrajectoryError

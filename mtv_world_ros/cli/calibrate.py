@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.options import (
+from mtv_world_ros.cli.shared_options import (
     add_dtype,
     add_model_options,
     add_overwrite,
@@ -26,7 +26,7 @@ from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
-    from mtv_world_ros.evaluation.report.summary import Summary
+    from mtv_world_ros.evaluation.report.evaluation_summary import Summary
     from mtv_world_ros.evaluation.results import EpisodeResult
     from mtv_world_ros.success.calibration import HorizonCurve
 
@@ -122,7 +122,7 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
-    from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+    from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
     from mtv_world_ros.pipeline import SEED_STEP
 
     load = partial(

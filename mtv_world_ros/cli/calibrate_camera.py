@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_source
+from mtv_world_ros.cli.shared_options import add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import names
+from mtv_world_ros.cli.shared_options import names
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -84,7 +84,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _collect(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.sim.collect.collect import collect
+    from mtv_world_ros.sim.collect.collect_dataset import collect
     from mtv_world_ros.sim.collect.episode_maker import CollectConfig
     from mtv_world_ros.sim.collect.record import RecordConfig
     from mtv_world_ros.sim.expert.faults import kinds_named

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_checkpoint, add_model_options, add_overwrite
+from mtv_world_ros.cli.shared_options import add_checkpoint, add_model_options, add_overwrite
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -25,7 +25,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.files import check_free, share_path
 
     check_free(arguments.out, arguments.overwrite)
-    from mtv_world_ros.demo.run import run_demo
+    from mtv_world_ros.demo.run_demo import run_demo
 
     text = run_demo(
         arguments.episode or share_path('resource', 'demo_episode'),

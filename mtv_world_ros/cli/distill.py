@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_dtype
+from mtv_world_ros.cli.shared_options import add_dtype
 from mtv_world_ros.cli.train import add_saving
 
 #: overrides of the preset: a student starts from a trained model, close to its goal
@@ -57,7 +57,7 @@ def _distill(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.training_config import load_training_config
 
     teacher = checkpoint_path(arguments.checkpoint)
     robot = checkpoint_robot(teacher)
@@ -69,7 +69,7 @@ def _distill(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.training.distill import distill, DistillConfig
+    from mtv_world_ros.training.distillation import distill, DistillConfig
 
     settings = DistillConfig(
         num_steps=arguments.steps, teacher_steps=arguments.teacher_steps or 8 * arguments.steps

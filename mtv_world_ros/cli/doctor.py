@@ -8,13 +8,13 @@ import sys
 import tempfile
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_source
+from mtv_world_ros.cli.shared_options import add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.inspection.inspect import Inspector
-    from mtv_world_ros.inspection.report import Inspection
+    from mtv_world_ros.inspection.inspection_report import Inspection
 
 
 #: exit status by verdict; 2 is argparse's
@@ -65,7 +65,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_episode, read_info
     from mtv_world_ros.inspection.inspect import load_inspector
-    from mtv_world_ros.inspection.report import to_text
+    from mtv_world_ros.inspection.inspection_report import to_text
 
     source = load_source(arguments.topics, arguments.calibration)
     robot = arguments.robot or (source.mapping.robot if source.mapping else '')
@@ -89,7 +89,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
 
 def _write(inspector: Inspector, episode: Episode, inspection: Inspection, out: Path) -> None:
     from mtv_world_ros.data.bag.messages import encode_png
-    from mtv_world_ros.inspection.report import to_markdown
+    from mtv_world_ros.inspection.inspection_report import to_markdown
 
     out.mkdir(parents=True, exist_ok=True)
     pictures = {}

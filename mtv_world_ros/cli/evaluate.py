@@ -8,7 +8,7 @@ from pathlib import Path
 import re
 from typing import NamedTuple, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import (
+from mtv_world_ros.cli.shared_options import (
     add_dtype,
     add_model_options,
     add_overwrite,
@@ -26,7 +26,7 @@ from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
-    from mtv_world_ros.evaluation.report.summary import Summary
+    from mtv_world_ros.evaluation.report.evaluation_summary import Summary
     from mtv_world_ros.pipeline import Pipeline
 
 _EPILOG = """\
@@ -187,7 +187,7 @@ def _score(
 ) -> Summary:
     from mtv_world_ros.assembly import assemble_describer, fingerprint, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.evaluation.evaluate import evaluate, Parallel
+    from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
 
     load = partial(
         load_pipeline,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import (
+from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
     add_model_options,
     add_overwrite,

@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 from mtv_world_ros.errors import CheckpointError
 
 if TYPE_CHECKING:
-    from mtv_world_ros.model.wan_import.import_weights import PartReport
+    from mtv_world_ros.model.wan_import.wan_weights import PartReport
 
 #: of the paper, Implementation Details
 PROMPT = 'The robotic arm picks up objects from the table and places them'
@@ -47,7 +47,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.training_config import load_training_config
 
     if not arguments.path.exists():
         raise CheckpointError(
@@ -55,7 +55,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
         )
     config = load_training_config(arguments.preset)
     sampling = config.sampling
-    from mtv_world_ros.model.wan_import.import_weights import import_weights
+    from mtv_world_ros.model.wan_import.wan_weights import import_weights
 
     robot = load_robot(robot_path(config.video.robot))
     config = config.replace(video=config.video.replace(robot=robot.name))

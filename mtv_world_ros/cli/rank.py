@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.options import (
+from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
     add_dtype,
     add_model_options,
@@ -22,9 +22,9 @@ from mtv_world_ros.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from mtv_world_ros.ranking.jobs import Job
     from mtv_world_ros.ranking.policy_list import ListedPolicy
-    from mtv_world_ros.ranking.rank import Checkpoint
+    from mtv_world_ros.ranking.rollout_jobs import Job
+    from mtv_world_ros.ranking.run_jobs import Checkpoint
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -109,10 +109,10 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.ranking.flip_sheet import flip_sheet
     from mtv_world_ros.ranking.optimism import Optimism
     from mtv_world_ros.ranking.policy_list import ListedPolicies
-    from mtv_world_ros.ranking.rank import FOLDER, run_jobs
-    from mtv_world_ros.ranking.report import console, write_ranking
-    from mtv_world_ros.ranking.runner import RolloutConfig
-    from mtv_world_ros.ranking.summary import Summary
+    from mtv_world_ros.ranking.ranking_report import console, write_ranking
+    from mtv_world_ros.ranking.ranking_summary import Summary
+    from mtv_world_ros.ranking.rollout_runner import RolloutConfig
+    from mtv_world_ros.ranking.run_jobs import FOLDER, run_jobs
     from mtv_world_ros.sim.collect.contact_sheet import write_sheet
 
     if arguments.true_episodes < 0:
@@ -176,7 +176,7 @@ def _rank(arguments: argparse.Namespace) -> int:
 
 def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoint:
     from mtv_world_ros.assembly import load_pipeline
-    from mtv_world_ros.ranking.rank import Checkpoint
+    from mtv_world_ros.ranking.run_jobs import Checkpoint
 
     make_pipeline = partial(
         load_pipeline,
@@ -203,13 +203,13 @@ def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:
 
 def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list[Job]:
     from mtv_world_ros.assembly import checkpoint_robot
-    from mtv_world_ros.ranking.jobs import (
+    from mtv_world_ros.ranking.policy_sets import BENCHMARK_TASKS, POLICY_SETS
+    from mtv_world_ros.ranking.rollout_jobs import (
         DEFAULT_POLICIES,
         DEFAULT_TASKS,
         make_jobs,
         policies_named,
     )
-    from mtv_world_ros.ranking.policy_sets import BENCHMARK_TASKS, POLICY_SETS
     from mtv_world_ros.sim.expert.expert import Expert
     from mtv_world_ros.sim.tasks.tasks import tasks_named
 

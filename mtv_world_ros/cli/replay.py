@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 import sys
 
-from mtv_world_ros.cli.options import (
+from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
     add_dtype,
     add_model_options,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_overwrite
+from mtv_world_ros.cli.shared_options import add_overwrite
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import check_free
 

@@ -10,7 +10,7 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_dtype, add_source
+from mtv_world_ros.cli.shared_options import add_dtype, add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.evaluation.results import StoredRollout
-    from mtv_world_ros.training.config import TrainingConfig
-    from mtv_world_ros.training.run import HeldOut, Judge
+    from mtv_world_ros.training.training_config import TrainingConfig
+    from mtv_world_ros.training.training_run import HeldOut, Judge
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -117,7 +117,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.training_config import load_training_config
 
     config = load_training_config(arguments.preset, _overrides(arguments))
     if arguments.dry_run:
@@ -141,7 +141,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.training.run import train
+    from mtv_world_ros.training.training_run import train
 
     source = load_source(arguments.topics, arguments.calibration)
     dtype = choose_dtype(arguments.dtype, arguments.device)
@@ -271,7 +271,7 @@ def held_out(
     """
     if not arguments.sample_every:
         return None
-    from mtv_world_ros.training.run import HeldOut, spread
+    from mtv_world_ros.training.training_run import HeldOut, spread
 
     paths = spread(_paths(arguments), arguments.held_out_episodes)
     both = {path.resolve() for path in paths} & {path.resolve() for path in trained_on}
@@ -329,10 +329,10 @@ def make_judge(
 
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.data.bag_mapping import EpisodeSource
-    from mtv_world_ros.evaluation.evaluate import evaluate
+    from mtv_world_ros.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.evaluation.results import load_rollout, rollout_path
     from mtv_world_ros.model.lora import ADAPTER
-    from mtv_world_ros.training.run import Judged
+    from mtv_world_ros.training.training_run import Judged
 
     def judge(checkpoint: Path, step: int) -> Judged:
         folder = out / f'{step:07d}'

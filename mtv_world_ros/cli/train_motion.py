@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.options import add_overwrite
+from mtv_world_ros.cli.shared_options import add_overwrite
 from mtv_world_ros.files import check_free
 
 
@@ -64,7 +64,7 @@ def _train(arguments: argparse.Namespace) -> int:
         read_tracks,
         train_motion,
     )
-    from mtv_world_ros.training.run import find_episodes
+    from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     set_num_threads(arguments.threads)

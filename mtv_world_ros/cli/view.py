@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.options import add_overwrite
+from mtv_world_ros.cli.shared_options import add_overwrite
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.images import (
+from mtv_world_ros.data.bag.image_decoding import (
     check_compressed,
     check_raw,
     compressed_to_ids,

@@ -14,7 +14,7 @@ import numpy as np
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.metrics.frechet.store import feature_path, FeatureTaker
+from mtv_world_ros.evaluation.metrics.frechet.feature_store import feature_path, FeatureTaker
 from mtv_world_ros.evaluation.metrics.image_quality import ImageQuality
 from mtv_world_ros.evaluation.metrics.scores import (
     find_masks,

@@ -13,7 +13,7 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.inspection.report import broken, Finding, suspicious
+from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicious
 
 Stamps = NDArray[np.int64]
 

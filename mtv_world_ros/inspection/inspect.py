@@ -32,18 +32,18 @@ from mtv_world_ros.inspection.clocks import (
     ClockConfig,
     JointTrack,
 )
-from mtv_world_ros.inspection.motion_residual import (
-    measure_residual,
-    MotionResidual,
-    ResidualConfig,
-)
-from mtv_world_ros.inspection.report import (
+from mtv_world_ros.inspection.inspection_report import (
     broken,
     Finding,
     Inspection,
     not_checked,
     Section,
     suspicious,
+)
+from mtv_world_ros.inspection.motion_residual import (
+    measure_residual,
+    MotionResidual,
+    ResidualConfig,
 )
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,

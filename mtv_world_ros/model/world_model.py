@@ -33,8 +33,8 @@ from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
 from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.memory_check import check_memory
-from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import decoder_of, prepare
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 
 if TYPE_CHECKING:
     from mtv_world_ros.geometry.robot import RobotModel

@@ -29,7 +29,7 @@ from mtv_world_ros.evaluation.metrics.statistics import (
     MIN_SCENES,
     UNKNOWN,
 )
-from mtv_world_ros.ranking.jobs import Judged, Result
+from mtv_world_ros.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, parse_variant
 
 #: who judges: field of a result -> words

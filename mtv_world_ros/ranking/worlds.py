@@ -22,7 +22,7 @@ from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
-from mtv_world_ros.ranking.jobs import Judged
+from mtv_world_ros.ranking.rollout_jobs import Judged
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.sim.collect.record import START_NS
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation

@@ -19,8 +19,8 @@ from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
-from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.encoding import Encoders
+from mtv_world_ros.training.training_config import TrainingConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,7 @@ from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig
 
 #: bytes of a float32 number: trained weights, their averages, gradients, Adam's two moments
 _FLOAT = 4

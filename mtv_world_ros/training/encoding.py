@@ -23,8 +23,8 @@ from mtv_world_ros.model.encoders import ImageEncoder
 from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.training.clips.batches import Batch
-from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
 from mtv_world_ros.training.objective import Draws, latent_weights, pixel_weights, pooled_weights
+from mtv_world_ros.training.training_config import AugmentConfig, ObjectiveConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

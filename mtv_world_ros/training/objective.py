@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.training.config import ObjectiveConfig
+from mtv_world_ros.training.training_config import ObjectiveConfig
 
 
 class Draws:

@@ -16,7 +16,7 @@ from torch import Tensor
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import Weights
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig
 
 #: folder of the state in that of the training
 STATE = 'state'

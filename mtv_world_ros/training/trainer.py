@@ -32,10 +32,9 @@ from mtv_world_ros.training.averaged_weights import Weights
 from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.clips.batches import Batch, BatchSource
 from mtv_world_ros.training.clips.fit_actions import transformer_arguments
-from mtv_world_ros.training.config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.training.distributed import memory_errors_named, Processes
 from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.training.latent_cache.clips import CachedSource
+from mtv_world_ros.training.latent_cache.latent_clips import CachedSource
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
@@ -53,6 +52,7 @@ from mtv_world_ros.training.resume import (
     STATE,
 )
 from mtv_world_ros.training.self_rollout import SelfRollout
+from mtv_world_ros.training.training_config import OptimizerConfig, TrainingConfig
 
 #: losses averaged for the progress bar and the log
 _WINDOW = 50

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data.bag.images import compressed_to_ids, compressed_to_rgb, raw_to_rgb
+from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb, raw_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data_types import ByteArray

@@ -7,7 +7,7 @@ import pytest
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import DescriptionError
-from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.vision.describers.scene_objects import SceneObject
 
 

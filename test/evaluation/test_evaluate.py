@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 

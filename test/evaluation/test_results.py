@@ -6,7 +6,7 @@ import pytest
 
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation import results
-from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.results import (
     join,
     load_rollout,

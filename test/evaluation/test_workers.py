@@ -4,7 +4,7 @@ import pytest
 from small_episodes import persistence
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.evaluation.evaluate import evaluate, make_jobs, Parallel
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate, make_jobs, Parallel
 from mtv_world_ros.files import plain
 
 QUIET = {'show_progress': False}

@@ -13,7 +13,7 @@ from wan_files import CLIP_DIM, DIM, FFN, TEXT_DIM, TRANSFORMER
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.lora import ADAPTER, Adapters, add_adapter, save_adapter
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config
 
 RANK = 4
 

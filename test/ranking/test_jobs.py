@@ -1,7 +1,7 @@
 import pytest
 
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
-from mtv_world_ros.ranking.jobs import DEFAULT_POLICIES, make_jobs, policies_named
+from mtv_world_ros.ranking.rollout_jobs import DEFAULT_POLICIES, make_jobs, policies_named
 
 
 def test_policies_are_named_once_each():

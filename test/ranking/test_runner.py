@@ -5,15 +5,15 @@ import pytest
 
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ConfigError, PolicyError, TrajectoryError
-from mtv_world_ros.ranking.jobs import make_jobs
-from mtv_world_ros.ranking.rank import Checkpoint, run_jobs
-from mtv_world_ros.ranking.runner import (
+from mtv_world_ros.ranking.rollout_jobs import make_jobs
+from mtv_world_ros.ranking.rollout_runner import (
     ComparisonRunner,
     Results,
     RolloutConfig,
     RolloutRunner,
     WantedJob,
 )
+from mtv_world_ros.ranking.run_jobs import Checkpoint, run_jobs
 
 TASK = 'place_block_a2b_left'
 
@@ -117,7 +117,7 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
             return Results(tuple(result if k in wanted.checkpoints else None for k in (0, 1)))
 
     monkeypatch.setattr(
-        'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Counting()
+        'mtv_world_ros.ranking.run_jobs.make_runner', lambda make_pipeline, config: Counting()
     )
 
     def run(*names, overwrite=False):
@@ -165,7 +165,7 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
             return Results((make_result('expert', 1, True, 0.9, seed=wanted.job.seed),))
 
     monkeypatch.setattr(
-        'mtv_world_ros.ranking.rank.make_runner', lambda make_pipeline, config: Failing()
+        'mtv_world_ros.ranking.run_jobs.make_runner', lambda make_pipeline, config: Failing()
     )
     jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
     alone = Checkpoint(make_pipeline=lambda: None, out=tmp_path, settings={})

@@ -5,9 +5,9 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.ranking.jobs import Job, Result
-from mtv_world_ros.ranking.report import markdown, remarks, write_ranking
-from mtv_world_ros.ranking.summary import Summary
+from mtv_world_ros.ranking.ranking_report import markdown, remarks, write_ranking
+from mtv_world_ros.ranking.ranking_summary import Summary
+from mtv_world_ros.ranking.rollout_jobs import Job, Result
 
 #: (policy, true outcomes, imagined probabilities) of four episodes
 POLICIES = (

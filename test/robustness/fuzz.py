@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from mtv_world_ros.data.bag.images import compressed_to_rgb
+from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, parse_joint_trajectory, typestore
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.recover import recover

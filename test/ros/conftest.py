@@ -28,7 +28,7 @@ from mtv_world_ros.data_types import CameraModel  # noqa: E402
 from mtv_world_ros.files import share_path  # noqa: E402
 from mtv_world_ros.geometry.calibration_file import save_calibration  # noqa: E402
 from mtv_world_ros.ros.messages.conversions import values_of  # noqa: E402
-from mtv_world_ros.ros.messages.images import to_compressed, to_image  # noqa: E402
+from mtv_world_ros.ros.messages.image_messages import to_compressed, to_image  # noqa: E402
 from mtv_world_ros.ros.messages.stamps import NANO, to_stamp  # noqa: E402
 
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)

@@ -11,7 +11,7 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 TINY = {
     'transformer.num_attention_heads': 2,

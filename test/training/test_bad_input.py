@@ -23,10 +23,10 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.resume import DiskError
-from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 Change = Callable[[BagMessage], list[bytes]]

@@ -18,10 +18,10 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.training.clips.fit_actions import fit_actions
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.objective import Draws, pooled_weights
-from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import _kept
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']

@@ -16,14 +16,14 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import HistoryConfig, TrainingConfig
-from mtv_world_ros.training.distill import (
+from mtv_world_ros.training.distillation import (
     distill,
     DistillConfig,
     DistillTrainer,
     student_config,
 )
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import HistoryConfig, TrainingConfig
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 

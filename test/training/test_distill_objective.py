@@ -9,7 +9,7 @@ from torch import nn, Tensor
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.parts import build_scheduler, Scheduler
 from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.training.distill import (
+from mtv_world_ros.training.distillation import (
     as_predicted,
     follow,
     path_sigmas,

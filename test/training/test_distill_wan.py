@@ -13,8 +13,8 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.lora import add_adapter, save_adapter
-from mtv_world_ros.training.config import load_training_config
-from mtv_world_ros.training.distill import distill, DistillConfig
+from mtv_world_ros.training.distillation import distill, DistillConfig
+from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 SHORT = {'optimizer.steps': 1, 'optimizer.batch_size': 1, 'optimizer.learning_rate': 1e-8}

@@ -18,9 +18,9 @@ import yaml
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import TrainingConfig
 
 SCRIPT = Path(__file__).with_name('train_recorded.py')
 ROOT = Path(__file__).parents[2]

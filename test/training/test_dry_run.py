@@ -7,8 +7,8 @@ import torch
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.dry_run import step_cost
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 
 @pytest.mark.parametrize('control', ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens'])

@@ -7,9 +7,9 @@ import torch
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.model.conditioning import Conditioning
-from mtv_world_ros.training.config import AugmentConfig, ObjectiveConfig
 from mtv_world_ros.training.encoding import drop_conditions
 from mtv_world_ros.training.objective import Draws
+from mtv_world_ros.training.training_config import AugmentConfig, ObjectiveConfig
 
 COUNT = 2000
 

@@ -13,8 +13,8 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.video import decode_video
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.training.config import TrainingConfig
-from mtv_world_ros.training.run import HeldOut, Judged, train
+from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.training.training_run import HeldOut, Judged, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 

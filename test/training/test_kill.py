@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 import torch
 import yaml
 
-from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import TrainingConfig
 
 SCRIPT = Path(__file__).with_name('train_killed.py')
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
-from mtv_world_ros.training.config import ObjectiveConfig
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
@@ -18,6 +17,7 @@ from mtv_world_ros.training.objective import (
     sample_loss,
     sigma_weights,
 )
+from mtv_world_ros.training.training_config import ObjectiveConfig
 
 CONFIG = ObjectiveConfig()
 

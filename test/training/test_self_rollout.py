@@ -19,13 +19,13 @@ from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.training import self_rollout
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import (
+from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import (
     HistoryConfig,
     load_training_config,
     SelfRolloutConfig,
     TrainingConfig,
 )
-from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 

@@ -16,9 +16,13 @@ from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import load_training_config, OptimizerConfig, TrainingConfig
-from mtv_world_ros.training.run import find_episodes, train
 from mtv_world_ros.training.trainer import learning_rate, Trainer
+from mtv_world_ros.training.training_config import (
+    load_training_config,
+    OptimizerConfig,
+    TrainingConfig,
+)
+from mtv_world_ros.training.training_run import find_episodes, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 

@@ -15,7 +15,7 @@ from wan_files import write_videox
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.card import check_same_model, read_card
-from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config
 
 SMALL = ['--dtype', 'float32', '--threads', '1']
 

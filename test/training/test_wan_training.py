@@ -21,9 +21,9 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.base import load_base
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
-from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 CPU = torch.device('cpu')

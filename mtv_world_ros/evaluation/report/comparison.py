@@ -11,7 +11,7 @@ from typing import NamedTuple
 from mtv_world_ros.documents import Table
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
 from mtv_world_ros.evaluation.report import tables
-from mtv_world_ros.evaluation.report.summary import Group, SEEN, Summary
+from mtv_world_ros.evaluation.report.evaluation_summary import Group, SEEN, Summary
 from mtv_world_ros.files import plain, write_json, write_whole
 
 #: tasks beside each other in a table

@@ -10,9 +10,9 @@ from mtv_world_ros.documents import DASH, number, render
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.metrics.statistics import METHOD
 from mtv_world_ros.evaluation.report import details
-from mtv_world_ros.evaluation.report.clips import Clip, make_clip
 from mtv_world_ros.evaluation.report.headline import cell, headline, horizon, mark
 from mtv_world_ros.evaluation.report.read_back import Evaluated, Pick, picks, read_evaluations
+from mtv_world_ros.evaluation.report.rollout_clips import Clip, make_clip
 from mtv_world_ros.files import write_whole
 
 #: of all embedded videos [bytes]; base64 adds a third

@@ -26,7 +26,7 @@ from torch import distributed, Tensor
 from torch.distributed.device_mesh import init_device_mesh
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelError
-from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import ContextAttnProcessor
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 

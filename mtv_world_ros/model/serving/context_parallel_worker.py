@@ -15,8 +15,8 @@ import torch
 
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving.context_parallel import join, open_store, receive, split
-from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import prepare
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 

@@ -18,7 +18,7 @@ from mtv_world_ros.errors import ModelMemoryError
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
 from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 

@@ -22,7 +22,7 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
 from mtv_world_ros.model.parts import Autoencoder
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 

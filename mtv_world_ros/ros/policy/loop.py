@@ -13,7 +13,7 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, W
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.ros.bags.player import ENDS
 from mtv_world_ros.ros.messages.rejection import Rejection
-from mtv_world_ros.ros.policy.parameters import PolicySettings
+from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor, Answer
 from mtv_world_ros.ros.policy.predicted_frames import chunk_stamps, PredictedFrames
 

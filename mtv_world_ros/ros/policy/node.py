@@ -25,7 +25,7 @@ from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.policy.loop import PolicyLoop
-from mtv_world_ros.ros.policy.parameters import PolicySettings
+from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor
 from mtv_world_ros.ros.policy.predicted_frames import PredictedFrames
 from mtv_world_ros.ros.run_node import run

@@ -10,7 +10,7 @@ from sensor_msgs.msg import Image, JointState
 from mtv_world_ros.data_types import Observation
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.ros.messages.conversions import to_positions
-from mtv_world_ros.ros.messages.images import to_rgb
+from mtv_world_ros.ros.messages.image_messages import to_rgb
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 
 

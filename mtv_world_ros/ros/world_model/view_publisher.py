@@ -8,7 +8,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.ros.messages.images import scale_camera_info, to_compressed, to_image
+from mtv_world_ros.ros.messages.image_messages import scale_camera_info, to_compressed, to_image
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import create_publisher
 

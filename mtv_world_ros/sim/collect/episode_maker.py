@@ -13,7 +13,7 @@ from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import GO_ON
-from mtv_world_ros.sim.collect.jobs import episode_seed, Job
+from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.collect.siblings import BoundarySearch
 from mtv_world_ros.sim.expert.expert import Expert, ExpertConfig

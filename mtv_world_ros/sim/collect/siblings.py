@@ -18,7 +18,7 @@ from tqdm import tqdm
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.files import write_json
 from mtv_world_ros.parallel import run_all
-from mtv_world_ros.sim.collect.jobs import episode_seed, Job
+from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, PolicyVariant

@@ -34,7 +34,7 @@ from mtv_world_ros.training.clips.past import (
     lead_before,
     Past,
 )
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 

@@ -13,7 +13,7 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, STATISTICS, TRAJECTORY_VIDEO
-from mtv_world_ros.training.config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig
 
 #: number of clips used, spread evenly
 _MOST_CLIPS = 4096

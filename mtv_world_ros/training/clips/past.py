@@ -15,7 +15,7 @@ import numpy as np
 
 from mtv_world_ros.data.recording import Clip, cut_clip, frame_indices, Recording
 from mtv_world_ros.data_types import ByteArray, History, WorldModelSpec
-from mtv_world_ros.training.config import HistoryConfig, SelfRolloutConfig
+from mtv_world_ros.training.training_config import HistoryConfig, SelfRolloutConfig
 
 
 class Past(NamedTuple):

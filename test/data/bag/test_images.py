@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.bag.images import compressed_to_ids, compressed_to_rgb, raw_to_rgb
+from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb, raw_to_rgb
 from mtv_world_ros.errors import ObservationError
 
 RED, GREEN = (200, 10, 20), (30, 150, 40)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.evaluation.report.comparison import (
     lines,

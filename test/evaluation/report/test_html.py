@@ -10,7 +10,7 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.evaluate import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.report.charts import (
     Dot,
     dot_chart,
@@ -19,9 +19,9 @@ from mtv_world_ros.evaluation.report.charts import (
     Point,
     scatter_chart,
 )
-from mtv_world_ros.evaluation.report.clips import make_clip, outlined, OUTLINES
 from mtv_world_ros.evaluation.report.comparison import write_comparison
 from mtv_world_ros.evaluation.report.html import write_report
+from mtv_world_ros.evaluation.report.rollout_clips import make_clip, outlined, OUTLINES
 from mtv_world_ros.evaluation.results import load_rollout, rollout_path
 
 EVIL_NAME = '<script>alert("name")<x onload=y>'

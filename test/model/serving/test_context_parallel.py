@@ -13,7 +13,7 @@ from wan_files import TRANSFORMER
 
 from mtv_world_ros.errors import ConfigError, ModelError
 from mtv_world_ros.model.serving.context_parallel import Followers, open_store
-from mtv_world_ros.model.serving.options import ServingOptions
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 #: 1 + 3 token frames of 4 x 4 tokens; three heads do not divide among two processes

@@ -28,11 +28,11 @@ from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import memory_check, prepare
-from mtv_world_ros.model.serving.options import ServingOptions
 from mtv_world_ros.model.serving.prepare import Float8Linear, to_float8
+from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.training.config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config
 
 
 @pytest.fixture(scope='module')

@@ -17,7 +17,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_trajectory,
     values_of,
 )
-from mtv_world_ros.ros.messages.images import (
+from mtv_world_ros.ros.messages.image_messages import (
     scale_camera_info,
     to_compressed,
     to_image,

@@ -61,7 +61,13 @@ def test_an_imagined_episode_starts_from_what_the_cameras_show(tmp_path, ros):
     world = ros.start_node(tmp_path, *strict, *ros.FROZEN, **options)
     policy = ros.start_policy(tmp_path, *ros.FROZEN, **options)
     out = tmp_path / 'out'
-    command = [sys.executable, '-m', 'mtv_world_ros.ros.episodes.runner', str(out), '--live']
+    command = [
+        sys.executable,
+        '-m',
+        'mtv_world_ros.ros.episodes.episode_runner',
+        str(out),
+        '--live',
+    ]
     command += ['--views', 'low', 'high', '--count', '2', '--max-chunks', '2', '--no-record']
     runner = ros.NodeProcess(command, tmp_path / 'runner.log')
     client = ros.Client()

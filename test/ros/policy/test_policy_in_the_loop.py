@@ -61,7 +61,7 @@ class Stack:
         episodes = [write_episode(folder, task, ros) for task in TASKS]
         arguments = [folder / 'out', '--views', 'low', 'high', '--seed', SEED, '--episodes']
         arguments += [*episodes, '--heartbeat-timeout', '3']
-        command = [sys.executable, '-m', 'mtv_world_ros.ros.episodes.runner']
+        command = [sys.executable, '-m', 'mtv_world_ros.ros.episodes.episode_runner']
         self.runner = ros.NodeProcess([*command, *map(str, arguments)], folder / 'runner.log')
         self.diagnostics = []
 

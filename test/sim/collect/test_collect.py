@@ -16,9 +16,9 @@ from rosbags.typesys import get_typestore, Stores
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import iter_messages, read_episode, read_info
 from mtv_world_ros.errors import EpisodeError, SimulatorError
-from mtv_world_ros.sim.collect.collect import collect, locked
+from mtv_world_ros.sim.collect.collect_dataset import collect, locked
+from mtv_world_ros.sim.collect.episode_jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.sim.collect.record import true_poses
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
@@ -323,7 +323,7 @@ def test_81_frames_at_16_fps_and_288x384_can_be_cut(tmp_path, data_set):
     from mtv_world_ros.data.recording import clip_starts, load_recording
     from mtv_world_ros.files import share_path
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.training.config import load_training_config
+    from mtv_world_ros.training.training_config import load_training_config
 
     del data_set  # skips without OpenGL
     words = ['collect', '--task', 'stack_blocks_two', '--episodes', '1', '--fps', '16']

@@ -5,7 +5,7 @@ import pytest
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
-from mtv_world_ros.sim.collect.collect import collect
+from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.siblings import find_boundary, SIBLINGS_FILE
 from mtv_world_ros.sim.world.randomize import RandomizationConfig

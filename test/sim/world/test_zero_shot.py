@@ -7,9 +7,9 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.sim.collect.collect import collect
+from mtv_world_ros.sim.collect.collect_dataset import collect
+from mtv_world_ros.sim.collect.episode_jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.sim.collect.episode_maker import cameras_of, CollectConfig
-from mtv_world_ros.sim.collect.jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import task_named, TASKS, tasks_named
 from mtv_world_ros.sim.world.cameras import camera_model, CameraJitter, CameraMoves, CAMERAS

@@ -16,9 +16,13 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.past import draw_past, history_before
-from mtv_world_ros.training.config import HistoryConfig, load_training_config, TrainingConfig
-from mtv_world_ros.training.distill import student_config
+from mtv_world_ros.training.distillation import student_config
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import (
+    HistoryConfig,
+    load_training_config,
+    TrainingConfig,
+)
 
 HISTORY = HistoryConfig(num_frames=4, reference='first_frame')
 

@@ -18,10 +18,10 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.conditioning import condition, encode_chunk
 from mtv_world_ros.training.base import Base, load_base
 from mtv_world_ros.training.clips.batches import BatchSource
-from mtv_world_ros.training.config import load_training_config, TrainingConfig
 from mtv_world_ros.training.distributed import Processes
-from mtv_world_ros.training.latent_cache.clips import cached, CachedSource
+from mtv_world_ros.training.latent_cache.latent_clips import cached, CachedSource
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 CPU = torch.device('cpu')
 

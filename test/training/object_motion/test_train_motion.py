@@ -15,7 +15,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import load_network
-from mtv_world_ros.sim.collect.collect import collect
+from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
 from mtv_world_ros.sim.expert.faults import kinds_of

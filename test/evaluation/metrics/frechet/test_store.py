@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.evaluation.evaluate import evaluate
-from mtv_world_ros.evaluation.metrics.frechet.store import distances, FeatureTaker, load_features
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.evaluation.metrics.frechet.feature_store import (
+    distances,
+    FeatureTaker,
+    load_features,
+)
 
 
 def mean_colour(frames):
@@ -60,7 +64,7 @@ def test_broken_file_is_an_error_and_a_missing_one_is_not_measured(tmp_path):
 def test_distances_reach_metrics_and_are_kept_for_the_next_run(
     make_pipeline, episodes, oracle, tmp_path, monkeypatch
 ):
-    module = 'mtv_world_ros.evaluation.evaluate'
+    module = 'mtv_world_ros.evaluation.evaluate_episodes'
     monkeypatch.setattr(f'{module}.frame_features', lambda path, device: mean_colour)
     options = {'fid_weights': tmp_path / 'w.pth', 'show_progress': False}
     pipeline = make_pipeline(oracle)

@@ -45,11 +45,11 @@ from mtv_world_ros.model.sampler import denoise, flow_of, set_timesteps
 from mtv_world_ros.model.transformer.transformer import copy_of
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.training.clips.batches import Batch
-from mtv_world_ros.training.config import LoraSettings, TrainingConfig, VideoConfig
 from mtv_world_ros.training.encoding import encode_batch, Encoders
 from mtv_world_ros.training.objective import Draws, Loss, sample_loss
-from mtv_world_ros.training.run import train
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import LoraSettings, TrainingConfig, VideoConfig
+from mtv_world_ros.training.training_run import train
 
 _SETTINGS = 'distillation.json'
 

@@ -9,7 +9,7 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
-from mtv_world_ros.data.bag import images
+from mtv_world_ros.data.bag import image_decoding
 from mtv_world_ros.data_types import ByteArray, CameraModel
 from mtv_world_ros.geometry.camera import with_camera_info
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
@@ -28,11 +28,11 @@ def check(message: Image | CompressedImage) -> None:
     if isinstance(message, CompressedImage):
         known = any(word in message.format.lower() for word in _FORMATS)
         with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
-            images.check_compressed(message.format, data)
+            image_decoding.check_compressed(message.format, data)
         return
-    known = message.encoding in images.ENCODINGS
+    known = message.encoding in image_decoding.ENCODINGS
     with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
-        images.check_raw(
+        image_decoding.check_raw(
             encoding=message.encoding,
             height=message.height,
             width=message.width,
@@ -51,8 +51,8 @@ def to_rgb(message: Image | CompressedImage) -> ByteArray:
     data = np.frombuffer(message.data, np.uint8)
     with rejected_as(Reason.IMAGE_DATA):
         if isinstance(message, CompressedImage):
-            return images.compressed_to_rgb(message.format, data)
-        return images.raw_to_rgb(
+            return image_decoding.compressed_to_rgb(message.format, data)
+        return image_decoding.raw_to_rgb(
             data,
             encoding=message.encoding,
             height=message.height,

@@ -28,11 +28,11 @@ from mtv_world_ros.training.base import Base
 from mtv_world_ros.training.clips.batches import Batch, BatchSource, pasts
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.training.clips.past import draw_past, history_before
-from mtv_world_ros.training.config import HistoryConfig, ObjectiveConfig, TrainingConfig
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.training.latent_cache.store import digest_of, LatentCache
+from mtv_world_ros.training.latent_cache.latent_store import digest_of, LatentCache
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
+from mtv_world_ros.training.training_config import HistoryConfig, ObjectiveConfig, TrainingConfig
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
 #: to be increased when the stored data or their computation change

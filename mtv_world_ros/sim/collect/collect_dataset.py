@@ -26,13 +26,13 @@ from mtv_world_ros.sim.collect.dataset_card import (
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.sim.collect.dataset_readme import write_readme
+from mtv_world_ros.sim.collect.episode_jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
 from mtv_world_ros.sim.collect.episode_maker import (
     CollectConfig,
     EpisodeMaker,
     plain_config,
     Spent,
 )
-from mtv_world_ros.sim.collect.jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
 from mtv_world_ros.sim.collect.siblings import (
     SceneJob,
     search_siblings,

@@ -14,9 +14,9 @@ import numpy as np
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
-from mtv_world_ros.ranking.jobs import Job, Judged, Result
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.ranking.optimism import last_frames_png
+from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
 from mtv_world_ros.ranking.worlds import (
     ImaginedWorld,
     judge,

@@ -18,17 +18,17 @@ from tqdm import tqdm
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import DescriptionError, EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
-from mtv_world_ros.evaluation.metrics.frechet.features import clip_features, frame_features
-from mtv_world_ros.evaluation.metrics.frechet.store import (
+from mtv_world_ros.evaluation.metrics.frechet.feature_store import (
     distances,
     feature_path,
     FeatureTaker,
     load_features,
 )
+from mtv_world_ros.evaluation.metrics.frechet.features import clip_features, frame_features
 from mtv_world_ros.evaluation.metrics.image_quality import image_quality
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.evaluation.references import round_trip
-from mtv_world_ros.evaluation.report.summary import Group, Summary
+from mtv_world_ros.evaluation.report.evaluation_summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
 from mtv_world_ros.files import check_same_settings, plain, write_json

@@ -20,8 +20,8 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
     rates,
 )
 from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson, Interval, wilson
-from mtv_world_ros.ranking.jobs import Job, Judged, Result
 from mtv_world_ros.ranking.optimism import Optimism
+from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'

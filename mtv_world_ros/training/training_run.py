@@ -36,13 +36,13 @@ from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions
-from mtv_world_ros.training.config import TrainingConfig
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.training.latent_cache.clips import cached, CachedSource
+from mtv_world_ros.training.latent_cache.latent_clips import cached, CachedSource
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
-from mtv_world_ros.data.bag.images import raw_to_rgb
+from mtv_world_ros.data.bag.image_decoding import raw_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.demo.processes import DemoOptions, NODE, record_through_node
+from mtv_world_ros.demo.node_processes import DemoOptions, NODE, record_through_node
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation.metrics.scores import (
     episode_means,

@@ -13,10 +13,10 @@ from mtv_world_ros.documents import DASH, render, Table
 from mtv_world_ros.evaluation.metrics.statistics import MIN_SCENES
 from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
 from mtv_world_ros.files import write_json, write_whole
-from mtv_world_ros.ranking.jobs import THRESHOLD
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
-from mtv_world_ros.ranking.summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
+from mtv_world_ros.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
+from mtv_world_ros.ranking.rollout_jobs import THRESHOLD
 
 TITLE = 'Policy ranking'
 #: hues of the report's style sheet

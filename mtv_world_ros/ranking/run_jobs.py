@@ -17,8 +17,8 @@ from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.ranking.jobs import Job, Result
-from mtv_world_ros.ranking.runner import make_runner, RolloutConfig, WantedJob
+from mtv_world_ros.ranking.rollout_jobs import Job, Result
+from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
 
 FOLDER = 'rollouts'
 
