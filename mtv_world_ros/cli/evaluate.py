@@ -1,4 +1,4 @@
-"""`mtv-world evaluate`."""
+"""`mtv-world evaluate`, and `report`, which writes the HTML report again."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from mtv_world_ros.cli.shared_options import (
     threads_of_workers,
 )
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.report.evaluation_summary import Summary
     from mtv_world_ros.pipeline import Pipeline
+
 
 _EPILOG = """\
 DIR gets metrics.json, rows.csv, tables.md, numbers.csv, paper_tables.md and report.html. Several
@@ -37,7 +39,12 @@ again continues an interrupted run.
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Adds the commands."""
+    _add_evaluate(commands)
+    _add_report(commands)
+
+
+def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'evaluate', help='score checkpoints on recorded episodes', epilog=_EPILOG
     )
@@ -226,3 +233,37 @@ def _score(
         fvd_weights=arguments.fvd_weights,
         source=load_source(arguments.topics, arguments.calibration),
     )
+
+
+def _add_report(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'report', help='write the HTML report of one or several evaluations again'
+    )
+    parser.add_argument(
+        'evaluations', type=Path, nargs='+', help="folders that 'mtv-world evaluate --out' wrote"
+    )
+    parser.add_argument(
+        '--out', type=Path, help="HTML file; default: the evaluation's report.html, written anew"
+    )
+    add_overwrite(parser)
+    parser.set_defaults(handler=_report)
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    first, *others = arguments.evaluations
+    if others and arguments.out is None:
+        raise ConfigError(
+            f'{1 + len(others)} evaluations go into one page; give --out FILE: the page of '
+            f"'{first}' stays as it is"
+        )
+    if arguments.out is not None:
+        check_free(arguments.out, arguments.overwrite)
+    from mtv_world_ros.evaluation.report.read_back import check_evaluation
+
+    for folder in arguments.evaluations:
+        check_evaluation(folder)
+    from mtv_world_ros.evaluation.report.html import write_report
+
+    path = arguments.out or first / 'report.html'
+    print(f'written: {write_report(arguments.evaluations, path)}')
+    return 0
