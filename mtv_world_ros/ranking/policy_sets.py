@@ -26,6 +26,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-fumble-0.4',
         'expert-grip-0.6',
         'expert-play-2',
+        'expert-odd-3',
     ),
     'calibrate': (
         'expert',
@@ -73,6 +74,15 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-snag-0.7',
         'expert-brush-0.06',
         'expert-brush-0.1',
+        # added after the second measurement, before any on these
+        'expert-soft-0.5',
+        'expert-soft-0.8',
+        'expert-dive-0.9',
+        'expert-dive-1',
+        'expert-flick-0.06',
+        'expert-flick-0.1',
+        'expert-knock-0.01',
+        'expert-knock-0.03',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

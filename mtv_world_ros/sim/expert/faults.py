@@ -79,9 +79,13 @@ FAULTS: Mapping[str, FaultKind] = {
     'late': _kind('timing', 'train', 0.6, 3.0, 's', 'the grippers follow this much later'),
     'early': _kind('timing', 'test', 0.5, 2.0, 's', 'the grippers go this much ahead'),
     'hasty': _kind('timing', 'test', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
+    'soft': _kind('timing', 'test', 0.6, 1.5, 's', 'time constant with which the grippers follow'),
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
+    'dive': _kind(
+        'height', 'test', 1.0, 1.0, '', 'share that lacks of its height before it goes down'
+    ),
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
     # lateral
     'shift': _kind(
@@ -138,6 +142,9 @@ FAULTS: Mapping[str, FaultKind] = {
         'share of its range that the gripper opens on the way',
     ),
     'snag': _kind('release', 'test', 0.8, 1.0, '', 'share that lacks of how far it lets go'),
+    'flick': _kind(
+        'release', 'test', 0.08, 0.15, 'm', 'it goes this far sideways while the fingers open'
+    ),
     'blink': _kind(
         'release', 'test', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
     ),
@@ -152,6 +159,18 @@ FAULTS: Mapping[str, FaultKind] = {
         6,
         '',
         'number of way points drawn at random: about the object, or where the gripper is',
+    ),
+    'odd': _kind(
+        'any',
+        'train',
+        3,
+        8,
+        '',
+        'number of runs of one to three way points with another opening, place or turn, or a '
+        'detour, drawn at random',
+    ),
+    'knock': _kind(
+        'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push what is at the goal before it'
     ),
     'brush': _kind(
         'collision', 'test', 0.04, 0.1, 'm', 'it goes this far sideways before it rises again'
@@ -384,6 +403,7 @@ def with_faults(
     positions = _late(np.array(plan.positions), grippers, round(variant.size('late') / period))
     positions = _early(positions, grippers, round(variant.size('early') / period))
     positions = _hang(positions, grippers, opens, round(variant.size('hang') / period))
+    positions = _soft(positions, grippers, variant.size('soft') / period)
     if variant.size('stall'):
         share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.6)
         positions = _stall(
@@ -449,6 +469,17 @@ def _hang(positions: FloatArray, grippers: list[int], opens: FloatArray, num: in
     whole, delayed = _delayed(positions, num)
     both = np.stack([whole[:, grippers], delayed[:, grippers]]) * opens
     whole[:, grippers] = both.min(axis=0) * opens
+    return whole
+
+
+def _soft(positions: FloatArray, grippers: list[int], constant: float) -> FloatArray:
+    """(T, J): the grippers follow with a first-order lag, its time constant in samples."""
+    if not constant:
+        return positions
+    whole, share = positions.copy(), 1 - np.exp(-1 / constant)
+    for row in range(1, len(whole)):
+        last = whole[row - 1, grippers]
+        whole[row, grippers] = last + share * (positions[row, grippers] - last)
     return whole
 
 

@@ -21,6 +21,8 @@ _TRY_LIFT_M = 0.04
 _MOST_STOPS = 40
 #: a way point of play: standard deviations in the plane [m], in yaw [rad]; largest height [m]
 _PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
+#: an odd way point: standard deviations of its place [m], yaw and lean [rad]; the longest run
+_ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +180,10 @@ def _hasty(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('close',), lambda stop: stop.moved(_up(size)))
 
 
+def _flick(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('open', 'retreat'), lambda stop: stop.moved(size * side.anywhere))
+
+
 def _clutch(stops: Stops, size: float, side: _Side) -> Stops:
     released = stops[_first(stops, 'open')].opening
     return _changed(stops, ('retreat',), lambda s: replace(s, opening=released * (1 - size)))
@@ -231,21 +237,59 @@ def _push(stops: Stops, size: float, side: _Side) -> Stops:
     return [above.moved(way), replace(grasp, phase='above').moved(way), *stops[1:]]
 
 
+def _dive(stops: Stops, size: float, side: _Side) -> Stops:
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    return [above.moved(size * (grasp.position - above.position)), *stops[1:]]
+
+
 def _sweep(stops: Stops, size: float, side: _Side) -> Stops:
     """Shut fingers come down beside the object and push it across the fingers."""
     above, grasp = stops[0], stops[_first(stops, 'grasp')]
-    away = -0.07 * side.across
+    return [*_pushed(grasp, size, above.position - grasp.position, side.across), *stops]
+
+
+def _knock(stops: Stops, size: float, side: _Side) -> Stops:
+    """The same at the goal, lower than where the object is let go."""
+    lower = stops[_first(stops, 'lower')]
+    floor = stops[_first(stops, 'grasp')].position[2]
+    place = lower.position - _up(min(0.02, max(lower.position[2] - floor, 0.0)))
+    there = replace(lower, position=place)
+    return [*_pushed(there, size, _up(0.09), side.anywhere), *stops]
+
+
+def _pushed(at: WayPoint, size: float, rise: FloatArray, to: FloatArray) -> Stops:
+    """Down beside a way point, shut, and through it until `size` behind it; up again."""
+    shut = replace(at, phase='above', opening=0.0)
     # half a finger and half a small object lie between the tool and the object's centre
-    end = (size - 0.03) * side.across
-    shut = replace(grasp, phase='above', opening=0.0)
-    rise = above.position - grasp.position
-    return [
-        shut.moved(away + rise),
-        shut.moved(away),
-        shut.moved(end),
-        shut.moved(end + rise),
-        *stops,
-    ]
+    away, end = -0.07 * to, (size - 0.03) * to
+    return [shut.moved(away + rise), shut.moved(away), shut.moved(end), shut.moved(end + rise)]
+
+
+def _odd(stops: Stops, size: float, side: _Side) -> Stops:
+    """Runs of way points drawn at random, each with one thing that is not the expert's."""
+    rng, floor = side.play, min(stop.position[2] for stop in stops)
+    for _ in range(round(size)):
+        first = int(rng.integers(len(stops) - 1))
+        end = min(first + int(rng.integers(1, _ODD_RUN + 1)), len(stops) - 1)
+        way, opening = rng.normal(0.0, _ODD_M, 3), float(rng.uniform())
+        yaw, lean = rng.normal(0.0, (_ODD_YAW_RAD, _ODD_LEAN_RAD))
+        match str(rng.choice(['opening', 'place', 'turn', 'detour'], p=[0.4, 0.2, 0.2, 0.2])):
+            case 'opening':
+                run = [replace(s, opening=opening) for s in stops[first:end]]
+            case 'place':
+                run = [_above(s.moved(way), floor) for s in stops[first:end]]
+            case 'turn':
+                run = [replace(s, yaw=s.yaw + yaw, lean=s.lean + lean) for s in stops[first:end]]
+            case _:
+                detour = replace(stops[end - 1], phase='above', seconds=None).moved(way)
+                run = [*stops[first:end], _above(detour, floor)]
+        stops = [*stops[:first], *run, *stops[end:]]
+    return stops
+
+
+def _above(stop: WayPoint, floor: float) -> WayPoint:
+    x, y, z = stop.position
+    return replace(stop, position=np.array([x, y, max(z, floor)]))
 
 
 def _brush(stops: Stops, size: float, side: _Side) -> Stops:
@@ -305,16 +349,14 @@ def _regrasp(stops: Stops, size: float, side: _Side) -> Stops:
 def _wander(stops: Stops, size: float, side: _Side) -> Stops:
     floor = min(stop.position[2] for stop in stops)
 
-    def moved(stop: WayPoint, way: FloatArray) -> WayPoint:
-        x, y, z = stop.position + size * way
-        return replace(stop, position=np.array([x, y, max(z, floor)]))
-
-    return [*(moved(s, w) for s, w in zip(stops[:-1], side.draws, strict=False)), stops[-1]]
+    draws = zip(stops[:-1], side.draws, strict=False)
+    return [*(_above(stop.moved(size * way), floor) for stop, way in draws), stops[-1]]
 
 
 _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'high': _high,
     'hasty': _hasty,
+    'dive': _dive,
     'drop_high': _drop_high,
     'aside': _aside,
     'along': _along,
@@ -327,8 +369,11 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'drops': _drops,
     'snag': _snag,
     'clutch': _clutch,
+    'flick': _flick,
     'blink': _blink,
     'play': _play,
+    'odd': _odd,
+    'knock': _knock,
     'brush': _brush,
     'low_carry': _low_carry,
     'push': _push,
