@@ -98,24 +98,25 @@ class _Extents:
             views the least, since a mask in the plane is too long away from its camera.
         low: (B, O) lowest point, from the centre [m].
         high: (B, O) highest point, from the centre [m].
+        yaw: (B, O, 2) cosine and sine of how far they have turned since.
     """
 
     shape: Tensor
     widths: Tensor
     low: Tensor
     high: Tensor
+    yaw: Tensor
 
-    def half_width(self, direction: Tensor, rotations: Tensor) -> Tensor:
-        """Returns (B, O, K) half the width along directions (B, O, K, 2) of the plane [m].
-
-        Args:
-            direction: unit vectors, or zeros.
-            rotations: (B, O, 3, 3) of the objects from the start; their yaw counts.
-        """
+    def turned(self, rotations: Tensor) -> _Extents:
+        """Returns them with the yaw of rotations (B, O, 3, 3) from the start."""
         cos = rotations[..., 0, 0] + rotations[..., 1, 1]
         sin = rotations[..., 1, 0] - rotations[..., 0, 1]
         norm = (cos**2 + sin**2 + 1e-8).sqrt()
-        cos, sin = (cos / norm)[..., None], (sin / norm)[..., None]
+        return replace(self, yaw=torch.stack([cos / norm, sin / norm], -1))
+
+    def half_width(self, direction: Tensor) -> Tensor:
+        """Returns (B, O, K) half the width along unit vectors (B, O, K, 2), or zeros [m]."""
+        cos, sin = self.yaw[..., None, :].unbind(-1)
         x, y = direction.unbind(-1)
         x, y = cos * x + sin * y, cos * y - sin * x
         two_cos, two_sin = x * x - y * y, 2 * x * y
@@ -217,7 +218,7 @@ class ObjectMotionNetwork(nn.Module):
                 scene.tools[:, rows],
                 scene.gaps[:, rows],
                 scene.present,
-                extents,
+                extents.turned(now.rotations),
                 now,
             )
             now = Memory(
@@ -249,6 +250,7 @@ class ObjectMotionNetwork(nn.Module):
             widths=torch.where(known, widths, 0.0),
             low=torch.where(known[..., 0], low, 0.0),
             high=torch.where(known[..., 0], high, 0.0),
+            yaw=features.new_tensor([1.0, 0.0]).expand(*scene.present.shape, 2),
         )
 
     def _begin(self, scene: Scene) -> Memory:
@@ -267,6 +269,8 @@ class ObjectMotionNetwork(nn.Module):
         self, tools: Tensor, gaps: Tensor, present: Tensor, extents: _Extents, now: Memory
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """One step, from the tools (B, 3, A, 4, 4) and gaps (B, 3, A) before, now and after.
+
+        `extents` are turned as the objects are now.
 
         Returns points, rotations, shares of the tools, memory, and what is added to the spread.
         """
@@ -383,8 +387,8 @@ def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory
     x, y, _ = _local(tools, now.points).unbind(-1)
     frame = tools[:, None, :, :2, :2].expand(-1, now.points.shape[1], -1, -1, -1)
     directions = F.normalize(frame, dim=-2, eps=1e-4)  # of the tool's x and y in the plane
-    across = extents.half_width(directions[..., 0], now.rotations)
-    along = extents.half_width(directions[..., 1], now.rotations)
+    across = extents.half_width(directions[..., 0])
+    along = extents.half_width(directions[..., 1])
     gap = gaps[:, None]
     above = tools[:, None, :, 2, 3] - now.points[..., None, 2]
     rows = [
@@ -404,7 +408,7 @@ def _object_clearances(offset: Tensor, extents: _Extents, now: Memory) -> Tensor
     plane = offset[..., :2]
     distance = plane.norm(dim=-1)
     direction = plane / distance.clamp(min=1e-4)[..., None]
-    half = extents.half_width(direction, now.rotations)
+    half = extents.half_width(direction)
     half = half + half.transpose(1, 2)  # the width is the same to either side
     bottom, top = now.points[..., 2] + extents.low, now.points[..., 2] + extents.high
     rows = [
