@@ -91,6 +91,9 @@ class Settings(NodeSettings):
         'What finds the objects; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
     )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
+    autostart: bool = at_start(
+        True, 'Configures and activates itself; false = a lifecycle manager does that.'
+    )
     diagnostics_period_s: float = at_start(1.0, 'Period of /diagnostics [s].', (0.05, 60.0))
     adapter: str = parameter(
         '',
@@ -255,6 +258,8 @@ def descriptor(field: FieldInfo) -> ParameterDescriptor:
 
 
 def _declare(node: Node, name: str, field: FieldInfo) -> object:
+    if node.has_parameter(name):  # a lifecycle node is configured again
+        return node.get_parameter(name).value
     default = [''] if field.default == () else field.default  # ROS has no empty list
     try:
         value = node.declare_parameter(name, default, descriptor(field)).value

@@ -34,6 +34,7 @@ class Reason(StrEnum):
     JOINT_LIMITS = 'joint_limits'
     INSTRUCTION_TOO_LONG = 'instruction_too_long'
     NO_CLOCK = 'no_clock'
+    NOT_ACTIVE = 'not_active'
     WORLD_MODEL_MISSING = 'world_model_missing'
     ROLLOUT_INVALID = 'rollout_invalid'
     OUT_OF_MEMORY = 'out_of_memory'

@@ -138,6 +138,8 @@ class MatchedSubscription:
 
         def declare(name: str, value: object, text: str) -> Any:
             told = ParameterDescriptor(description=f'{text} of {self.topic}', read_only=True)
+            if node.has_parameter(f'{prefix}.{name}'):  # a lifecycle node is configured again
+                return node.get_parameter(f'{prefix}.{name}').value
             return node.declare_parameter(f'{prefix}.{name}', value, told).value
 
         words = ', '.join(_RELIABILITIES)

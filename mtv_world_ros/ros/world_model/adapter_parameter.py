@@ -64,8 +64,14 @@ class AdapterSwitch:
         self.in_use = ''
         if value:
             self._use(value, self._load(value))
+        self._node = node
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
+
+    def close(self) -> None:
+        """Listens to the parameter no more."""
+        self._node.remove_on_set_parameters_callback(self._check)
+        self._node.remove_post_set_parameters_callback(self._take)
 
     def _load(self, value: str) -> Adapter:
         model = self._world_model

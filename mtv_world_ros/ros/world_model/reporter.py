@@ -44,9 +44,11 @@ _ERRORS = (Reason.OUT_OF_MEMORY, Reason.WORKER_STUCK, Reason.INTERNAL_ERROR)
 class Reporter:
     """Publishes reports and diagnostics.
 
+    Attributes:
+        robot_name: the hardware id, with the node's namespace before it; empty = not known yet.
+
     Args:
         node: owner of the publishers and the logger.
-        hardware_id: name of the robot; diagnostics put the node's namespace before it.
         settings: the present parameters.
         state: what else `/diagnostics` shows, asked each time.
         missing: what the node needs and does not get, in words, asked each time.
@@ -55,13 +57,11 @@ class Reporter:
     def __init__(
         self,
         node: Node,
-        hardware_id: str,
         settings: Callable[[], Settings],
         state: Callable[[], Mapping[str, object]],
         missing: Callable[[], Sequence[str]],
     ) -> None:
-        self._node = node
-        self._hardware_id = f'{node.get_namespace()}/{hardware_id}'.lstrip('/')
+        self._node, self.robot_name = node, ''
         self._settings, self._state, self._missing = settings, state, missing
         self._tally = Tally()
         self._report = create_publisher(node, DiagnosticArray, '~/report', 100)
@@ -189,7 +189,8 @@ class Reporter:
         values: Mapping[str, object],
     ) -> None:
         name = f'{status_name(self._node)}{suffix}'
-        status = to_status(name, self._hardware_id, level, message, values)
+        hardware_id = f'{self._node.get_namespace()}/{self.robot_name}'.strip('/')
+        status = to_status(name, hardware_id, level, message, values)
         header = make_header(self._node.get_clock().now().nanoseconds)
         publisher.publish(to_diagnostics(header, status))
 
@@ -327,7 +328,9 @@ def _ended_values(ended: Ended) -> dict[str, object]:
     if ended.last is not None:
         values |= _success_values(ended.last.prediction.success)
     if ended.reason is not None:
-        values |= {'reason': ended.reason.value, 'text': ended.text}
+        values['reason'] = ended.reason.value
+    if ended.text:
+        values['text'] = ended.text
     return values
 
 

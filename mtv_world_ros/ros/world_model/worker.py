@@ -101,7 +101,7 @@ class Ended:
         num_chunks: that were predicted.
         last: the last one of them: what was known of the plan; None = nothing.
         reason: why it was rejected or failed.
-        text: the same in words.
+        text: the same in words, or why it was pre-empted if not by a newer plan.
         trace: of an error that nobody raised on purpose.
     """
 
@@ -221,15 +221,20 @@ class RolloutWorker:
             self._between = job
             self._changed.notify_all()
 
-    def reset(self) -> None:
-        """Gives up what runs and waits, drops chunks not taken, forgets the last frames."""
+    def reset(self, state: str = 'reset', text: str = '') -> None:
+        """Gives up what runs and waits, drops chunks not taken, forgets the last frames.
+
+        Args:
+            state: how it ended, for `Ended`.
+            text: why, in words.
+        """
         with self._changed:
             self._results = deque(r for r in self._results if isinstance(r, Ended))
             running = None if self._abandoned else self._running
             if running is not None:
-                self._put(self._ended(running, 'reset'))
+                self._put(self._ended(running, state, text=text))
             if self._pending is not None:
-                self._put(Ended(request=self._pending, state='reset', num_chunks=0))
+                self._put(Ended(request=self._pending, state=state, num_chunks=0, text=text))
             self._abandoned = self._running is not None
             self._pending = None
             self._episode, self._last = None, None
@@ -249,6 +254,8 @@ class RolloutWorker:
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_LONGEST_JOIN_S)
+        with self._changed:  # one that is stuck tells nobody when it ends
+            self._notify = _tell_nobody
 
     def _run(self) -> None:
         while (request := self._next()) is not None:
@@ -377,6 +384,10 @@ class RolloutWorker:
     def _put(self, result: Result) -> None:
         self._results.append(result)
         self._notify()
+
+
+def _tell_nobody() -> None:
+    """In place of `notify` when nobody listens any more."""
 
 
 def from_observation(

@@ -1,0 +1,268 @@
+"""What a configured node has: a loaded pipeline, with its inputs and outputs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+import time
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import to_ns
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer
+from mtv_world_ros.ros.sensing.subscriptions import Inputs
+from mtv_world_ros.ros.world_model.adapter_parameter import AdapterSwitch
+from mtv_world_ros.ros.world_model.live_fidelity import LiveFidelity
+from mtv_world_ros.ros.world_model.loading import check_calibration, load_cameras, reload_cameras
+from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
+from mtv_world_ros.ros.world_model.reporter import Reporter
+from mtv_world_ros.ros.world_model.requests import RequestMaker
+from mtv_world_ros.ros.world_model.worker import RolloutWorker
+
+#: what a node makes and can destroy
+_ENTITIES = ('publisher', 'subscription', 'service', 'timer', 'guard_condition')
+
+
+class Rollouts:
+    """Plans in, predictions out.
+
+    Callbacks store; a worker thread runs the model; results are published from the executor.
+    Plans are refused until `activate`.
+
+    Attributes:
+        description: views, sizes and robot in words.
+
+    Args:
+        node: owner of all inputs and outputs.
+        pipeline: the main path.
+        settings: the present parameters.
+        reporter: is told what happens.
+
+    Raises:
+        MtvWorldError: a parameter or a file it names cannot be used; nothing is left on the node.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        pipeline: Pipeline,
+        settings: Callable[[], Settings],
+        reporter: Reporter,
+    ) -> None:
+        self._node, self._settings, self._reporter = node, settings, reporter
+        self._spec, self._robot = pipeline.spec, pipeline.robot
+        self._is_active = False
+        self.description = (
+            f'{", ".join(self._spec.views)} at {self._spec.width}x{self._spec.height}, '
+            f'{self._spec.num_frames} frames of {self._spec.fps:g} Hz a chunk, '
+            f'robot {self._robot.name}'
+        )
+        with ExitStack() as undo:
+            undo.callback(_destroy_others, node, _entities(node))
+            self._build(pipeline, undo)
+            self._undo = undo.pop_all()
+
+    def _build(self, pipeline: Pipeline, undo: ExitStack) -> None:
+        node, settings, reporter = self._node, self._settings, self._reporter
+        node.add_on_set_parameters_callback(self._check_calibration)
+        undo.callback(node.remove_on_set_parameters_callback, self._check_calibration)
+        self._worker = RolloutWorker(pipeline, lambda: self._results.trigger())
+        undo.callback(self._worker.close)
+        self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
+        undo.callback(self._adapter.close)
+        self._buffer = ObservationBuffer(
+            cameras=load_cameras(settings(), self._spec),
+            joint_names=self._robot.joint_names,
+            width=self._spec.width,
+            height=self._spec.height,
+            limits=settings,
+            on_image=self._on_image,
+        )
+        self._maker = RequestMaker(
+            self._robot, self._buffer, settings, lambda: self._worker.last_scene
+        )
+        self._fidelity = LiveFidelity(node, pipeline, reporter.scored, reporter.crash)
+        undo.callback(self._fidelity.close)
+        self._publisher = PredictionPublisher(
+            node,
+            self._spec,
+            self._robot.joint_names,
+            settings,
+            on_judged=reporter.judged,
+            on_sent=reporter.sent,
+            on_ended=reporter.ended,
+            on_error=reporter.crash,
+        )
+        self._arrived: deque[tuple[float, JointTrajectory]] = deque()
+        self._arrivals = node.create_guard_condition(self._start_rollouts)
+        self._results = node.create_guard_condition(self._publish_results)
+        self._inputs = Inputs(
+            node,
+            self._spec.views,
+            compressed=settings().compressed_input,
+            buffer=self._buffer,
+            on_instruction=self._on_instruction,
+            on_trajectory=self._on_trajectory,
+            guarded=reporter.guarded,
+        )
+        node.create_service(Trigger, '~/reset', reporter.served(self._on_reset))
+        node.create_service(SetBool, '~/imagine', reporter.served(self._on_imagine))
+        back = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+        )
+        jumps = node.get_clock().create_jump_callback(
+            back, post_callback=reporter.guarded(self._on_jump)
+        )
+        undo.callback(jumps.unregister)
+        self._worker.start()
+
+    def activate(self) -> None:
+        """Takes plans from now on."""
+        self._is_active = True
+
+    def deactivate(self) -> None:
+        """Refuses plans from now on; one that runs or waits is pre-empted, and told so."""
+        self._is_active = False
+        self._start_rollouts()  # plans that came before are told as well
+        self._give_up('preempted', 'the node was deactivated')
+        self._publish_results()
+
+    def close(self) -> None:
+        """Ends the threads and takes all inputs and outputs from the node."""
+        self._undo.close()
+
+    def refresh(self) -> None:
+        """Looks at the worker and at the publishers again; to be called now and then."""
+        self._worker.supervise(self._settings().stuck_after_s)
+        self._inputs.refresh()
+
+    def missing(self) -> Sequence[str]:
+        """What the node needs and does not get; in imagine mode only to begin."""
+        if self._maker.imagine and self._worker.last_scene is not None:
+            return []
+        silent = [f'nobody publishes {topic}' for topic in self._inputs.unpublished()]
+        if not self._maker.num_requests and not self._inputs.publisher_counts()['policies']:
+            silent.append(f'nobody publishes {self._inputs.plan_topic}')
+        return silent or self._buffer.problems(self._node.get_clock().now().nanoseconds)
+
+    def state(self) -> Mapping[str, object]:
+        """Keys and values for `/diagnostics`."""
+        return {
+            'mode': 'imagine' if self._maker.imagine else 'observe',
+            'checkpoint': self._settings().checkpoint,
+            'adapter': self._adapter.in_use,
+            'views': self._spec.views,
+            'busy': self._worker.busy,
+            **self._fidelity.values(),
+            **self._inputs.publisher_counts(),
+            **self._publisher.subscriber_counts(),
+            **self._buffer.ages(self._node.get_clock().now().nanoseconds),
+        }
+
+    def _on_image(self, view: str, message: Image | CompressedImage) -> None:
+        """Hands real images on; an observation of all views once a frame of the model."""
+        if not self._is_active:
+            return
+        self._fidelity.see(view, message)
+        if self._worker.sees(self._buffer.newest_stamp_ns):
+            with suppress(Rejection):  # the plan that comes too early is told
+                self._worker.see(
+                    self._buffer.observe(self._node.get_clock().now().nanoseconds).observation
+                )
+
+    def _on_instruction(self, message: String) -> None:
+        with bounded(Reason.INSTRUCTION_TOO_LONG):
+            check_limit('instruction_characters', len(message.data), 'the instruction')
+        self._maker.instruction = message.data
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        """Stores it; images that came with it are stored before it is looked at."""
+        self._arrived.append((time.monotonic(), message))
+        self._arrivals.trigger()
+
+    def _start_rollouts(self) -> None:
+        while self._arrived:
+            self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
+
+    def _start_rollout(self, arrived: tuple[float, JointTrajectory]) -> None:
+        received_s, message = arrived
+        self._reporter.count('trajectories_received')
+        now_ns = self._node.get_clock().now().nanoseconds
+        try:
+            if not self._is_active:
+                raise Rejection(
+                    Reason.NOT_ACTIVE, 'the node is inactive; its lifecycle manager activates it'
+                )
+            request = self._maker.make(message, now_ns, received_s)
+            self._worker.submit(self._fidelity.replan(request))
+        except Exception as error:  # one answer a plan, whatever is wrong with it
+            self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
+
+    def _publish_results(self) -> None:
+        for result in self._worker.take():
+            for take in (self._fidelity.expect, self._publisher.add):
+                self._reporter.guarded(take)(result)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._give_up()
+        try:
+            self._buffer.accept_cameras(reload_cameras(self._settings(), self._spec))
+        except Rejection as error:
+            self._reporter.reject(error)
+            response.message = f'not reset: {error}'
+            return response
+        response.success = True
+        response.message = 'the next trajectory starts from the newest real frames'
+        return response
+
+    def _on_imagine(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        if request.data != self._maker.imagine:
+            self._give_up()
+            self._maker.imagine = request.data
+        response.success = True
+        response.message = 'imagine' if request.data else 'observe'
+        return response
+
+    def _give_up(self, state: str = 'reset', text: str = '') -> None:
+        self._worker.reset(state, text)
+        self._fidelity.reset()
+        self._publisher.reset()
+
+    def _on_jump(self, _: object) -> None:
+        """The clock went back, as when a bag starts over: what is stored lies in the future."""
+        self._reporter.count('clock_jumps_back')
+        self._buffer.clear()
+        self._give_up()
+
+    def _check_calibration(self, changed: list[Parameter]) -> SetParametersResult:
+        """Refuses a `calibration_file` that cannot be used."""
+        return check_calibration(changed, self._settings(), self._spec)
+
+
+def _entities(node: Node) -> dict[str, list[object]]:
+    """Everything the node has, by kind."""
+    names = {kind: 'guards' if kind == 'guard_condition' else f'{kind}s' for kind in _ENTITIES}
+    return {kind: list(getattr(node, name)) for kind, name in names.items()}
+
+
+def _destroy_others(node: Node, kept: Mapping[str, Sequence[object]]) -> None:
+    """Destroys what the node was given since."""
+    for kind, entities in _entities(node).items():
+        for entity in entities:
+            if not any(entity is one for one in kept[kind]):
+                getattr(node, f'destroy_{kind}')(entity)
