@@ -124,6 +124,15 @@ class Pipeline:
         """Of the world model."""
         return self.world_model.spec
 
+    def with_robot(self, robot: RobotModel) -> Pipeline:
+        """Returns the same for a robot of the same joints and tools, e.g. a calibrated one."""
+        motion = self.object_motion
+        return replace(
+            self,
+            robot=robot,
+            object_motion=None if motion is None else motion.with_robot(robot),
+        )
+
     def begin(
         self,
         observation: Observation,

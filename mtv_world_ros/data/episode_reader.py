@@ -335,9 +335,14 @@ class _EpisodeReader:
         row = self.mapping.views.get(view)
         frame = (row.frame if row else '') or of_info or of_images
         links = () if self.robot is None else self.robot.link_names
-        link, T = tree.mount(frame, links)
+        mount = tree.mount(frame, links)
         return CameraModel(
-            view=view, width=1, height=1, K=np.eye(3), mount_link=link, T_mount_camera=T
+            view=view,
+            width=1,
+            height=1,
+            K=np.eye(3),
+            mount_link=mount.link,
+            T_mount_camera=mount.T_link_frame,
         )
 
     def _camera_info(self, view: str, names: ViewTopics) -> str:

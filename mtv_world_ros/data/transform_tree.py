@@ -3,21 +3,74 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterable
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import CalibrationError, nearest
-from mtv_world_ros.geometry.transforms import inverse, is_rigid, pose
+from mtv_world_ros.geometry.transforms import inverse, pose
 
 #: a transform on /tf that varies by less than this is static [m, entries of the rotation]
-_STILL = 1e-4
+STILL = 1e-4
+#: frames kept; a publisher that makes up a name a message must not fill the memory
+_MOST_FRAMES = 2000
+
+_Numbers = tuple[float, ...]
+
+
+class Mount(NamedTuple):
+    """What carries a frame.
+
+    Attributes:
+        link: a link of the robot that is fixed to the frame.
+        T_link_frame: (4, 4) pose of the frame in it [m].
+        stamp_ns: when the least recent transform between the two was published [ns]; None = all
+            of them are from /tf_static and hold for good.
+    """
+
+    link: str
+    T_link_frame: FloatArray
+    stamp_ns: int | None
+
+
+@dataclass(slots=True)
+class _Edge:
+    """The transforms from one frame to another: the first one, and how far they vary.
+
+    Attributes:
+        T: (4, 4) the first one [m].
+        last: position and quaternion of the last one.
+        low: (4, 4) least entries.
+        high: (4, 4) greatest entries.
+        stamp_ns: of the newest one [ns]; None = from /tf_static.
+        count: transforms.
+        is_still: whether they vary by no more than `STILL`.
+    """
+
+    T: FloatArray
+    last: _Numbers
+    low: FloatArray
+    high: FloatArray
+    stamp_ns: int | None
+    count: int = 1
+    is_still: bool = True
+
+    def see(self, numbers: _Numbers) -> None:
+        """Widens the span by a transform; one that moves anyway is not looked at."""
+        self.count += 1
+        if numbers != self.last and self.is_still:
+            T = pose(numbers[:3], numbers[3:])
+            self.low, self.high = np.minimum(self.low, T), np.maximum(self.high, T)
+            self.is_still = bool((self.high - self.low).max() <= STILL)
+        self.last = numbers
 
 
 class TransformTree:
-    """Frames and the transforms between them.
+    """Frames and the transforms between them, in bounded memory.
 
     What cannot be used (a frame's second parent, a transform that is no pose) is counted in
     `problems`, and the rest is kept.
@@ -28,21 +81,44 @@ class TransformTree:
 
     def __init__(self, prefix: str = '') -> None:
         self._prefix = prefix
-        self._seen: dict[tuple[str, str], list[FloatArray]] = defaultdict(list)
+        self._edges: dict[tuple[str, str], _Edge] = {}
         self._unusable: dict[str, int] = defaultdict(int)
 
-    def add(self, message: Any) -> None:
-        """Takes the transforms of a tf2_msgs/TFMessage."""
+    def add(self, message: Any, *, latched: bool = False) -> None:
+        """Takes the transforms of a tf2_msgs/TFMessage.
+
+        Args:
+            message: of /tf or /tf_static.
+            latched: it holds until it is published again, as on a live /tf_static.
+        """
         for item in message.transforms:
-            parent, child = self.name(item.header.frame_id), self.name(item.child_frame_id)
+            edge = self.name(item.header.frame_id), self.name(item.child_frame_id)
             p, q = item.transform.translation, item.transform.rotation
-            length = np.linalg.norm((q.x, q.y, q.z, q.w))
-            usable = parent != child and np.isfinite((p.x, p.y, p.z)).all() and length > 0.5
-            T = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w)) if usable else np.zeros((4, 4))
-            if usable and is_rigid(T):
-                self._seen[parent, child].append(T)
-            else:
-                self._unusable[f"'{parent}' -> '{child}'"] += 1
+            numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            is_pose = math.hypot(*numbers[3:]) > 0.5 and math.isfinite(sum(numbers))
+            num_known = len(self._edges) + len(self._unusable)
+            is_room = edge in self._edges or num_known < _MOST_FRAMES
+            if edge[0] != edge[1] and is_pose and is_room:
+                stamp = item.header.stamp
+                stamp_ns = None if latched else stamp.sec * 10**9 + stamp.nanosec
+                self._add(edge, numbers, stamp_ns)
+            elif is_room:
+                self._unusable["'{}' -> '{}'".format(*edge)] += 1
+
+    def _add(self, names: tuple[str, str], numbers: _Numbers, stamp_ns: int | None) -> None:
+        edge = self._edges.get(names)
+        is_new = edge is None or stamp_ns is None and (numbers, None) != (edge.last, edge.stamp_ns)
+        if edge is None or is_new:
+            T = pose(numbers[:3], numbers[3:])
+            self._edges[names] = _Edge(T, numbers, T, T, stamp_ns)
+            return
+        edge.see(numbers)
+        if edge.stamp_ns is not None and stamp_ns is not None:
+            edge.stamp_ns = max(edge.stamp_ns, stamp_ns)
+
+    def forget_moving(self) -> None:
+        """Forgets what /tf said (the clock jumped); /tf_static holds for good."""
+        self._edges = {k: edge for k, edge in self._edges.items() if edge.stamp_ns is None}
 
     def name(self, frame: str) -> str:
         """A frame's name without slash and prefix."""
@@ -51,7 +127,7 @@ class TransformTree:
     @property
     def frames(self) -> set[str]:
         """Names of all frames."""
-        return {name for edge in self._seen for name in edge}
+        return {name for edge in self._edges for name in edge}
 
     @property
     def problems(self) -> list[str]:
@@ -61,23 +137,20 @@ class TransformTree:
             for edge, count in self._unusable.items()
         ]
         kept = self._parents()
-        for (parent, child), transforms in self._seen.items():
+        for (parent, child), edge in self._edges.items():
             if kept[child] != parent:
                 lines.append(
                     f"/tf: frame '{child}' has two parents; '{kept[child]}' is kept, "
-                    f"{len(transforms)} transforms from '{parent}' were left out"
+                    f"{edge.count} transforms from '{parent}' were left out"
                 )
         return lines
 
-    def mount(self, frame: str, links: Collection[str]) -> tuple[str, FloatArray]:
-        """Returns the nearest of the robot's links that is fixed to a frame, and the pose in it.
+    def mount(self, frame: str, links: Collection[str]) -> Mount:
+        """Returns the nearest of the robot's links that is fixed to a frame.
 
         Args:
             frame: e.g. a camera's optical frame.
             links: of the robot; empty = the topmost frame that is fixed to it.
-
-        Returns:
-            The link and T_link_frame (4, 4) [m].
 
         Raises:
             CalibrationError: the frame is not there, or nothing fixed to it is a link.
@@ -88,45 +161,64 @@ class TransformTree:
                 f"/tf and /tf_static have no frame '{frame}'{nearest(frame, self.frames)}; they "
                 f'have {", ".join(sorted(self.frames)) or "none"}'
             )
-        fixed = self._fixed_to(frame)
-        if not links:
-            parents = self._parents()
-            top = frame
-            while parents.get(top) in fixed:
-                top = parents[top]
-            return top, fixed[top]
-        for name, T in fixed.items():  # nearest first
-            if name in links:
-                return name, T
-        raise CalibrationError(
-            f"no link of the robot is fixed to frame '{frame}': only {', '.join(fixed)} are. Is "
-            'it carried by joints that are not among the robot (a camera that pans and tilts)?'
-        )
+        fixed = {}
+        for mount in self._reachable(frame, only_still=True):
+            if mount.link in links:
+                return mount
+            fixed[mount.link] = mount
+        if links:
+            raise CalibrationError(
+                f"no link of the robot is fixed to frame '{frame}': only {', '.join(fixed)} are. "
+                'Is it carried by joints that are not among the robot (a camera that pans and '
+                'tilts)?'
+            )
+        parents, top = self._parents(), frame
+        while parents.get(top) in fixed:
+            top = parents[top]
+        return fixed[top]
+
+    def is_connected(self, frame: str, links: Collection[str]) -> bool:
+        """Tells whether TF leads from a frame to one of the links, moving or not."""
+        frame = self.name(frame)
+        reached = self._reachable(frame, only_still=False)
+        return frame in self.frames and any(mount.link in links for mount in reached)
+
+    def parent(self, frame: str) -> str | None:
+        """A frame's parent; None = it has none."""
+        return self._parents().get(self.name(frame))
 
     def _parents(self) -> dict[str, str]:
         """The parent of each frame; of several, the one that is published most."""
-        ordered = sorted(self._seen, key=lambda edge: len(self._seen[edge]))
+        ordered = sorted(self._edges, key=lambda names: self._edges[names].count)
         return {child: parent for parent, child in ordered}
 
-    def _fixed_to(self, frame: str) -> dict[str, FloatArray]:
-        """T_other_frame of the frames that do not move against it, the nearest first.
+    def _reachable(self, frame: str, *, only_still: bool) -> Iterator[Mount]:
+        """Yields the frames that TF leads to as mounts, itself and the nearest first.
 
         A breadth-first search that visits a frame once: frames in a circle end it, too.
+
+        Args:
+            frame: where to begin.
+            only_still: leave out transforms that move.
         """
-        neighbours: dict[str, list[tuple[str, FloatArray]]] = defaultdict(list)
+        neighbours: dict[str, list[tuple[str, _Edge]]] = defaultdict(list)
         for child, parent in self._parents().items():
-            transforms = np.stack(self._seen[parent, child])
-            if np.ptp(transforms, axis=0).max() <= _STILL:
-                neighbours[child].append((parent, transforms[0]))
-                neighbours[parent].append((child, inverse(transforms[0])))
-        found, queue = {frame: np.eye(4)}, deque([frame])
+            edge = self._edges[parent, child]
+            if edge.is_still or not only_still:
+                neighbours[child].append((parent, edge))
+                neighbours[parent].append((child, edge))
+        found, queue = {frame}, deque([Mount(frame, np.eye(4), None)])
         while queue:
             here = queue.popleft()
-            for other, T_other_here in neighbours[here]:
+            yield here
+            for other, edge in neighbours[here.link]:
                 if other not in found:
-                    found[other] = T_other_here @ found[here]
-                    queue.append(other)
-        return found
+                    is_parent = self._edges.get((other, here.link)) is edge
+                    T_other_here = edge.T if is_parent else inverse(edge.T)
+                    stamps = [s for s in (here.stamp_ns, edge.stamp_ns) if s is not None]
+                    T = T_other_here @ here.T_link_frame
+                    found.add(other)
+                    queue.append(Mount(other, T, min(stamps, default=None)))
 
 
 def read_tree(messages: Iterable[Any], prefix: str = '') -> TransformTree:

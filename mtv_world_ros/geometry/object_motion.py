@@ -14,6 +14,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.robot import RobotModel
 
 #: what moved or turned by less is taken to stand still
 _STILL_M, _STILL_RAD = 0.004, 0.08
@@ -85,6 +86,10 @@ class ObjectMotionModel(Protocol):
         self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
     ) -> TrackedObjects:
         """Returns the objects of masks (V, O, H, W), seen by cameras at T_base_camera (4, 4)."""
+        ...
+
+    def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
+        """Returns the same for a robot of the same joints and tools."""
         ...
 
 

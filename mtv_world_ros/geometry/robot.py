@@ -82,6 +82,7 @@ class RobotModel:
         upper: (J,) largest positions [rad or m].
         velocity_limits: (J,) largest speeds [rad/s or m/s]; inf where not given.
         tools: one per arm, in the order of all A axes.
+        mimics: joints that follow commanded ones.
         pinocchio_model: the model, with every joint of the description.
 
     Raises:
@@ -104,6 +105,7 @@ class RobotModel:
         self.pinocchio_model = model
         self.joint_names = tuple(joint_names)
         self.tools = tuple(tools)
+        self.mimics = tuple(mimics)
         self.base_link = base_link
         self._frames = _link_frames(model)
         self._setters = [

@@ -224,6 +224,19 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
         ) from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"URDF file '{path}' cannot be read: {error}") from error
+    return parse_urdf(text, f"URDF '{path}'")
+
+
+def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
+    """Returns a URDF's model, its mimic joints (kept as joints of their own), and the root link.
+
+    Args:
+        text: the URDF.
+        what: what it is, for errors.
+
+    Raises:
+        RobotError: it is not a URDF that can be used.
+    """
     try:
         root = ElementTree.fromstring(text)
         # Pinocchio must see mimic joints as ordinary ones: RobotModel moves them itself.
@@ -231,7 +244,7 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
         model = pin.buildModelFromXML(ElementTree.tostring(root, encoding='unicode'))
     except (ElementTree.ParseError, ValueError, KeyError, RuntimeError) as error:
         raise RobotError(
-            f"URDF '{path}' cannot be used: {error} (a .xacro file must be expanded first)"
+            f'{what} cannot be used: {error} (a .xacro file must be expanded first)'
         ) from error
     children = {child.get('link') for child in root.iter('child')}
     base = next(link.attrib['name'] for link in root.iter('link')

@@ -94,6 +94,26 @@ class Settings(NodeSettings):
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'
     )
+    use_robot_description: bool = at_start(
+        True,
+        'Take lengths, offsets and limits of the robot from the topic `robot_description`; while '
+        'it describes another robot, trajectories are rejected.',
+    )
+    extrinsics: Literal['auto', 'tf', 'file'] = at_start(
+        'auto',
+        "Where the cameras' poses come from: /tf and /tf_static (needs tf2_msgs), or the "
+        'calibration file; auto = TF if it leads from the frame of the images to the robot and '
+        '`calibration_file` is empty.',
+    )
+    tf_prefix: str = at_start('', 'Prefix of the frame names in TF, e.g. `left_cell/`.')
+    max_tf_age_s: float = parameter(
+        1.0,
+        'Camera poses from /tf that are older than the image by more are no observation [s].',
+        _SECONDS,
+    )
+    publish_tf: bool = at_start(
+        True, 'Publish the frames of the views to /tf_static where TF lacks them.'
+    )
     diagnostics_period_s: float = at_start(1.0, 'Period of /diagnostics [s].', (0.05, 60.0))
     adapter: str = parameter(
         '',

@@ -34,7 +34,8 @@ from mtv_world_ros.ros.messages.stamps import NANO, to_stamp  # noqa: E402
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
-ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2]), 'OMP_NUM_THREADS': '1'}
+PACKAGES = filter(None, (str(Path(__file__).parents[2]), os.environ.get('PYTHONPATH')))
+ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join(PACKAGES), 'OMP_NUM_THREADS': '1'}
 FAKE = Path(__file__).with_name('fake_world_model.py')
 FAKE_POLICY = Path(__file__).with_name('fake_policy.py')
 VIEWS = ('low', 'high')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 import json
 from pathlib import Path
@@ -56,6 +57,12 @@ class ObjectMotionPredictor:
         self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
         self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
         self._places[0], self._scales[0] = 0.0, 1.0
+
+    def with_robot(self, robot: RobotModel) -> ObjectMotionPredictor:
+        """Returns the same for a robot of the same joints and tools."""
+        other = copy(self)
+        other.robot = robot
+        return other
 
     def disturbed(self, points: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns (K, O, 3) places and (K, O, V, F) features; row 0 as they are."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 
+from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.data_types import CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.rendering.resize import resize_frames
@@ -64,6 +65,8 @@ class ObservationBuffer:
         height: height of the model's frames [px].
         limits: asked at every observation, so that they may change.
         on_image: also gets every image that is stored.
+        pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
+            = the calibrated pose.
     """
 
     def __init__(
@@ -75,8 +78,10 @@ class ObservationBuffer:
         height: int,
         limits: Callable[[], NodeSettings],
         on_image: Callable[[str, Image | CompressedImage], None] | None = None,
+        pose: Callable[[str, str, int], Mount | None] | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras)
+        self._pose = pose
         self._size = (width, height)
         self._limits, self._on_image = limits, on_image
         self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
@@ -198,7 +203,7 @@ class ObservationBuffer:
         for view, (_, message) in zip(self.views, images, strict=True):
             frame = image_messages.to_rgb(message)
             camera = self._intrinsics.camera(view, width=frame.shape[1], height=frame.shape[0])
-            cameras.append(scaled(camera, *self._size))
+            cameras.append(scaled(self._posed(camera, message), *self._size))
             frames.append(resize_frames(frame[None], *self._size)[0])
         observation = Observation(
             cameras=tuple(cameras),
@@ -211,6 +216,16 @@ class ObservationBuffer:
             for view, (_, message) in zip(self.views, images, strict=True)
         )
         return Scene(observation=observation, camera_infos=infos, source_stamp_ns=stamp_ns)
+
+    def _posed(self, camera: CameraModel, image: Image | CompressedImage) -> CameraModel:
+        """The camera with its pose at the image's time."""
+        if self._pose is None:
+            return camera
+        frame = self._intrinsics.info(camera.view, image.header.frame_id).header.frame_id
+        mount = self._pose(camera.view, frame, to_ns(image.header.stamp))
+        if mount is None:
+            return camera
+        return replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame)
 
     def _pick_images(
         self, now_ns: int, limits: NodeSettings

@@ -14,6 +14,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.ros.messages import image_messages
@@ -140,6 +141,10 @@ class LiveFidelity:
             # not before: a node that fails at its start would wait for the thread
             if self._thread.ident is None:
                 self._thread.start()
+
+    def use_robot(self, robot: RobotModel) -> None:
+        """Observes with another description of the same robot from the next chunk on."""
+        self._pipeline = self._pipeline.with_robot(robot)
 
     def see(self, view: str, message: Image | CompressedImage) -> None:
         """Takes a real image; it is looked at in the thread."""

@@ -28,6 +28,7 @@ class RequestMaker:
         imagine: whether rollouts go on from the last predicted frames.
         instruction: what the robot is told.
         num_requests: made so far.
+        robot: whose joints trajectories move.
 
     Args:
         robot: whose joints trajectories move.
@@ -43,7 +44,7 @@ class RequestMaker:
         settings: Callable[[], Settings],
         last_scene: Callable[[], Scene | None],
     ) -> None:
-        self._robot, self._buffer = robot, buffer
+        self.robot, self._buffer = robot, buffer
         self._settings, self._last_scene = settings, last_scene
         self.num_requests = 0
         self.imagine = settings().mode == 'imagine'
@@ -90,11 +91,11 @@ class RequestMaker:
 
     def _check_joints(self, trajectory: JointTrajectory, tolerance: float) -> None:
         """Joints that are not named keep their position; none is outside its limits."""
-        home = np.clip(0.0, self._robot.lower, self._robot.upper)
+        home = np.clip(0.0, self.robot.lower, self.robot.upper)
         with rejected_as(Reason.JOINT_NAMES):
-            whole = match_joints(trajectory, self._robot, home, allow_missing=True)
+            whole = match_joints(trajectory, self.robot, home, allow_missing=True)
         with rejected_as(Reason.JOINT_LIMITS):
-            check_positions(self._robot, whole.positions, tolerance=tolerance)
+            check_positions(self.robot, whole.positions, tolerance=tolerance)
 
     def _real_scene(self, now_ns: int) -> Scene:
         if now_ns == 0:
@@ -107,7 +108,7 @@ class RequestMaker:
 
     def _check_measured(self, positions: FloatArray) -> None:
         """Refuses measured joints that are far beyond their limits (wrong unit or joint)."""
-        robot = self._robot
+        robot = self.robot
         slack = _MEASURED_SLACK * (1.0 + np.abs(robot.upper - robot.lower))
         outside = (positions < robot.lower - slack) | (positions > robot.upper + slack)
         if outside.any():

@@ -18,10 +18,12 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.sensing.live_robot import LiveRobot
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.adapter_parameter import AdapterSwitch
@@ -83,6 +85,7 @@ class Rollouts:
         undo.callback(self._worker.close)
         self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
         undo.callback(self._adapter.close)
+        self._live = LiveRobot(node, self._robot, settings, self._on_robot, reporter.guarded)
         self._buffer = ObservationBuffer(
             cameras=load_cameras(settings(), self._spec),
             joint_names=self._robot.joint_names,
@@ -90,6 +93,7 @@ class Rollouts:
             height=self._spec.height,
             limits=settings,
             on_image=self._on_image,
+            pose=self._live.pose,
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, settings, lambda: self._worker.last_scene
@@ -151,6 +155,8 @@ class Rollouts:
 
     def missing(self) -> Sequence[str]:
         """What the node needs and does not get; in imagine mode only to begin."""
+        if self._live.problems():
+            return self._live.problems()
         if self._maker.imagine and self._worker.last_scene is not None:
             return []
         silent = [f'nobody publishes {topic}' for topic in self._inputs.unpublished()]
@@ -166,6 +172,7 @@ class Rollouts:
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            **self._live.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
@@ -206,7 +213,9 @@ class Rollouts:
                 raise Rejection(
                     Reason.NOT_ACTIVE, 'the node is inactive; its lifecycle manager activates it'
                 )
+            self._live.check()
             request = self._maker.make(message, now_ns, received_s)
+            self._live.show(request.scene)
             self._worker.submit(self._fidelity.replan(request))
         except Exception as error:  # one answer a plan, whatever is wrong with it
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
@@ -219,6 +228,7 @@ class Rollouts:
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._give_up()
         try:
+            self._live.accept()
             self._buffer.accept_cameras(reload_cameras(self._settings(), self._spec))
         except Rejection as error:
             self._reporter.reject(error)
@@ -238,6 +248,12 @@ class Rollouts:
         response.message = 'imagine' if request.data else 'observe'
         return response
 
+    def _on_robot(self, robot: RobotModel) -> None:
+        """The robot as it describes itself."""
+        self._maker.robot = robot
+        for part in (self._worker, self._fidelity):
+            part.use_robot(robot)
+
     def _give_up(self, state: str = 'reset', text: str = '') -> None:
         self._worker.reset(state, text)
         self._fidelity.reset()
@@ -247,6 +263,7 @@ class Rollouts:
         """The clock went back, as when a bag starts over: what is stored lies in the future."""
         self._reporter.count('clock_jumps_back')
         self._buffer.clear()
+        self._live.forget_moving()
         self._give_up()
 
     def _check_calibration(self, changed: list[Parameter]) -> SetParametersResult:

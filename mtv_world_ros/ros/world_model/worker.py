@@ -12,6 +12,7 @@ import traceback
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
 from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode, ObservedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -133,7 +134,7 @@ class RolloutWorker:
         self._running: Request | None = None
         self._known: list[Chunk] = []
         self._is_starved = False
-        self._between: Callable[[], None] | None = None
+        self._between: deque[Callable[[], None]] = deque()
         self._abandoned = False
         self._closing = False
         self._episode: ImaginedEpisode | None = None
@@ -216,10 +217,22 @@ class RolloutWorker:
             self._changed.notify_all()
 
     def run_between(self, job: Callable[[], None]) -> None:
-        """Runs a job that must not raise, never during a rollout; it replaces a waiting one."""
+        """Runs a job that must not raise, never during a rollout; jobs run in order."""
         with self._changed:
-            self._between = job
+            self._between.append(job)
             self._changed.notify_all()
+
+    def use_robot(self, robot: RobotModel) -> None:
+        """Imagines with another description of the same robot from the next rollout on."""
+
+        def use() -> None:
+            with self._changed:
+                self._pipeline = self._pipeline.with_robot(robot)
+                self._observed = ObservedEpisode(self._pipeline)
+                if self._episode is not None:
+                    self._episode.pipeline = self._pipeline
+
+        self.run_between(use)
 
     def reset(self, state: str = 'reset', text: str = '') -> None:
         """Gives up what runs and waits, drops chunks not taken, forgets the last frames.
@@ -279,7 +292,7 @@ class RolloutWorker:
                 if self._closing:
                     return None
                 self._beat_s = time.monotonic()
-                job, self._between = self._between, None
+                job = self._between.popleft() if self._between else None
                 if job is None and self._pending is None:
                     job = self._catch_up
                 if job is None:
@@ -289,8 +302,8 @@ class RolloutWorker:
             job()
 
     def _has_work(self) -> bool:
-        is_asked = self._closing or self._between is not None or self._pending is not None
-        return is_asked or self._observed.is_behind
+        is_asked = self._closing or self._between or self._pending is not None
+        return bool(is_asked) or self._observed.is_behind
 
     def _catch_up(self) -> None:
         """Looks at real frames while no rollout runs; what fails here is forgotten."""

@@ -1,0 +1,89 @@
+"""Frames and transforms as TF tells them: what carries a camera, and what is refused."""
+
+from types import SimpleNamespace as Message
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.data.transform_tree import TransformTree
+from mtv_world_ros.errors import CalibrationError
+
+LINKS = ('base', 'hand')
+TURNED = (0.0, 0.0, np.sin(0.25), np.cos(0.25))  # by 0.5 rad about z
+
+
+def message(*edges):
+    """A TFMessage of (parent, child, position, quaternion, stamp [s])."""
+    transforms = []
+    for parent, child, place, turn, stamp_s in edges:
+        sec, nanosec = divmod(round(stamp_s * 1e9), 10**9)
+        header = Message(frame_id=parent, stamp=Message(sec=sec, nanosec=nanosec))
+        position = Message(**dict(zip('xyz', place, strict=True)))
+        rotation = Message(**dict(zip('xyzw', turn, strict=True)))
+        transform = Message(translation=position, rotation=rotation)
+        transforms.append(Message(header=header, child_frame_id=child, transform=transform))
+    return Message(transforms=transforms)
+
+
+def edge(parent, child, x=0.0, turn=(0, 0, 0, 1), stamp_s=0.0):
+    return parent, child, (x, 0.0, 0.0), turn, stamp_s
+
+
+def test_a_wrist_camera_is_mounted_on_the_hand_though_the_hand_moves():
+    tree = TransformTree()
+    tree.add(message(edge('hand', 'bracket', 0.1), edge('bracket', 'optical', 0.02)), latched=True)
+    for k in range(5):
+        tree.add(message(edge('base', 'hand', 0.1 * k, stamp_s=k)))
+    mount = tree.mount('optical', LINKS)
+    assert (mount.link, mount.stamp_ns) == ('hand', None)
+    np.testing.assert_allclose(mount.T_link_frame[:3, 3], (0.12, 0, 0))
+
+
+def test_a_pose_over_tf_has_the_stamp_of_its_least_recent_transform():
+    tree = TransformTree()
+    tree.add(message(edge('base', 'ceiling', 1.0, TURNED)), latched=True)
+    for stamp_s in (1, 2, 3):
+        tree.add(message(edge('ceiling', 'rail', 0.5, stamp_s=stamp_s)))
+    for stamp_s in (3, 4, 5):
+        tree.add(message(edge('rail', 'optical', 0.5, stamp_s=stamp_s)))
+    mount = tree.mount('optical', LINKS)
+    assert (mount.link, mount.stamp_ns) == ('base', 3_000_000_000)
+    np.testing.assert_allclose(mount.T_link_frame[:2, 3], (1 + np.cos(0.5), np.sin(0.5)))
+    tree.forget_moving()
+    assert not tree.is_connected('optical', LINKS)
+
+
+def test_a_camera_that_pans_has_no_link_but_is_connected():
+    tree = TransformTree()
+    tree.add(message(edge('pan', 'optical')), latched=True)
+    tree.add(message(edge('base', 'pan')))
+    assert tree.mount('optical', LINKS).link == 'base'  # as far as one knows
+    tree.add(message(edge('base', 'pan', turn=TURNED)))
+    with pytest.raises(CalibrationError, match='pans and tilts'):
+        tree.mount('optical', LINKS)
+    assert tree.is_connected('optical', LINKS)
+    assert tree.mount('optical', ()).link == 'pan'
+
+
+def test_the_latest_of_tf_static_holds():
+    tree = TransformTree()
+    for x in (1.0, 2.0):
+        tree.add(message(edge('base', 'optical', x)), latched=True)
+    assert tree.mount('optical', LINKS).T_link_frame[0, 3] == 2.0
+
+
+def test_frames_in_a_circle_and_transforms_that_are_no_poses():
+    tree = TransformTree('cell/')
+    tree.add(message(edge('/cell/a', 'cell/b'), edge('b', 'a'), edge('b', 'b')), latched=True)
+    tree.add(message(edge('a', 'c', float('nan')), edge('a', 'd', turn=(0, 0, 0, 0))))
+    assert tree.frames == {'a', 'b'}
+    assert sum('no poses' in line for line in tree.problems) == 3
+    with pytest.raises(CalibrationError, match='no link of the robot'):
+        tree.mount('a', LINKS)
+
+
+def test_memory_is_bounded_whatever_is_published():
+    tree = TransformTree()
+    for k in range(5000):
+        tree.add(message(edge('base', f'frame{k}'), edge('base', f'nan{k}', float('nan'))))
+    assert len(tree.frames) + len(tree.problems) < 2100
