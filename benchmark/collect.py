@@ -18,15 +18,16 @@ import time
 import numpy as np
 from page import parse_arguments, publish, table
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.episode_jobs import jobs_of
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, ROBOT_FILE, Spent
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.randomize import draw_scene
 from mtv_world_ros.sim.world.scene import scene_xml
 from mtv_world_ros.sim.world.simulator import scene_generator
+from mtv_world_ros.sim.world.workcell import workcell_of
 
 PARTS = {'planning and physics': 'physics_s', 'rendering': 'rendering_s', 'writing': 'writing_s'}
 
@@ -54,8 +55,10 @@ def main() -> None:
 def _image_parts(config: CollectConfig, seed: int) -> str:
     """What an image is made of: the same one with nothing, the table alone, and everything."""
     mujoco = load_mujoco()
-    robot = load_robot(share_path(*ROBOT_FILE))
-    scene = draw_scene(task_named('collect_food'), scene_generator(seed), config.randomization)
+    robot = load_robot(bundled('robots', CollectConfig().robot, '--robot'))
+    scene = draw_scene(
+        task_named('collect_food'), scene_generator(seed), workcell_of(robot), config.randomization
+    )
     model = mujoco.MjModel.from_xml_string(scene_xml(scene, robot))
     data, size = mujoco.MjData(model), config.randomization
     mujoco.mj_forward(model, data)

@@ -26,12 +26,12 @@ from page import publish, table
 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
 from mtv_world_ros.sim.collect.dataset_readme import commands
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig, ROBOT_FILE
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import simulate
 from mtv_world_ros.sim.episode_measures import EpisodeMeasures, measure
 from mtv_world_ros.sim.expert.expert import Expert
@@ -61,7 +61,7 @@ def _mean(values: Iterable[float]) -> str:
 def _successes(task: str, seed: int, attempts: int) -> int:
     """How many of other seeds than those of the data set the expert brings to success."""
     config = CollectConfig()
-    robot = load_robot(share_path(*ROBOT_FILE))
+    robot = load_robot(bundled('robots', CollectConfig().robot, '--robot'))
     expert = Expert(robot, config.expert)
     sim = SimEpisode(robot, expert.home, config.randomization, rendering=False)
     done = 0

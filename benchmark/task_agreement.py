@@ -19,9 +19,9 @@ from pathlib import Path
 from page import publish, table
 
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.sim.collect.episode_maker import ROBOT_FILE
+from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import true_poses
 from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.success.task import ever_and_final
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument('--machine', default=f'cpu{os.cpu_count()}')
     parser.add_argument('--out', type=Path, help='folder to write the page into')
     options = parser.parse_args()
-    robot = load_robot(share_path(*ROBOT_FILE))
+    robot = load_robot(bundled('robots', CollectConfig().robot, '--robot'))
     counts: dict[str, Counter[str]] = {}
     for path in (path for folder in options.datasets for path in list_episodes(folder)):
         episode = read_episode(path, with_cameras=False)

@@ -18,6 +18,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--task', default='all', help="names, comma-separated, or 'all'")
     parser.add_argument(
+        '--robot',
+        default='yam_bimanual',
+        help='a robot with a workcell in the simulator: yam_bimanual, franka or ur5e_pair',
+    )
+    parser.add_argument(
         '--episodes', type=int, required=True, help='per task; with --zero-shot in all'
     )
     parser.add_argument(
@@ -100,6 +105,7 @@ def _collect(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         failures_of_ten=arguments.failures_of_ten,
         config=CollectConfig(
+            robot=arguments.robot,
             randomization=size,
             moved_share=arguments.moved_cameras,
             policies=arguments.policies,

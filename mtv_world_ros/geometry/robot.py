@@ -107,6 +107,7 @@ class RobotModel:
         self.tools = tuple(tools)
         self.mimics = tuple(mimics)
         self.base_link = base_link
+        self.mimics = tuple(mimics)
         self._frames = _link_frames(model)
         self._setters = [
             (self._joint(joint), column, 1.0, 0.0) for column, joint in enumerate(self.joint_names)

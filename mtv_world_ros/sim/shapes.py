@@ -255,7 +255,8 @@ class Grasp:
 
     Attributes:
         height: of the tool over the object's bottom, as a share of the object's height.
-        rim_m: thickness of the rim that is held, on the arm's own side; None = across the middle.
+        rim_m: thickness of the rim that is held, on the object's side of the table; None = across
+            the middle.
         opening: of the gripper on the way down, 0..1.
     """
 
@@ -263,11 +264,16 @@ class Grasp:
     rim_m: float | None = None
     opening: float = 1.0
 
-    def offset(self, size: Size, arm: str) -> float:
-        """Returns how far the tool is from the object's centre along its x [m]."""
+    def offset(self, size: Size, side: float) -> float:
+        """Returns how far the tool is from the object's centre along its x [m].
+
+        Args:
+            size: of the object [m].
+            side: on which a rim is held, -1 left, 1 right.
+        """
         if self.rim_m is None:
             return 0.0
-        return (size[0] - self.rim_m) / 2 * (-1.0 if arm == 'left' else 1.0)
+        return (size[0] - self.rim_m) / 2 * side
 
     def width(self, size: Size) -> float:
         """Returns what is between the closed fingers [m]."""

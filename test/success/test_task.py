@@ -5,12 +5,15 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
 LEFT = """
 name: left
 instruction: place the {a} to the left of the {b}
@@ -63,7 +66,7 @@ def test_bundled_tasks_are_matched_from_the_instruction(bundled):
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_every_task_of_the_simulator_is_known_by_what_it_says(bundled, name, seed):
     task = task_named(name)
-    scene = draw_scene(task, np.random.default_rng(seed))
+    scene = draw_scene(task, np.random.default_rng(seed), WORKCELL)
     instruction = instruction_of(task, scene)
     matched = match_task(bundled.values(), instruction)
     assert matched is not None, instruction
@@ -84,7 +87,7 @@ def test_usual_sizes_serve_in_place_of_exact_ones(bundled, name):
     task, spec = task_named(name), bundled[name]
     agreed, rng = [], np.random.default_rng(7)
     for seed in range(4):
-        scene = draw_scene(task, np.random.default_rng(seed))
+        scene = draw_scene(task, np.random.default_rng(seed), WORKCELL)
         starts = {item.role: np.array(item.position) for item in scene.objects}
         goals = {move.subject: goal for move, goal in zip(task.moves, scene.goals, strict=True)}
         sizes = {item.role: item.size for item in scene.objects}

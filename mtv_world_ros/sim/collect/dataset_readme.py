@@ -63,8 +63,10 @@ def _counts(
 
 def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[str]:
     """Returns the commands that make the data set again; several where tasks differ in number."""
-    config, plain = card['config'], plain_config(CollectConfig())
+    config = card['config']
+    plain = plain_config(CollectConfig(robot=_robot(config)))
     given = {
+        'robot': config.get('robot'),
         **{side: config['randomization'][side] for side in ('width', 'height')},
         'fps': f'{1 / config["record"]["frame_period_s"]:g}',
         'moved-cameras': config['moved_share'],
@@ -106,9 +108,13 @@ def _zero_shot_numbers(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
     return list(zip(kinds, numbers, strict=True))
 
 
+def _robot(config: Mapping[str, Any]) -> str:
+    return config.get('robot', CollectConfig().robot)
+
+
 def _other_configuration(config: Mapping[str, Any]) -> str:
     """A line where a command alone does not make the set again."""
-    usual = plain_config(CollectConfig())
+    usual = plain_config(CollectConfig(robot=_robot(config)))
     for key in ('moved_share', 'policies', 'kinds', 'siblings'):
         usual |= {key: config[key]} if key in config else {}
     for key in ('pictures', 'frame_period_s'):
@@ -189,6 +195,10 @@ def _misses(card: Mapping[str, Any]) -> str:
     return '' if card['config']['policies'] else '; two misses in ten, one of either parity'
 
 
+def _arms(config: Mapping[str, Any]) -> str:
+    return f'The robot `{config["robot"]}`' if 'robot' in config else 'Two YAM arms'
+
+
 def _who(card: Mapping[str, Any]) -> str:
     policies = card['config']['policies']
     if not policies:
@@ -235,7 +245,7 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
     size = f'{_number(len(entries), "episode")} of {_number(len(card["tasks"]), "task")}'
     return f"""# {what}: {size}
 
-Two YAM arms in MuJoCo and {_who(card)}. {_number(outcomes['success'], 'episode')} with
+{_arms(card['config'])} in MuJoCo and {_who(card)}. {_number(outcomes['success'], 'episode')} with
 success; in the other {outcomes['failure']} {_how(card)}. Each episode
 is a rosbag2 MCAP folder like a robot's recording; `dataset.json` says the same, and more, as data.
 

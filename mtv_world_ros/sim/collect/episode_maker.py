@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import GO_ON
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
@@ -22,9 +22,11 @@ from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.sim.world.cameras import CameraMoves, TRAINING_MOVES
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
 from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.sim.world.zero_shot import variant, with_moved_cameras
 
-ROBOT_FILE = ('config', 'robots', 'yam_bimanual.yaml')
+#: whose data sets the card does not name
+_DEFAULT_ROBOT = 'yam_bimanual'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +34,7 @@ class CollectConfig:
     """What is randomised, how the expert moves, how episodes are sampled.
 
     Attributes:
+        robot: a bundled one's name, or a robot YAML; it must have a workcell.
         randomization: objects, light, cameras and their jitter.
         expert: heights, speeds and timing.
         record: sampling and noise.
@@ -45,6 +48,7 @@ class CollectConfig:
             lie on both sides of the boundary between success and failure; 0 = no siblings.
     """
 
+    robot: str = _DEFAULT_ROBOT
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
@@ -81,16 +85,21 @@ class Spent:
 
 
 def plain_config(config: CollectConfig) -> dict[str, Any]:
-    """Returns the configuration as the card has it."""
+    """Returns the configuration as the card has it, with the cameras of the robot's workcell."""
+    workcell = workcell_of(load_robot(bundled('robots', config.robot, '--robot')))
+    config = replace(config, randomization=config.randomization.of(workcell))
     values = json.loads(json.dumps(asdict(config)))
-    return values if values['siblings'] else {k: v for k, v in values.items() if k != 'siblings'}
+    usual = {'robot': _DEFAULT_ROBOT, 'siblings': 0}
+    return {k: v for k, v in values.items() if k not in usual or v != usual[k]}
 
 
 class EpisodeMaker:
     """Makes episodes one after the other in one process."""
 
     def __init__(self, config: CollectConfig) -> None:
-        self._robot = load_robot(share_path(*ROBOT_FILE))
+        self._robot = load_robot(bundled('robots', config.robot, '--robot'))
+        randomization = config.randomization.of(workcell_of(self._robot))
+        config = replace(config, randomization=randomization)
         self._config = config
         self._expert = Expert(self._robot, config.expert)
 

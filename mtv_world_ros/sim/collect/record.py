@@ -25,6 +25,7 @@ from mtv_world_ros.sim.world.simulator import (
     SimEpisode,
     SimObservation,
 )
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final
 
@@ -264,7 +265,7 @@ def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
             f"'{info.path}' has no object poses with a seed; only simulated ones do"
         )
     task = task_named(info.task)
-    scene = draw_scene(task, scene_generator(info.seed))
+    scene = draw_scene(task, scene_generator(info.seed), workcell_of(robot))
     names = tuple(item.name for item in scene.objects)
     if names != info.objects:
         raise EpisodeError(

@@ -13,9 +13,9 @@ from mtv_world_ros.sim.expert.kinematics import ArmSolver, top_down
 from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
-from mtv_world_ros.sim.world.arm import FINGER_THICKNESS_M, FINGER_WIDTH_M
-from mtv_world_ros.sim.world.placement import arm_of
+from mtv_world_ros.sim.world.placement import side_of
 from mtv_world_ros.sim.world.scene import Place, Scene, SceneObject
+from mtv_world_ros.sim.world.workcell import Workcell, workcell_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,7 @@ class Pick:
     """How one object is taken.
 
     Attributes:
-        arm: `left` or `right`.
+        arm: its name.
         position: of the tool at the grasp (3,) [m].
         yaw: of the tool [rad].
         opening: of the gripper on the way down, 0..1.
@@ -68,23 +68,24 @@ def tool_yaw(item: SceneObject) -> float:
 def tool_offset(subject: SceneObject, yaw: float) -> FloatArray:
     """Returns the way (3,) from an object's centre, turned by `yaw`, to the tool that holds it."""
     grasp = grasp_of(subject)
-    out = grasp.offset(subject.size, arm_of(subject))
+    out = grasp.offset(subject.size, side_of(subject))
     height = (grasp.height - 0.5) * subject.size[2]
     return np.array([out * np.cos(yaw), out * np.sin(yaw), height])
 
 
-def pick_of(subject: SceneObject, max_gap: float, config: PickingConfig) -> Pick:
-    """Returns how an object is taken by the arm on its side.
+def pick_of(subject: SceneObject, arm: str, max_gap: float, config: PickingConfig) -> Pick:
+    """Returns how an object is taken.
 
     Args:
         subject: what is taken, where it lies.
+        arm: that takes it.
         max_gap: way of one finger from closed to open [m].
         config: gaps.
     """
     yaw, grasp = tool_yaw(subject), grasp_of(subject)
     gap = grasp.width(subject.size) / 2 + config.release
     return Pick(
-        arm=arm_of(subject),
+        arm=arm,
         position=np.asarray(subject.position) + tool_offset(subject, yaw),
         yaw=yaw,
         opening=grasp.opening,
@@ -96,6 +97,7 @@ def miss_shift(
     subject: SceneObject,
     others: Sequence[SceneObject],
     max_gap: float,
+    workcell: Workcell,
     config: PickingConfig,
     rng: np.random.Generator,
 ) -> FloatArray:
@@ -107,10 +109,10 @@ def miss_shift(
     yaw, grasp = tool_yaw(subject), grasp_of(subject)
     margin = float(rng.uniform(*config.miss_margin))
     if grasp.rim_m is not None:
-        side = np.sign(grasp.offset(subject.size, arm_of(subject)))
-        inner = grasp.opening * max_gap + FINGER_THICKNESS_M
+        side = np.sign(grasp.offset(subject.size, side_of(subject)))
+        inner = grasp.opening * max_gap + workcell.finger_thickness_m
         return side * (grasp.rim_m / 2 + inner + margin) * _direction(yaw)
-    distance = min(subject.size[1] / 2 + FINGER_WIDTH_M / 2 + margin, config.max_miss)
+    distance = min(subject.size[1] / 2 + workcell.finger_width_m / 2 + margin, config.max_miss)
     across = distance * _direction(yaw + np.pi / 2)
     place = np.asarray(subject.position)
 
@@ -123,11 +125,6 @@ def miss_shift(
 
 def _direction(yaw: float) -> FloatArray:
     return np.array([np.cos(yaw), np.sin(yaw), 0.0])
-
-
-#: the tools' rest poses in the base frame [m], pointing down, in view of both cameras
-HOME_TOOL = {'left': (-0.2, 0.17, 0.13), 'right': (0.2, 0.17, 0.13)}
-_HOME_SEED = np.array([0.0, 1.5, 1.5, -1.4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,12 +169,12 @@ class ExpertConfig:
 
 
 def home_positions(robot: RobotModel) -> FloatArray:
-    """Returns the joint positions (J,) of both arms at rest, grippers open."""
-    positions = np.zeros(len(robot.joint_names))
+    """Returns the joint positions (J,) of all arms at rest, grippers open."""
+    positions, workcell = np.zeros(len(robot.joint_names)), workcell_of(robot)
     for tool in robot.tools:
-        solver = ArmSolver(robot, tool)
-        pose = top_down(np.asarray(HOME_TOOL[tool.arm]), 0.0)
-        positions[solver.indices] = solver.solve(pose, _HOME_SEED)
+        solver, near = ArmSolver(robot, tool), workcell.home_joints[tool.arm]
+        pose = top_down(workcell.home_tools[tool.arm], 0.0)
+        positions[solver.indices] = solver.solve(pose, near)
         if tool.gripper_joint is not None:
             positions[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
     return positions
@@ -195,10 +192,13 @@ class Expert:
     """Plans a task's moves for a scene, from the objects' true start poses."""
 
     def __init__(self, robot: RobotModel, config: ExpertConfig | None = None) -> None:
-        self.robot = robot
+        self.robot, self.workcell = robot, workcell_of(robot)
         self.home = home_positions(robot)
         self._config = config or ExpertConfig()
-        self._solvers = {tool.arm: ArmSolver(robot, tool) for tool in robot.tools}
+        self._solvers = {}
+        for tool in robot.tools:
+            rest = self.home[ArmSolver(robot, tool).indices]
+            self._solvers[tool.arm] = ArmSolver(robot, tool, rest)
         self._tools = {tool.arm: tool for tool in robot.tools}
         self._max_gap = {
             tool.arm: abs(tool.gripper_open - tool.gripper_closed) for tool in robot.tools
@@ -255,7 +255,7 @@ class Expert:
         return task.moves[_missed_move(task, rng)].subject
 
     def _lay(self, whole: FloatArray, rows: FloatArray, start: int, arm: str) -> FloatArray:
-        """Puts one arm's rows into the whole plan from `start` on; both arms rest at home."""
+        """Puts one arm's rows into the whole plan from `start` on; the arms rest at home."""
         num = max(len(whole), start + len(rows))
         longer = np.concatenate([whole, np.repeat(self.home[None], num - len(whole), axis=0)])
         columns = self._columns(arm)
@@ -271,12 +271,13 @@ class Expert:
         self, now: dict[str, SceneObject], move: Move, rng: np.random.Generator, *, miss: bool
     ) -> Pick:
         subject, config = now[move.subject], self._config.picking
-        gap = self._max_gap[arm_of(subject)]
-        pick = pick_of(subject, gap, config)
+        arm = self.workcell.arm_at(subject.position[0])
+        gap = self._max_gap[arm]
+        pick = pick_of(subject, arm, gap, config)
         if not miss:
             return pick
         others = [item for item in now.values() if item is not subject]
-        shift = miss_shift(subject, others, gap, config, rng)
+        shift = miss_shift(subject, others, gap, self.workcell, config, rng)
         return replace(pick, position=pick.position + shift)
 
     def _stops(
@@ -296,7 +297,7 @@ class Expert:
             WayPoint('close', place, yaw, 0.0, config.close_s),
         ]
         if isinstance(move, Shake):
-            middle = self._swings(move, pick, place + lift)
+            middle = self._swings(move, pick, place + lift, -side_of(now[move.subject]))
             down, turned = place + _rise(0.002), yaw
         else:
             down, turned = self._place(pick, move, now, goal)
@@ -308,7 +309,7 @@ class Expert:
                 WayPoint('lift', lifted, yaw, 0.0),
                 WayPoint('carry', pre_place, turned, 0.0),
             ]
-        home = np.asarray(HOME_TOOL[pick.arm])
+        home = self.workcell.home_tools[pick.arm]
         return [
             *start,
             *middle,
@@ -318,8 +319,9 @@ class Expert:
             WayPoint('home', home, 0.0, 1.0),
         ]
 
-    def _swings(self, move: Shake, pick: Pick, lifted: FloatArray) -> list[WayPoint]:
-        inwards = 1.0 if pick.arm == 'left' else -1.0
+    def _swings(
+        self, move: Shake, pick: Pick, lifted: FloatArray, inwards: float
+    ) -> list[WayPoint]:
         upright = WayPoint('lift', lifted, pick.yaw, 0.0)
         swings = [
             replace(
@@ -359,7 +361,7 @@ class Expert:
     ) -> FloatArray:
         """Minimum-jerk blends between way points, scaled to the drawn motion time."""
         config = self._config
-        home = WayPoint('home', np.asarray(HOME_TOOL[arm]), 0.0, 1.0)
+        home = WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
         seconds = self._timed(stops, home.position)
         wanted = rng.uniform(*(config.motion_s if alone else config.motions_s))
         ends = np.cumsum([0.0, *seconds]) * wanted / sum(seconds)

@@ -37,20 +37,24 @@ def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
 class ArmSolver:
     """Solves the joints of one arm for tool poses, starting from the previous solution.
 
-    Damped least squares, iterated until the tool is there.
+    Damped least squares, iterated until the tool is there. An arm of more than six joints has
+    many solutions: of those around the start it takes the one nearest to `rest`.
+
+    Args:
+        robot: the robot.
+        tool: of the arm.
+        rest: its joints at rest; None = the first start.
     """
 
-    def __init__(self, robot: RobotModel, tool: Tool) -> None:
+    def __init__(self, robot: RobotModel, tool: Tool, rest: FloatArray | None = None) -> None:
         self._model = robot.pinocchio_model
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(tool.link)
         self._tool = pin.SE3(np.asarray(tool.T_link_tool, dtype=float))
-        prefix = f'{tool.arm}_'
-        self.indices = [
-            index
-            for index, name in enumerate(robot.joint_names)
-            if name.startswith(prefix) and name != tool.gripper_joint
-        ]
+        chain = self._model.supports[self._model.frames[self._frame].parentJoint]
+        carrying = {self._model.names[joint] for joint in chain}
+        self.indices = [index for index, name in enumerate(robot.joint_names) if name in carrying]
+        self._rest = rest
         joints = [
             self._model.joints[self._model.getJointId(robot.joint_names[i])] for i in self.indices
         ]
@@ -61,23 +65,25 @@ class ArmSolver:
         self._neutral = pin.neutral(self._model)
 
     def solve(self, pose: FloatArray, start: FloatArray) -> FloatArray:
-        """Returns the arm's joints (6,) [rad] that bring the tool to `pose` (4, 4).
+        """Returns the arm's joints (n,) [rad] that bring the tool to `pose` (4, 4).
 
         Raises:
             SimulatorError: the pose is out of reach from `start`.
         """
         goal = pin.SE3(np.asarray(pose))
         q, joints = self._neutral.copy(), np.clip(start, self._lower, self._upper)
+        rest, slack = (joints if self._rest is None else self._rest), np.zeros(len(joints))
         for _ in range(_NUM_ITERATIONS):
             q[self._q_at] = joints
             pin.computeJointJacobians(self._model, self._data, q)
             pin.updateFramePlacement(self._model, self._data, self._frame)
             placement = self._data.oMf[self._frame] * self._tool
             error = pin.log6(placement.actInv(goal)).vector
-            if (
+            there = (
                 np.linalg.norm(error[:3]) < _TOLERANCE_M
                 and np.linalg.norm(error[3:]) < _TOLERANCE_RAD
-            ):
+            )
+            if there and len(joints) <= 6:
                 return joints
             jacobian = (
                 self._tool.actionInverse
@@ -85,8 +91,18 @@ class ArmSolver:
                     self._model, self._data, self._frame, pin.ReferenceFrame.LOCAL
                 )[:, self._v_at]
             )
+            if len(joints) > 6:
+                slack = _slack(jacobian, rest - joints)
+                if there and np.abs(slack).max() < _TOLERANCE_RAD:
+                    return joints
             normal = jacobian.T @ jacobian + _DAMPING * np.eye(len(joints))
-            step = np.linalg.solve(normal, jacobian.T @ error)
+            step = np.linalg.solve(normal, jacobian.T @ error) + slack
             joints = np.clip(joints + np.clip(step, -0.5, 0.5), self._lower, self._upper)
         x, y, z = pose[:3, 3]
         raise SimulatorError(f'tool pose at ({x:.3f}, {y:.3f}, {z:.3f}) m is out of reach')
+
+
+def _slack(jacobian: FloatArray, wanted: FloatArray) -> FloatArray:
+    """The part of a joint motion (n,) that leaves the tool where it is."""
+    square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
+    return wanted - jacobian.T @ np.linalg.solve(square, jacobian @ wanted)

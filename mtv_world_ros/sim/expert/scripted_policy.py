@@ -224,7 +224,7 @@ def scripted_policy(
         SimulatorError: no such task, or no scene for this seed.
     """
     variant, kind = parse_variant(name), task_named(task)
-    scene = draw_scene(kind, scene_generator(seed), randomization)
+    scene = draw_scene(kind, scene_generator(seed), expert.workcell, randomization)
     return ScriptedPolicy(variant, expert, kind, scene, hold_s)
 
 

@@ -1,185 +1,189 @@
-"""The YAM arm as MJCF: primitive geoms on the published kinematics, masses and gains."""
+"""A robot's arms as MJCF, from its URDF; the YAM has a description of its own."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
 
+import coal
+import numpy as np
+import pinocchio as pin
+
+from mtv_world_ros.bounded_input import read_text
+from mtv_world_ros.config import read_yaml
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.sim.world import yam
+from mtv_world_ros.sim.world.actuator import Actuator
+from mtv_world_ros.sim.world.cameras import camera_xml
 
-ARMS = ('left', 'right')
-#: arm bases in the base frame [m]; both are turned +90 degrees about z, so they reach to +y
-BASE_POSITIONS = {'left': (-0.28, 0.0, 0.0), 'right': (0.28, 0.0, 0.0)}
-FINGER_WIDTH_M, FINGER_THICKNESS_M = 0.015, 0.01
-
-_LIGHT, _MID, _DARK = '0.62 0.62 0.63 1', '0.36 0.36 0.38 1', '0.16 0.16 0.17 1'
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Link:
-    """One moving body of the arm: frame in its parent, joint, mass and drawn/colliding geoms."""
-
-    position: str
-    quaternion: str
-    joint_range: tuple[float, float]
-    mass: float
-    kp: float
-    kv: float
-    max_torque: float
-    geoms: tuple[str, ...]
+#: gains of a joint by its largest torque or force: kp [1/rad], [1/m], and kv as a share of kp [s]
+_TURN_GAIN, _SLIDE_GAIN, _DAMPING_S = 25.0, 10.0, 0.1
+#: armature of joints that turn and that slide [kg m2, kg]
+_ARMATURE, _SLIDE_ARMATURE = 0.1, 0.05
 
 
-def _capsule(start: str, end: str, radius: float, rgba: str) -> str:
-    return f'type="capsule" fromto="{start} {end}" size="{radius}" rgba="{rgba}"'
+def bodies_xml(robot: RobotModel, cameras: Sequence[CameraModel]) -> str:
+    """Returns the MJCF body trees of all arms, bases and cameras on links included.
 
+    A site `<arm>_tool` stands at each tool centre point.
 
-def _cylinder(start: str, end: str, radius: float, rgba: str) -> str:
-    return f'type="cylinder" fromto="{start} {end}" size="{radius}" rgba="{rgba}"'
-
-
-def _box(center: str, half_sizes: str, rgba: str) -> str:
-    return f'type="box" pos="{center}" size="{half_sizes}" rgba="{rgba}"'
-
-
-#: links 1-6, wxyz quaternions as published (not normalised); the first geom carries the mass
-LINKS = (
-    Link(
-        position='0 0 0.0631',
-        quaternion='1 0 0 1',
-        joint_range=(-2.61799, 3.05433),
-        mass=0.124,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(_cylinder('0 0 -0.02', '0 0 0.03', 0.036, _DARK),),
-    ),
-    Link(
-        position='0.000025 -0.02 0.0409',
-        quaternion='1 1 1 1',
-        joint_range=(0, 3.66519),
-        mass=1.244,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(
-            _capsule('0.02 0 0', '0.24 0 0', 0.032, _LIGHT),
-            _cylinder('0 0 -0.04', '0 0 0.04', 0.036, _DARK),
-            _cylinder('0.264 0 -0.04', '0.264 0 0.04', 0.034, _DARK),
-        ),
-    ),
-    Link(
-        position='0.264 0 0',
-        quaternion='0 1 0 0',
-        joint_range=(0, 3.66519),
-        mass=0.854,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(
-            _capsule('-0.26 -0.06 0', '-0.02 -0.06 0', 0.034, _LIGHT),
-            _capsule('0 0 0', '-0.03 -0.06 0', 0.03, _MID),
-        ),
-    ),
-    Link(
-        position='-0.245 -0.06 0',
-        quaternion='1 0 0 0',
-        joint_range=(-1.5708, 1.5708),
-        mass=0.464,
-        kp=20,
-        kv=1.0,
-        max_torque=10,
-        geoms=(_capsule('0 0 0', '-0.074 -0.0395 0', 0.029, _MID),),
-    ),
-    Link(
-        position='-0.074 -0.0395 0.000025',
-        quaternion='1 -1 1 1',
-        joint_range=(-1.5708, 1.5708),
-        mass=0.351,
-        kp=20,
-        kv=1.0,
-        max_torque=10,
-        geoms=(_capsule('0 0 0', '0 0.0353 0.0395', 0.028, _DARK),),
-    ),
-    Link(
-        position='0 0.0353 0.0395',
-        quaternion='1 -1 0 0',
-        joint_range=(-2.0944, 2.0944),
-        mass=0.367,
-        kp=10,
-        kv=0.5,
-        max_torque=10,
-        geoms=(
-            _cylinder('0 0 0', '0 0 0.05', 0.03, _MID),
-            _box('0 0 0.06', '0.05 0.02 0.014', _DARK),
-        ),
-    ),
-)
-FINGER_MASS, FINGER_KP, FINGER_KV, FINGER_FORCE = 0.118, 100.0, 10.0, 20.0
-_FINGER_RANGE = (-0.00205, 0.037524)
-_FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0605)}
-
-
-def _finger_xml(arm: str, side: str, closed: float) -> str:
-    """One finger; its pad's inner face meets the tool axis at the joint value `closed`."""
-    x, y, z = _FINGER_BASES[side]
-    sign = 1.0 if side == 'left' else -1.0
-    closes_upwards = closed > sum(_FINGER_RANGE) / 2
-    # finger axes in link_6: x is -z, y is y, z is x
-    face = -(x + sign * closed)
-    outward = -sign if closes_upwards else sign
-    thickness = FINGER_THICKNESS_M / 2
-    low, high = _FINGER_RANGE if side == 'left' else (-_FINGER_RANGE[1], -_FINGER_RANGE[0])
-    pad = f'{z - 0.110:.4f} {-y:.4f} {face + outward * thickness:.5f}'
-    rail = f'{z - 0.074:.4f} {-y:.4f} {face + outward * 0.008:.5f}'
-    return f"""
-      <body name="{arm}_{side}_finger" pos="{x} {y} {z}" quat="1 0 1 0" gravcomp="1">
-        <joint name="{arm}_{side}_finger" type="slide" axis="0 0 1" range="{low} {high}"
-               armature="0.05"/>
-        <geom class="{arm}_pad" mass="{FINGER_MASS}"
-              {_box(pad, f'0.035 {FINGER_WIDTH_M / 2} {thickness}', _LIGHT)}/>
-        <geom class="{arm}_arm" mass="0" {_box(rail, '0.008 0.014 0.008', _DARK)}/>
-      </body>"""
-
-
-def arm_xml(arm: str, robot: RobotModel) -> str:
-    """Returns the MJCF body tree of one arm (`left` or `right`), base included.
-
-    The finger pads are placed so that they meet at the robot's closed gripper value.
+    Raises:
+        SimulatorError: the robot has no URDF, or shapes other than box, cylinder and sphere.
     """
-    tool = next(tool for tool in robot.tools if tool.arm == arm)
-    x, y, z = BASE_POSITIONS[arm]
-    pedestal = f'<geom class="{arm}_arm" {_cylinder("0 0 0", "0 0 0.045", 0.05, _DARK)}/>'
-    opening = [f'<body name="{arm}_base" pos="{x} {y} {z}" quat="1 0 0 1">{pedestal}']
-    for number, link in enumerate(LINKS, 1):
-        low, high = link.joint_range
-        geoms = ''.join(
-            f'<geom class="{arm}_arm" mass="{link.mass if i == 0 else 0}" {geom}/>'
-            for i, geom in enumerate(link.geoms)
+    if robot.name == yam.YAM:
+        return ''.join(yam.arm_xml(arm, robot) for arm in yam.ARMS)
+    return _UrdfBodies(robot, cameras).xml()
+
+
+@lru_cache(maxsize=8)
+def actuators_of(robot: RobotModel) -> tuple[Actuator, ...]:
+    """Returns the position actuators of all joints, in the order of the robot's joints.
+
+    Gains follow from the torque and force limits of the URDF; damping is critical or above.
+    """
+    if robot.name == yam.YAM:
+        return yam.actuators()
+    model, found = robot.pinocchio_model, []
+    for column, name in enumerate(robot.joint_names):
+        own = [(name, 1.0, 0.0)]
+        followers = [(m.joint, m.multiplier, m.offset) for m in robot.mimics if m.source == name]
+        force = float(model.effortLimit[model.joints[model.getJointId(name)].idx_v])
+        kp = force * (_SLIDE_GAIN if _slides(model, model.getJointId(name)) else _TURN_GAIN)
+        found += [
+            Actuator(
+                joint=joint,
+                column=column,
+                multiplier=multiplier,
+                offset=offset,
+                kp=kp,
+                kv=kp * _DAMPING_S,
+                max_force=force,
+            )
+            for joint, multiplier, offset in own + followers
+        ]
+    return tuple(found)
+
+
+def _slides(model: pin.Model, joint: int) -> bool:
+    return model.joints[joint].shortname().startswith('JointModelP')
+
+
+class _UrdfBodies:
+    """One body for each joint of the URDF; links that are fixed to one another are one body."""
+
+    def __init__(self, robot: RobotModel, cameras: Sequence[CameraModel]) -> None:
+        self._robot, self._model = robot, robot.pinocchio_model
+        self._inside: dict[int, str] = {}
+        base = self._model.frames[self._frame(robot.base_link)]
+        if base.parentJoint or not base.placement.isIdentity(1e-9):
+            raise SimulatorError(
+                f"base link '{robot.base_link}' of robot '{robot.name}' must be its URDF's root"
+            )
+        self._add_shapes()
+        for camera in cameras:
+            joint, pose = self._placed(camera.mount_link, camera.T_mount_camera)
+            self._add(joint, camera_xml(camera, pose))
+        for tool in robot.tools:
+            joint, pose = self._placed(tool.link, tool.T_link_tool)
+            self._add(joint, f'<site name="{tool.arm}_tool" {_at(pose)} size="0.002" group="5"/>')
+
+    def xml(self) -> str:
+        """Returns what is fixed to the base, and the bodies of its joints."""
+        return self._inside.get(0, '') + self._children(0)
+
+    def _children(self, parent: int) -> str:
+        joints = range(1, self._model.njoints)
+        return ''.join(
+            self._body(joint) for joint in joints if self._model.parents[joint] == parent
         )
-        opening.append(
-            f'<body name="{arm}_link_{number}" pos="{link.position}" quat="{link.quaternion}" '
-            f'gravcomp="1"><joint name="{arm}_joint{number}" axis="0 0 1" range="{low} {high}" '
-            f'armature="0.03" damping="0.05"/>{geoms}'
+
+    def _body(self, number: int) -> str:
+        model = self._model
+        name, joint = model.names[number], model.joints[number]
+        slides = _slides(model, number)
+        limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        inside = self._inside.get(number, '') + self._children(number)
+        return (
+            f'<body name="{name}" {_at(model.jointPlacements[number].homogeneous)} gravcomp="1">'
+            f'<joint name="{name}" type="{"slide" if slides else "hinge"}" '
+            f'axis="{_axis(model, joint)}" range="{_numbers(limits)}" '
+            f'armature="{_SLIDE_ARMATURE if slides else _ARMATURE}" damping="0.05"/>'
+            f'{inside}</body>'
         )
-    fingers = ''.join(_finger_xml(arm, side, tool.gripper_closed) for side in ('left', 'right'))
-    site = f'<site name="{arm}_tool" pos="0 0 0.1347" quat="1 0 0 -1" size="0.002" group="5"/>'
-    return ''.join(opening) + site + fingers + '</body>' * len(opening)
+
+    def _add_shapes(self) -> None:
+        file = self._robot.file
+        urdf = None if file is None else read_yaml(file, 'robot file', 'robot').get('urdf')
+        if file is None or urdf is None:
+            raise SimulatorError(f"robot '{self._robot.name}' has no URDF to be simulated with")
+        text = read_text(file.parent / urdf, 'urdf_bytes')
+        shapes = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.VISUAL)
+        for shape in shapes.geometryObjects:
+            joint = int(shape.parentJoint)
+            colour = _numbers(shape.meshColor)
+            self._add(
+                joint,
+                f'<geom {self._collides(joint)} {_geometry(shape)} '
+                f'{_at(shape.placement.homogeneous)} rgba="{colour}"/>',
+            )
+
+    def _collides(self, joint: int) -> str:
+        """Class of a body's geoms; what stands still touches objects alone."""
+        if joint == 0:
+            return 'contype="0" conaffinity="1"'
+        robot, first = self._robot, self._model.supports[joint][1]
+        tool = next((t for t in robot.tools if self._first_joint(t.link) == first), robot.tools[0])
+        grippers = {tool.gripper_joint} | {
+            m.joint for m in robot.mimics if m.source == tool.gripper_joint
+        }
+        return f'class="{tool.arm}_{"pad" if self._model.names[joint] in grippers else "arm"}"'
+
+    def _first_joint(self, link: str) -> int:
+        """Number of the joint nearest to the base among those that carry a link."""
+        chain = list(self._model.supports[self._placed(link, np.eye(4))[0]])
+        return chain[1] if len(chain) > 1 else 0
+
+    def _placed(self, link: str, pose: FloatArray) -> tuple[int, FloatArray]:
+        """The joint that carries a link, and a pose in the link as one in its body."""
+        frame = self._model.frames[self._frame(link)]
+        return int(frame.parentJoint), frame.placement.homogeneous @ np.asarray(pose)
+
+    def _frame(self, link: str) -> int:
+        return self._model.getFrameId(link, pin.FrameType.BODY)
+
+    def _add(self, joint: int, xml: str) -> None:
+        self._inside[joint] = self._inside.get(joint, '') + xml
 
 
-def actuators_xml(arm: str) -> str:
-    """Returns the position actuators of one arm: joints 1-6, left finger, right finger."""
-    rows = [
-        f'<position joint="{arm}_joint{number}" kp="{link.kp}" kv="{link.kv}" '
-        f'forcerange="-{link.max_torque} {link.max_torque}"/>'
-        for number, link in enumerate(LINKS, 1)
-    ]
-    rows += [
-        f'<position joint="{arm}_{side}_finger" kp="{FINGER_KP}" kv="{FINGER_KV}" '
-        f'forcerange="-{FINGER_FORCE} {FINGER_FORCE}"/>'
-        for side in ('left', 'right')
-    ]
-    return ''.join(rows)
+def _numbers(values: Any) -> str:
+    return ' '.join(f'{float(value):.12g}' for value in values)
 
 
-def velocity_gains() -> list[float]:
-    """Returns kv / kp [s] per actuator of one arm: velocity feedforward that removes the lag."""
-    return [link.kv / link.kp for link in LINKS] + [FINGER_KV / FINGER_KP] * 2
+def _at(pose: FloatArray) -> str:
+    x, y, z, w = pin.Quaternion(np.asarray(pose)[:3, :3]).coeffs()
+    return f'pos="{_numbers(np.asarray(pose)[:3, 3])}" quat="{_numbers((w, x, y, z))}"'
+
+
+def _axis(model: pin.Model, joint: pin.JointModel) -> str:
+    """The joint's own axis, found by moving it."""
+    data = joint.createData()
+    joint.calc(data, pin.neutral(model), np.ones(model.nv))
+    velocity = data.v
+    return _numbers(velocity.linear if np.any(velocity.linear) else velocity.angular)
+
+
+def _geometry(shape: Any) -> str:
+    form = shape.geometry
+    if isinstance(form, coal.Box):
+        return f'type="box" size="{_numbers(form.halfSide)}"'
+    if isinstance(form, coal.Cylinder):
+        return f'type="cylinder" size="{_numbers((form.radius, form.halfLength))}"'
+    if isinstance(form, coal.Sphere):
+        return f'type="sphere" size="{_numbers((form.radius,))}"'
+    raise SimulatorError(
+        f"shape '{shape.name}' is a {type(form).__name__}; the simulator draws box, cylinder and "
+        'sphere'
+    )

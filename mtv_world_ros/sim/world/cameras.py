@@ -30,25 +30,33 @@ class CameraSpec:
     visible_width: float
 
 
-#: the paper's views: low (close) and high (overview)
-CAMERAS = (
-    CameraSpec(
-        view='low',
-        target=(0.0, 0.23, 0.075),
-        distance=1.05,
-        azimuth=28,
-        elevation=30,
-        visible_width=0.6,
-    ),
-    CameraSpec(
-        view='high',
-        target=(0.0, 0.22, 0.06),
-        distance=1.3,
-        azimuth=-6,
-        elevation=58,
-        visible_width=0.6,
-    ),
-)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WristCameraSpec:
+    """A camera on a link, which moves with the arm.
+
+    Attributes:
+        view: name of the view.
+        link: that carries it.
+        position: (x, y, z) in the link [m].
+        target: (x, y, z) the point looked at, in the link [m].
+        right: (x, y, z) in the link, about the direction of the image's x.
+        visible_width: width of the view's plane through the target [m].
+    """
+
+    view: str
+    link: str
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    right: tuple[float, float, float]
+    visible_width: float
+
+    @property
+    def distance(self) -> float:
+        """Camera to target [m]."""
+        return float(np.linalg.norm(np.subtract(self.target, self.position)))
+
+
+AnyCameraSpec = CameraSpec | WristCameraSpec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,8 +94,12 @@ TRAINING_MOVES = (
 )
 
 
-def moved(spec: CameraSpec, moves: CameraMoves, generator: np.random.Generator) -> CameraSpec:
-    """Returns a camera that stands elsewhere and looks at the same point."""
+def moved(
+    spec: AnyCameraSpec, moves: CameraMoves, generator: np.random.Generator
+) -> AnyCameraSpec:
+    """Returns a camera that stands elsewhere and looks at the same point; one on a link stays."""
+    if isinstance(spec, WristCameraSpec):
+        return spec
     side = float(generator.choice((-1.0, 1.0)))
     factor = float(generator.uniform(*moves.distance))
     return replace(
@@ -100,9 +112,21 @@ def moved(spec: CameraSpec, moves: CameraMoves, generator: np.random.Generator) 
     )
 
 
-def jittered(spec: CameraSpec, jitter: CameraJitter, generator: np.random.Generator) -> CameraSpec:
-    """Returns the spec with target, distance and angles moved within the jitter."""
+def jittered(
+    spec: AnyCameraSpec, jitter: CameraJitter, generator: np.random.Generator
+) -> AnyCameraSpec:
+    """Returns the spec with target, distance and angles moved within the jitter.
+
+    A camera on a link is moved and turned by a quarter of it: its mount is a fixed part.
+    """
     draw = generator.uniform(-1.0, 1.0, 6)
+    if isinstance(spec, WristCameraSpec):
+        shifts = jitter.target_m / 4 * draw.reshape(2, 3)
+        return replace(
+            spec,
+            position=tuple((np.asarray(spec.position) + shifts[0]).tolist()),
+            target=tuple((np.asarray(spec.target) + shifts[1]).tolist()),
+        )
     target = np.asarray(spec.target) + jitter.target_m * draw[:3]
     distance = spec.distance + jitter.distance_m * draw[3]
     return CameraSpec(
@@ -116,8 +140,12 @@ def jittered(spec: CameraSpec, jitter: CameraJitter, generator: np.random.Genera
     )
 
 
-def optical_pose(spec: CameraSpec) -> FloatArray:
-    """Returns T_base_camera (4, 4) of the optical frame: x right, y down, z ahead."""
+def optical_pose(spec: AnyCameraSpec) -> FloatArray:
+    """Returns T_mount_camera (4, 4) of the optical frame: x right, y down, z ahead."""
+    if isinstance(spec, WristCameraSpec):
+        ahead = np.subtract(spec.target, spec.position) / spec.distance
+        across = np.asarray(spec.right) - ahead * (ahead @ np.asarray(spec.right))
+        return _pose(across / np.linalg.norm(across), ahead, np.asarray(spec.position))
     azimuth, elevation = np.deg2rad(spec.azimuth), np.deg2rad(spec.elevation)
     outward = np.array(
         [
@@ -129,14 +157,27 @@ def optical_pose(spec: CameraSpec) -> FloatArray:
     ahead = -outward
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
+    return _pose(right, ahead, np.asarray(spec.target) + spec.distance * outward)
+
+
+def _pose(right: FloatArray, ahead: FloatArray, position: FloatArray) -> FloatArray:
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    pose[:3, 3] = np.asarray(spec.target) + spec.distance * outward
+    pose[:3, 3] = position
     return pose
 
 
-def camera_model(spec: CameraSpec, width: int, height: int) -> CameraModel:
-    """Returns the calibrated camera for images of `width` x `height` px; no distortion."""
+def camera_model(
+    spec: AnyCameraSpec, width: int, height: int, base_link: str = 'base'
+) -> CameraModel:
+    """Returns the calibrated camera for images of `width` x `height` px; no distortion.
+
+    Args:
+        spec: of the camera.
+        width: of its images [px].
+        height: likewise.
+        base_link: carries the cameras that are fixed.
+    """
     focal = width * spec.distance / spec.visible_width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return CameraModel(
@@ -144,17 +185,20 @@ def camera_model(spec: CameraSpec, width: int, height: int) -> CameraModel:
         width=width,
         height=height,
         K=K,
-        mount_link='base',
+        mount_link=spec.link if isinstance(spec, WristCameraSpec) else base_link,
         T_mount_camera=optical_pose(spec),
     )
 
 
-def camera_xml(camera: CameraModel) -> str:
-    """Returns the MJCF camera of a fixed, centred, undistorted camera.
+def camera_xml(camera: CameraModel, pose: FloatArray) -> str:
+    """Returns the MJCF camera of a centred, undistorted camera.
 
     MuJoCo's camera looks along its own -z with y up; the optical frame has y down, z ahead.
+
+    Args:
+        camera: its name, size and K.
+        pose: (4, 4) of its optical frame in the body that carries it.
     """
-    pose = camera.T_mount_camera
     x, y, z = pose[:3, 3]
     right, down = pose[:3, 0], pose[:3, 1]
     axes = ' '.join(f'{value:.12g}' for value in (*right, *-down))

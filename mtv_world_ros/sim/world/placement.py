@@ -2,40 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mtv_world_ros.sim.shapes import RIM_M, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, START, Task
-from mtv_world_ros.sim.world.arm import BASE_POSITIONS
 from mtv_world_ros.sim.world.scene import Place, SceneObject
+from mtv_world_ros.sim.world.workcell import PlacementConfig, Workcell
 from mtv_world_ros.success.relations import FLOOR_M
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacementConfig:
-    """Limits of a feasible scene.
-
-    Attributes:
-        clearance: least gap between the objects' outlines, room for a finger [m].
-        reach: how far from an arm's base its tool is sent, top-down, over the table [m].
-        reach_above: the same where it is higher, over or in another object [m].
-        max_x: goals are at most this far from the table's middle line, in all views [m].
-    """
-
-    clearance: float = 0.06
-    reach: float = 0.4
-    reach_above: float = 0.375
-    max_x: float = 0.23
+def side_of(subject: SceneObject) -> float:
+    """Returns on which side of the table's middle line an object lies: -1 left, 1 right."""
+    return -1.0 if subject.position[0] < 0 else 1.0
 
 
-def arm_of(subject: SceneObject) -> str:
-    """Returns the arm that handles an object: the one on its side of the table."""
-    return 'left' if subject.position[0] < 0 else 'right'
-
-
-def _plane(a: Place, b: Place) -> float:
+def _plane(a: Sequence[float], b: Sequence[float]) -> float:
     return float(np.hypot(a[0] - b[0], a[1] - b[1]))
 
 
@@ -86,7 +70,11 @@ def goals_of(
 
 
 def is_feasible(
-    task: Task, items: dict[str, SceneObject], goals: tuple[Place, ...], config: PlacementConfig
+    task: Task,
+    items: dict[str, SceneObject],
+    goals: tuple[Place, ...],
+    config: PlacementConfig,
+    workcell: Workcell,
 ) -> bool:
     """Returns whether objects lie apart, and goals are free and in the arm's reach."""
     listed = list(items.values())
@@ -98,7 +86,7 @@ def is_feasible(
         moved, way = replace(subject, position=goal), _plane(subject.position, goal)
         if isinstance(move, PickPlace) and way < move.least:
             return False
-        if not _reaches(move, subject, goal, config):
+        if not _reaches(move, subject, goal, config, workcell):
             return False
         if not _is_free(task, number, moved, now, config):
             return False
@@ -106,14 +94,16 @@ def is_feasible(
     return True
 
 
-def _reaches(move: Move, subject: SceneObject, goal: Place, config: PlacementConfig) -> bool:
-    arm = arm_of(subject)
+def _reaches(
+    move: Move, subject: SceneObject, goal: Place, config: PlacementConfig, workcell: Workcell
+) -> bool:
     grasp = SHAPES[subject.shape].grasp
     assert grasp is not None, f'{subject.shape} cannot be grasped'
-    shift, base = grasp.offset(subject.size, arm), BASE_POSITIONS[arm]
+    shift = grasp.offset(subject.size, side_of(subject))
+    base = workcell.bases[workcell.arm_at(subject.position[0])]
 
     def distance(place: Place) -> float:
-        return _plane((place[0] + shift, place[1], place[2]), base)
+        return _plane((place[0] + shift, place[1]), base)
 
     above = not isinstance(move, PickPlace) or move.rest != 'table'
     limit = config.reach_above if above else config.reach

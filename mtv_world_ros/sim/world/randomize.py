@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import colorsys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import ObjectRole, Task
-from mtv_world_ros.sim.world.cameras import (
-    camera_model,
-    CameraJitter,
-    CAMERAS,
-    CameraSpec,
-    jittered,
-)
-from mtv_world_ros.sim.world.placement import goals_of, is_feasible, PlacementConfig
+from mtv_world_ros.sim.world.cameras import AnyCameraSpec, camera_model, CameraJitter, jittered
+from mtv_world_ros.sim.world.placement import goals_of, is_feasible
 from mtv_world_ros.sim.world.scene import (
     check_cameras,
     Place,
@@ -27,6 +21,7 @@ from mtv_world_ros.sim.world.scene import (
     SceneLook,
     SceneObject,
 )
+from mtv_world_ros.sim.world.workcell import PlacementConfig, Workcell
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.vision.colour_words import PALETTE
 
@@ -41,16 +36,24 @@ class RandomizationConfig:
     Attributes:
         width: image width [px].
         height: image height [px].
-        cameras: nominal cameras, in the order of the views.
+        cameras: nominal cameras, in the order of the views; None = those of the workcell.
         jitter: half widths of the camera randomisation.
-        placement: where objects and goals may lie.
+        placement: where objects and goals may lie; None = as in the workcell.
     """
 
     width: int = 384
     height: int = 288
-    cameras: tuple[CameraSpec, ...] = CAMERAS
+    cameras: tuple[AnyCameraSpec, ...] | None = None
     jitter: CameraJitter = CameraJitter()
-    placement: PlacementConfig = PlacementConfig()
+    placement: PlacementConfig | None = None
+
+    def of(self, workcell: Workcell) -> RandomizationConfig:
+        """Returns it with the cameras and limits of a workcell where it has none."""
+        return replace(
+            self,
+            cameras=self.cameras or workcell.cameras,
+            placement=self.placement or workcell.placement,
+        )
 
 
 def _draw_object(role: ObjectRole, side: float, taken: set[str], rng: Rng) -> SceneObject:
@@ -104,26 +107,30 @@ def start_situation(
         positions={role: np.array([item.position]) for role, item in items.items()},
         rotations={role: rotation_of(item)[None] for role, item in items.items()},
         sizes={role: item.size for role, item in items.items()},
-        openings=np.ones((2, 1)),
+        openings=np.ones((1, 1)),
         goals=task.goals(goals),
     )
 
 
 def draw_scene(
-    task: Task, rng: np.random.Generator, config: RandomizationConfig | None = None
+    task: Task,
+    rng: np.random.Generator,
+    workcell: Workcell,
+    config: RandomizationConfig | None = None,
 ) -> Scene:
     """Returns a random scene of a task; the same generator state gives the same scene.
 
     Raises:
-        SimulatorError: no feasible placement found, or a camera does not see an object.
+        SimulatorError: no feasible placement found, or a fixed camera does not see an object.
     """
-    config = config or RandomizationConfig()
+    config = (config or RandomizationConfig()).of(workcell)
+    assert config.cameras is not None and config.placement is not None
     roles = [role for role in task.roles if rng.uniform() < role.probability]
     for _ in range(MAX_DRAWS):
         items = _draw_objects(task, roles, rng)
         shifts = [(float(x), float(y)) for x, y in rng.uniform(-1, 1, (len(task.moves), 2))]
         goals = goals_of(task, items, shifts)
-        if not is_feasible(task, items, goals, config.placement):
+        if not is_feasible(task, items, goals, config.placement, workcell):
             continue
         if not task.succeeds(start_situation(task, items, goals)).any():
             break
@@ -131,16 +138,18 @@ def draw_scene(
         raise SimulatorError(
             f"no feasible placement for task '{task.name}' in {MAX_DRAWS} draws; widen x_range "
             'and y_range of its roles (sim/tasks/tasks.py) or lower the clearance '
-            '(sim/world/placement.py)'
+            '(config/workcells)'
         )
     cameras = tuple(
-        camera_model(jittered(spec, config.jitter, rng), config.width, config.height)
+        camera_model(
+            jittered(spec, config.jitter, rng), config.width, config.height, workcell.base_link
+        )
         for spec in config.cameras
     )
     scene = Scene(
         objects=tuple(items.values()), cameras=cameras, look=_draw_look(rng), goals=goals
     )
-    check_cameras(scene)
+    check_cameras(scene, workcell.base_link)
     return scene
 
 

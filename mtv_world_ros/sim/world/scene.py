@@ -1,7 +1,8 @@
-"""One episode's scene as data, and its MJCF: table, light, cameras, two arms, free objects."""
+"""One episode's scene as data, and its MJCF: table, light, cameras, arms, free objects."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.shapes import shape_named, Size
-from mtv_world_ros.sim.world.arm import actuators_xml, arm_xml, ARMS
+from mtv_world_ros.sim.world.arm import actuators_of, bodies_xml
 from mtv_world_ros.sim.world.cameras import camera_xml
 
 TIMESTEP_S = 0.002
@@ -83,13 +84,14 @@ def _object_xml(item: SceneObject) -> str:
     )
 
 
-def _classes_xml() -> str:
+def _classes_xml(names: Sequence[str]) -> str:
     """Arms collide with objects, the table and each other, but no arm with itself."""
+    bits = [2 << number for number in range(len(names))]
     arms = ''.join(
-        f'<default class="{arm}_arm"><geom contype="{own}" conaffinity="{1 | other}" '
+        f'<default class="{arm}_arm"><geom contype="{own}" conaffinity="{1 + sum(bits) - own}" '
         f'friction="0.6"/><default class="{arm}_pad"><geom friction="1.6 0.02 0.0005" condim="4" '
         'solref="0.008 1" priority="1"/></default></default>'
-        for arm, own, other in zip(ARMS, (2, 4), (4, 2), strict=True)
+        for arm, own in zip(names, bits, strict=True)
     )
     return (
         '<default><geom solref="0.006 1"/>'
@@ -99,12 +101,14 @@ def _classes_xml() -> str:
 
 
 def scene_xml(scene: Scene, robot: RobotModel) -> str:
-    """Returns the MJCF document of a scene with two arms at the origin pose of all joints.
+    """Returns the MJCF document of a scene with the arms at the origin pose of all joints.
 
     Without a GPU, triangles cost more than pixels: half the stacks and undivided boxes take a
     third off the time of an image, and outlines stay as they are.
     """
     look = scene.look
+    fixed = [camera for camera in scene.cameras if camera.mount_link == robot.base_link]
+    moving = [camera for camera in scene.cameras if camera.mount_link != robot.base_link]
     width = max(camera.width for camera in scene.cameras)
     height = max(camera.height for camera in scene.cameras)
     return f"""<mujoco model="bimanual_table">
@@ -118,18 +122,18 @@ def scene_xml(scene: Scene, robot: RobotModel) -> str:
                specular="0 0 0"/>
   </visual>
   <asset><material name="matte" specular="0" shininess="0"/></asset>
-  {_classes_xml()}
+  {_classes_xml([tool.arm for tool in robot.tools])}
   <worldbody>
     <light type="directional" dir="{_numbers(look.light_direction)}" pos="0 0 2" castshadow="false"
            diffuse="{look.diffuse} {look.diffuse} {look.diffuse}" ambient="0 0 0"
            specular="0 0 0"/>
     <geom name="table" type="plane" size="3 3 0.1" rgba="{_numbers(look.table_rgb)} 1"
           friction="0.9 0.01 0.0005" condim="4"/>
-    {''.join(camera_xml(camera) for camera in scene.cameras)}
-    {''.join(arm_xml(arm, robot) for arm in ARMS)}
+    {''.join(camera_xml(camera, camera.T_mount_camera) for camera in fixed)}
+    {bodies_xml(robot, moving)}
     {''.join(_object_xml(item) for item in scene.objects)}
   </worldbody>
-  <actuator>{''.join(actuators_xml(arm) for arm in ARMS)}</actuator>
+  <actuator>{''.join(actuator.xml() for actuator in actuators_of(robot))}</actuator>
 </mujoco>"""
 
 
@@ -145,18 +149,22 @@ def corners(item: SceneObject) -> FloatArray:
     return local @ rotation_of(item).T + np.asarray(item.position)
 
 
-def check_cameras(scene: Scene) -> None:
-    """Refuses a scene in which a camera does not see every object as a whole.
+def check_cameras(scene: Scene, base_link: str) -> None:
+    """Refuses a scene in which a fixed camera does not see every object as a whole.
+
+    Args:
+        scene: with its cameras.
+        base_link: carries the fixed ones.
 
     Raises:
         SimulatorError: names the camera and the objects outside its image.
     """
-    for camera in scene.cameras:
+    for camera in (one for one in scene.cameras if one.mount_link == base_link):
         hidden = [item.name for item in scene.objects if not _inside(camera, corners(item))]
         if hidden:
             raise SimulatorError(
                 f"camera '{camera.view}' does not see {', '.join(hidden)} as a whole; move its "
-                'target or widen visible_width (sim/world/cameras.py), or narrow the region of '
+                'target or widen visible_width (config/workcells), or narrow the region of '
                 'the objects (sim/tasks/tasks.py)'
             )
 

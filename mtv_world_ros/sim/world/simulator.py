@@ -11,10 +11,11 @@ from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
-from mtv_world_ros.sim.world.arm import ARMS, velocity_gains
+from mtv_world_ros.sim.world.arm import actuators_of
 from mtv_world_ros.sim.world.opengl import load_mujoco
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, RandomizationConfig
 from mtv_world_ros.sim.world.scene import Scene, scene_xml, TIMESTEP_S
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 
 CONTROL_PERIOD_S = 0.02
@@ -48,9 +49,9 @@ class SimEpisode:
     """Physics and cameras of one episode at a time.
 
     Args:
-        robot: the bimanual arm; two arms of six joints and a gripper, left first.
+        robot: one that has a workcell.
         home: (J,) joint positions at reset [rad or m].
-        config: what is randomised, and the image size.
+        config: what is randomised, and the image size; default: the workcell's.
         rendering: False runs physics alone, without OpenGL; images are then empty.
     """
 
@@ -64,17 +65,24 @@ class SimEpisode:
     ) -> None:
         self.robot = robot
         self.home = np.asarray(home, dtype=np.float64)
+        self._workcell = workcell_of(robot)
         self._config = config or RandomizationConfig()
         self._rendering = rendering
         self._mujoco = load_mujoco(rendering=rendering)
-        self._lead = np.array(velocity_gains() * len(ARMS))
+        actuators = actuators_of(robot)
+        self._columns = np.array([actuator.column for actuator in actuators])
+        self._multipliers = np.array([actuator.multiplier for actuator in actuators])
+        self._offsets = np.array([actuator.offset for actuator in actuators])
+        # velocity feedforward that removes the lag [s]
+        self._lead = np.array([actuator.kv / actuator.kp for actuator in actuators])
         self._renderer: Any = None
         self._model: Any = None
 
     def reset(self, seed: int, task: str | Task) -> SimObservation:
         """Builds the scene of a seed and returns its first observation."""
         self.task = task_named(task) if isinstance(task, str) else task
-        return self.load(draw_scene(self.task, scene_generator(seed), self._config), self.task)
+        scene = draw_scene(self.task, scene_generator(seed), self._workcell, self._config)
+        return self.load(scene, self.task)
 
     def load(self, scene: Scene, task: Task) -> SimObservation:
         """Builds a given scene and returns its first observation.
@@ -152,9 +160,9 @@ class SimEpisode:
 
     def positions(self) -> FloatArray:
         """Returns the measured joint positions (J,) in the robot's order [rad or m]."""
-        measured = self._data.qpos[self._arm_qpos].reshape(len(ARMS), 8)
-        gripper = (measured[:, 6] - measured[:, 7]) / 2
-        return np.concatenate([measured[:, :6], gripper[:, None]], axis=1).reshape(-1)
+        driven = (self._data.qpos[self._arm_qpos] - self._offsets) / self._multipliers
+        sums = np.bincount(self._columns, driven, minlength=len(self.home))
+        return sums / np.bincount(self._columns, minlength=len(self.home))
 
     def object_poses(self) -> FloatArray:
         """Returns T_base_object (O, 4, 4) of the objects' centres [m]."""
@@ -229,20 +237,10 @@ class SimEpisode:
 
     def _index_model(self) -> None:
         """Finds where the joints stand in qpos; which geom is whose is asked when it is drawn."""
-        joints = [
-            name
-            for arm in ARMS
-            for name in (
-                *(f'{arm}_joint{number}' for number in range(1, 7)),
-                f'{arm}_left_finger',
-                f'{arm}_right_finger',
-            )
-        ]
+        joints = [actuator.joint for actuator in actuators_of(self.robot)]
         self._arm_qpos = np.array([self._model.joint(name).qposadr[0] for name in joints])
         self._instance_of = np.zeros(0, dtype=np.uint8)
 
-    @staticmethod
-    def _spread(positions: FloatArray) -> FloatArray:
-        """(14,) robot joints -> (16,) actuators: the right finger mirrors the left."""
-        arms = positions.reshape(len(ARMS), 7)
-        return np.concatenate([arms, -arms[:, 6:]], axis=1).reshape(-1)
+    def _spread(self, positions: FloatArray) -> FloatArray:
+        """(J,) robot joints -> actuators: mimic joints follow, the YAM's right finger mirrors."""
+        return positions[self._columns] * self._multipliers + self._offsets

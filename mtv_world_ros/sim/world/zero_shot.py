@@ -83,8 +83,8 @@ def variant(
 def with_moved_cameras(
     randomization: RandomizationConfig, moves: CameraMoves, rng: np.random.Generator
 ) -> RandomizationConfig:
-    """Returns the randomisation with every camera moved."""
-    cameras = tuple(moved(spec, moves, rng) for spec in randomization.cameras)
+    """Returns the randomisation with every fixed camera moved; its cameras must be known."""
+    cameras = tuple(moved(spec, moves, rng) for spec in randomization.cameras or ())
     return replace(randomization, cameras=cameras)
 
 

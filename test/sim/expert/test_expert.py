@@ -6,7 +6,6 @@ from mtv_world_ros.geometry.robot import check_positions
 from mtv_world_ros.sim.collect.record import chunk, expert_generator, RecordConfig, simulate
 from mtv_world_ros.sim.expert.kinematics import ArmSolver, top_down
 from mtv_world_ros.sim.tasks.tasks import TASKS
-from mtv_world_ros.sim.world.arm import BASE_POSITIONS
 from mtv_world_ros.sim.world.simulator import SimEpisode
 
 
@@ -111,10 +110,10 @@ def test_chunks_join_to_the_whole_trajectory(sim, expert):
     assert not late.velocities[-1].any()
 
 
-def test_solver_reaches_poses_and_refuses_those_out_of_reach(robot):
+def test_solver_reaches_poses_and_refuses_those_out_of_reach(robot, workcell):
     tool = robot.tools[0]
     solver = ArmSolver(robot, tool)
-    x, y, _ = BASE_POSITIONS['left']
+    x, y = workcell.bases['left']
     pose = top_down(np.array([x + 0.1, y + 0.3, 0.05]), 0.3)
     joints = solver.solve(pose, np.array([0.0, 1.5, 1.5, -1.4, 0.0, 0.0]))
     positions = np.zeros((1, len(robot.joint_names)))

@@ -6,7 +6,6 @@ import pytest
 from mtv_world_ros.data_types import Observation
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.geometry.robot import check_positions
-from mtv_world_ros.sim.expert.expert import HOME_TOOL
 from mtv_world_ros.sim.expert.faults import parse_variant, PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.world.simulator import SimEpisode
@@ -182,8 +181,8 @@ def test_success_is_graded_by_the_faults(sim, expert):
     assert 0.0 < rates[1] < 1.0 and 0.0 < rates[2] < 1.0
 
 
-def test_home_is_where_the_scenario_begins(expert, robot):
+def test_home_is_where_the_scenario_begins(expert, robot, workcell):
     """A policy that stops at once keeps both tools at rest."""
     plan = _policy('expert-stop-0', expert).plan
     tools = robot.tool_poses(plan.positions)[:, -1, :3, 3]
-    np.testing.assert_allclose(tools, [HOME_TOOL['left'], HOME_TOOL['right']], atol=1e-3)
+    np.testing.assert_allclose(tools, list(workcell.home_tools.values()), atol=1e-3)

@@ -5,11 +5,15 @@ import pytest
 
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import task_named, TASKS, tasks_named
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, start_situation
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.vision.colour_words import PALETTE
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
+
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
 
 
 def test_unknown_task_names_the_nearest():
@@ -29,7 +33,7 @@ def test_tasks_are_chosen_by_all_or_by_a_list():
 def test_scenes_start_undone_with_distinct_colours_on_the_table(name):
     task = TASKS[name]
     for seed in range(20):
-        scene = draw_scene(task, np.random.default_rng(seed))
+        scene = draw_scene(task, np.random.default_rng(seed), WORKCELL)
         items = {item.role: item for item in scene.objects}
         assert len(items) >= 2
         words = [item.name.split()[0] for item in scene.objects]
@@ -45,14 +49,14 @@ def test_scenes_start_undone_with_distinct_colours_on_the_table(name):
 
 def test_the_same_seed_draws_the_same_scene_and_another_seed_another():
     task = TASKS['stack_blocks_two']
-    first, again, other = (draw_scene(task, np.random.default_rng(s)) for s in (3, 3, 4))
+    first, again, other = (draw_scene(task, np.random.default_rng(s), WORKCELL) for s in (3, 3, 4))
     assert first.objects == again.objects and first.look == again.look
     assert (first.cameras[0].T_mount_camera == again.cameras[0].T_mount_camera).all()
     assert first.objects != other.objects
 
 
 def test_instruction_names_the_objects_that_it_is_about():
-    scene = draw_scene(TASKS['place_block_a2b_left'], np.random.default_rng(0))
+    scene = draw_scene(TASKS['place_block_a2b_left'], np.random.default_rng(0), WORKCELL)
     text = instruction_of(TASKS['place_block_a2b_left'], scene)
     assert objects_from_instruction(text) == tuple(item.name for item in scene.objects[:2])
 
@@ -73,7 +77,7 @@ def then(task, scene, positions):
 
 def test_a_scene_that_is_done_is_a_success():
     task = TASKS['place_block_a2b_left']
-    scene = draw_scene(task, np.random.default_rng(0))
+    scene = draw_scene(task, np.random.default_rng(0), WORKCELL)
     target = next(np.array(item.position) for item in scene.objects if item.role == 'b')
     done = then(task, scene, {'a': target + [-0.13, 0.0, 0.0]})
     assert task.succeeds(done).tolist() == [False, True]
@@ -102,15 +106,18 @@ def test_the_goals_of_a_scene_fulfil_its_task():
     for task in TASKS.values():
         if task.name == 'shake_bottle':
             continue
-        scene = draw_scene(task, np.random.default_rng(1))
+        scene = draw_scene(task, np.random.default_rng(1), WORKCELL)
         goals = {move.subject: goal for move, goal in zip(task.moves, scene.goals, strict=True)}
         assert task.succeeds(then(task, scene, goals))[-1], task.name
 
 
 def test_both_sides_of_the_table_are_used():
     sides = {
-        draw_scene(TASKS['shake_bottle'], np.random.default_rng(seed)).objects[0].position[0] > 0
-        for seed in range(12)
+        drawn.objects[0].position[0] > 0
+        for drawn in (
+            draw_scene(TASKS['shake_bottle'], np.random.default_rng(seed), WORKCELL)
+            for seed in range(12)
+        )
     }
     assert sides == {True, False}
 
@@ -118,7 +125,7 @@ def test_both_sides_of_the_table_are_used():
 def test_things_that_grow_keep_their_colour_and_no_two_objects_share_one():
     grown = {'carrot': 'orange', 'corn': 'yellow', 'eggplant': 'purple'}
     for seed in range(20):
-        scene = draw_scene(TASKS['collect_food'], np.random.default_rng(seed))
+        scene = draw_scene(TASKS['collect_food'], np.random.default_rng(seed), WORKCELL)
         names = [item.name for item in scene.objects]
         assert len({name.split()[0] for name in names}) == len(names)
         for name in names:

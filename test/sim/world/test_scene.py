@@ -4,37 +4,52 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.camera import camera_poses, project
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import TASKS
-from mtv_world_ros.sim.world.arm import ARMS
-from mtv_world_ros.sim.world.cameras import camera_model, CAMERAS
+from mtv_world_ros.sim.world.arm import actuators_of
+from mtv_world_ros.sim.world.cameras import camera_model
 from mtv_world_ros.sim.world.opengl import load_mujoco, missing_opengl
 from mtv_world_ros.sim.world.randomize import draw_scene
 from mtv_world_ros.sim.world.scene import check_cameras, corners, scene_xml
 from mtv_world_ros.sim.world.simulator import SimEpisode
+from mtv_world_ros.sim.world.workcell import workcell_of
 
 
 @pytest.fixture
-def scene():
-    return draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1))
+def scene(workcell):
+    return draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell)
 
 
-def test_simulated_arms_stand_where_pinocchio_puts_them(robot, scene):
+@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+def test_simulated_arms_stand_where_pinocchio_puts_them(name):
     mujoco = load_mujoco(rendering=False)
-    model = mujoco.MjModel.from_xml_string(scene_xml(scene, robot))
+    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    drawn = draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell_of(robot))
+    model = mujoco.MjModel.from_xml_string(scene_xml(drawn, robot))
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     positions = rng.uniform(robot.lower, robot.upper, (200, len(robot.joint_names)))
     tools = robot.tool_poses(positions)
+    cameras = {c.view: camera_poses(c, robot, positions) for c in drawn.cameras}
     for t, row in enumerate(positions):
-        for name, value in zip(robot.joint_names, row, strict=True):
-            data.joint(name.replace('gripper', 'left_finger')).qpos = value
-        mujoco.mj_kinematics(model, data)
-        for a, arm in enumerate(ARMS):
-            site = data.site(f'{arm}_tool')
+        for actuator in actuators_of(robot):
+            driven = actuator.multiplier * row[actuator.column] + actuator.offset
+            data.joint(actuator.joint).qpos = driven
+        mujoco.mj_forward(model, data)
+        for a, tool in enumerate(robot.tools):
+            site = data.site(f'{tool.arm}_tool')
             np.testing.assert_allclose(site.xpos, tools[a, t, :3, 3], atol=1e-6)
             np.testing.assert_allclose(site.xmat.reshape(3, 3), tools[a, t, :3, :3], atol=1e-6)
+        for view, poses in cameras.items():
+            pose = poses[t] if poses.ndim == 3 else poses
+            seen = data.camera(view)
+            np.testing.assert_allclose(seen.xpos, pose[:3, 3], atol=1e-6)
+            # x right; MuJoCo's y is up and it looks along -z
+            axes = pose[:3, :3] * [1, -1, -1]
+            np.testing.assert_allclose(seen.xmat.reshape(3, 3), axes, atol=1e-6)
 
 
 def test_projected_block_corners_bound_the_rendered_mask(robot, expert, opengl):
@@ -93,10 +108,10 @@ def test_blocks_show_in_their_own_colour(robot, expert, opengl):
     sim.close()
 
 
-def test_camera_that_misses_an_object_is_refused(scene):
-    away = replace(CAMERAS[0], view='away', target=(1.5, 0.0, 0.0))
+def test_camera_that_misses_an_object_is_refused(scene, workcell):
+    away = replace(workcell.cameras[0], view='away', target=(1.5, 0.0, 0.0))
     with pytest.raises(SimulatorError, match=f"'away' does not see {scene.objects[0].name}"):
-        check_cameras(replace(scene, cameras=(camera_model(away, 96, 72),)))
+        check_cameras(replace(scene, cameras=(camera_model(away, 96, 72),)), 'base')
 
 
 def test_unknown_shape_names_the_nearest(robot, scene):

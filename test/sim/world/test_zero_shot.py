@@ -7,13 +7,16 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.sim.collect.episode_maker import cameras_of, CollectConfig
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import task_named, TASKS, tasks_named
-from mtv_world_ros.sim.world.cameras import camera_model, CameraJitter, CameraMoves, CAMERAS
+from mtv_world_ros.sim.world.cameras import camera_model, CameraJitter, CameraMoves
 from mtv_world_ros.sim.world.randomize import draw_scene, RandomizationConfig
+from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.sim.world.zero_shot import (
     kinds_named,
     tasks_of,
@@ -21,13 +24,15 @@ from mtv_world_ros.sim.world.zero_shot import (
     variant,
 )
 
-PLAIN, CONFIG = RandomizationConfig(), CameraMoves()
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
+CAMERAS = WORKCELL.cameras
+PLAIN, CONFIG = RandomizationConfig().of(WORKCELL), CameraMoves()
 ALL = tasks_named('all')
 
 
 def _scene(kind, task, seed):
     drawn, randomization = variant(kind, task, seed, PLAIN, CONFIG)
-    return draw_scene(drawn, np.random.default_rng(seed), randomization)
+    return draw_scene(drawn, np.random.default_rng(seed), WORKCELL, randomization)
 
 
 def _turn(one, other):

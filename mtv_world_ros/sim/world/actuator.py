@@ -1,0 +1,35 @@
+"""Position actuators of a simulated robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Actuator:
+    """Drives one joint of the simulated robot to `multiplier * position + offset`.
+
+    Attributes:
+        joint: its name in the MJCF.
+        column: of the robot's joint whose position it follows.
+        multiplier: of that position; the mimic joints of a URDF have others than 1.
+        offset: added to it [rad or m].
+        kp: gain [N m/rad or N/m].
+        kv: damping [N m s/rad or N s/m].
+        max_force: largest torque or force [N m or N].
+    """
+
+    joint: str
+    column: int
+    multiplier: float = 1.0
+    offset: float = 0.0
+    kp: float
+    kv: float
+    max_force: float
+
+    def xml(self) -> str:
+        """Returns its MJCF."""
+        return (
+            f'<position joint="{self.joint}" kp="{self.kp}" kv="{self.kv}" '
+            f'forcerange="-{self.max_force} {self.max_force}"/>'
+        )
