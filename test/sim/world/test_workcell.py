@@ -30,9 +30,7 @@ def test_franka_flange_is_where_the_published_parameters_put_it():
     robot = bundled('franka')
     (pose,) = robot.link_poses('panda_hand', np.zeros((1, 8)))
     (base,) = robot.link_poses('panda_link0', np.zeros((1, 8)))
-    np.testing.assert_allclose(
-        (np.linalg.inv(base) @ pose)[:3, 3], [0.088, 0, 0.926], atol=1e-12
-    )
+    np.testing.assert_allclose((np.linalg.inv(base) @ pose)[:3, 3], [0.088, 0, 0.926], atol=1e-12)
     assert robot.velocity_limits[0] == 2.175 and robot.upper[3] == -0.0698
 
 
