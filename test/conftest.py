@@ -32,8 +32,17 @@ def _no_native_ros() -> str:
     return 'no `ros2` command with launch_ros: no native ROS 2 is sourced'
 
 
+def _no_control_msgs() -> str:
+    return '' if find_spec('control_msgs') is not None else 'control_msgs is not installed'
+
+
 #: marker -> why its tests cannot run here; an empty text where they can
-OBSTACLES = {'gpu': _no_gpu, 'weights': _no_weights, 'native_ros': _no_native_ros}
+OBSTACLES = {
+    'gpu': _no_gpu,
+    'weights': _no_weights,
+    'native_ros': _no_native_ros,
+    'control_msgs': _no_control_msgs,
+}
 
 _skipped: Counter[str] = Counter()
 

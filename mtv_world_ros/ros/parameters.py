@@ -138,6 +138,12 @@ class Settings(NodeSettings):
     num_inference_steps: int = parameter(
         0, 'Denoising steps a chunk; 0 = those the checkpoint is made for, else 4.', (0, 1000)
     )
+    least_goal_success: float = parameter(
+        0.0,
+        'Goals of `~/follow_joint_trajectory` whose success estimate is lower, or abstains, fail; '
+        '0 = the estimate is only told.',
+        (0.0, 1.0),
+    )
     max_trajectory_age_s: float = parameter(
         1.0,
         'Trajectories stamped longer before their observation are rejected [s].',

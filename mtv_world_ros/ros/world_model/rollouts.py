@@ -27,6 +27,12 @@ from mtv_world_ros.ros.sensing.live_robot import LiveRobot
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.adapter_parameter import AdapterSwitch
+from mtv_world_ros.ros.world_model.follow_joint_trajectory import (
+    find_action,
+    FollowJointTrajectory,
+    Goal,
+    NAME,
+)
 from mtv_world_ros.ros.world_model.live_fidelity import LiveFidelity
 from mtv_world_ros.ros.world_model.loading import check_calibration, load_cameras, reload_cameras
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
@@ -110,7 +116,7 @@ class Rollouts:
             on_ended=reporter.ended,
             on_error=reporter.crash,
         )
-        self._arrived: deque[tuple[float, JointTrajectory]] = deque()
+        self._arrived: deque[tuple[float, JointTrajectory | Goal]] = deque()
         self._arrivals = node.create_guard_condition(self._start_rollouts)
         self._results = node.create_guard_condition(self._publish_results)
         self._inputs = Inputs(
@@ -122,6 +128,7 @@ class Rollouts:
             on_trajectory=self._on_trajectory,
             guarded=reporter.guarded,
         )
+        self._action = self._offer_action(undo)
         node.create_service(Trigger, '~/reset', reporter.served(self._on_reset))
         node.create_service(SetBool, '~/imagine', reporter.served(self._on_imagine))
         back = JumpThreshold(
@@ -132,6 +139,22 @@ class Rollouts:
         )
         undo.callback(jumps.unregister)
         self._worker.start()
+
+    def _offer_action(self, undo: ExitStack) -> FollowJointTrajectory | None:
+        kind, node = find_action(), self._node
+        if kind is None:
+            node.get_logger().info(f'control_msgs is not installed: no {NAME}', once=True)
+            return None
+        action = FollowJointTrajectory(
+            kind,
+            node,
+            self._robot,
+            self._settings,
+            on_goal=self._on_trajectory,
+            give_up=self._worker.give_up,
+        )
+        undo.callback(action.close)
+        return action
 
     def activate(self) -> None:
         """Takes plans from now on."""
@@ -195,17 +218,19 @@ class Rollouts:
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
+    def _on_trajectory(self, plan: JointTrajectory | Goal) -> None:
         """Stores it; images that came with it are stored before it is looked at."""
-        self._arrived.append((time.monotonic(), message))
+        self._arrived.append((time.monotonic(), plan))
         self._arrivals.trigger()
 
     def _start_rollouts(self) -> None:
         while self._arrived:
             self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
 
-    def _start_rollout(self, arrived: tuple[float, JointTrajectory]) -> None:
-        received_s, message = arrived
+    def _start_rollout(self, arrived: tuple[float, JointTrajectory | Goal]) -> None:
+        received_s, plan = arrived
+        goal = plan if isinstance(plan, Goal) else None
+        message = plan.message if isinstance(plan, Goal) else plan
         self._reporter.count('trajectories_received')
         now_ns = self._node.get_clock().now().nanoseconds
         try:
@@ -214,15 +239,24 @@ class Rollouts:
                     Reason.NOT_ACTIVE, 'the node is inactive; its lifecycle manager activates it'
                 )
             self._live.check()
+            if goal is not None:
+                goal.check(self._robot.joint_names)
             request = self._maker.make(message, now_ns, received_s)
             self._live.show(request.scene)
             self._worker.submit(self._fidelity.replan(request))
         except Exception as error:  # one answer a plan, whatever is wrong with it
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
+            if goal is not None and self._action is not None:
+                self._action.refused(goal, error)
+            return
+        if goal is not None and self._action is not None:
+            self._action.started(goal, request)
 
     def _publish_results(self) -> None:
         for result in self._worker.take():
-            for take in (self._fidelity.expect, self._publisher.add):
+            takers = [self._fidelity.expect, self._publisher.add]
+            takers += [self._action.take] if self._action is not None else []
+            for take in takers:
                 self._reporter.guarded(take)(result)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -253,6 +253,22 @@ class RolloutWorker:
             self._episode, self._last = None, None
             self._observed.forget()
 
+    def give_up(self, rollout: int, text: str) -> None:
+        """Pre-empts one plan if it still runs or waits; imagine mode goes on from its chunks.
+
+        Args:
+            rollout: its number.
+            text: why, in words.
+        """
+        with self._changed:
+            running, pending = self._running, self._pending
+            if pending is not None and pending.rollout == rollout:
+                self._put(Ended(request=pending, state='preempted', num_chunks=0, text=text))
+                self._pending = None
+            elif running is not None and running.rollout == rollout and not self._abandoned:
+                self._put(self._ended(running, 'preempted', text=text))
+                self._abandoned = True
+
     def take(self) -> list[Result]:
         """Returns the results since the last call, in order."""
         with self._changed:

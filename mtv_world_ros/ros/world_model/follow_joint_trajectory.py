@@ -1,0 +1,296 @@
+"""The action `~/follow_joint_trajectory`: controller clients execute on the imagination."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+import importlib
+from math import isnan
+from typing import Any
+
+from builtin_interfaces.msg import Duration
+import numpy as np
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
+from trajectory_msgs.msg import JointTrajectoryPoint
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.stamps import make_header, NANO
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request, Result
+
+NAME = '~/follow_joint_trajectory'
+#: positions are compared to the digits that a message keeps
+_ROUNDING = 1e-9
+
+
+@dataclass(eq=False, kw_only=True)
+class Goal:
+    """A goal that was accepted.
+
+    Attributes:
+        handle: what rclpy knows of it.
+        request: the plan that it became; None = it waits to become one.
+        start: (J,) positions that the plan starts from, in the robot's order [rad or m].
+        violation: name of the code and text of a tolerance that is violated.
+    """
+
+    handle: ServerGoalHandle
+    request: Request | None = None
+    start: FloatArray | None = None
+    violation: tuple[str, str] | None = None
+
+    @property
+    def message(self) -> JointTrajectoryMsg:
+        """Its trajectory."""
+        return self.handle.request.trajectory
+
+    def check(self, joint_names: Sequence[str]) -> None:
+        """Refuses what no plan on the topic can have.
+
+        Args:
+            joint_names: of the robot.
+
+        Raises:
+            Rejection: joints of several degrees of freedom, or a tolerance of another joint.
+        """
+        goal = self.handle.request
+        if goal.multi_dof_trajectory.joint_names or goal.multi_dof_trajectory.points:
+            raise Rejection(
+                Reason.TRAJECTORY_MALFORMED,
+                'joints of several degrees of freedom are not imagined; leave '
+                'multi_dof_trajectory empty',
+            )
+        named = {one.name for one in (*goal.path_tolerance, *goal.goal_tolerance)}
+        others = sorted(named - (set(goal.trajectory.joint_names) & set(joint_names)))
+        if others:
+            raise Rejection(
+                Reason.JOINT_NAMES,
+                f'tolerances name the joints {others}, which are no joints of the robot that the '
+                'trajectory moves',
+            )
+
+
+class FollowJointTrajectory:
+    """Goals take the same path as plans on the topic; a newer plan pre-empts an older one.
+
+    A chunk gives one feedback, of its last frame. The goal ends when the plan does, which is as
+    soon as it is computed.
+
+    Args:
+        action: the type of the action.
+        node: owner of the server.
+        robot: whose joints goals move.
+        settings: the present parameters.
+        on_goal: gets the goals, to hand them back by `started` or `refused`.
+        give_up: pre-empts a plan, by the number of its rollout, with a text.
+    """
+
+    def __init__(
+        self,
+        action: Any,
+        node: Node,
+        robot: RobotModel,
+        settings: Callable[[], Settings],
+        *,
+        on_goal: Callable[[Goal], None],
+        give_up: Callable[[int, str], None],
+    ) -> None:
+        self._action, self._robot, self._settings = action, robot, settings
+        self._on_goal, self._give_up = on_goal, give_up
+        self._goals: dict[int, Goal] = {}
+        self._server = _Server(
+            node,
+            action,
+            NAME,
+            execute_callback=_never,
+            handle_accepted_callback=self._on_accepted,
+            cancel_callback=self._on_cancel,
+        )
+
+    def close(self) -> None:
+        """Ends the server."""
+        self._server.destroy()
+
+    def started(self, goal: Goal, request: Request) -> None:
+        """Takes the plan that a goal became."""
+        goal.request = request
+        self._goals[request.rollout] = goal
+
+    def refused(self, goal: Goal, error: Exception) -> None:
+        """Takes why a goal did not become a plan."""
+        reason = error.reason if isinstance(error, Rejection) else None
+        self._conclude(goal, 'abort', _code(reason), str(error))
+
+    def take(self, result: Result) -> None:
+        """Tells the client of a chunk or of the end, if the plan came from one."""
+        goal = self._goals.get(result.request.rollout)
+        if goal is None:
+            return
+        if isinstance(result, Chunk):
+            self._follow(goal, result)
+            return
+        del self._goals[result.request.rollout]
+        self._conclude(goal, *self._outcome(goal, result))
+
+    def _on_accepted(self, handle: ServerGoalHandle) -> None:
+        handle.execute()
+        self._on_goal(Goal(handle=handle))
+
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        for rollout, goal in self._goals.items():
+            if goal.handle == handle:
+                self._give_up(rollout, 'cancelled by its client')
+                return CancelResponse.ACCEPT
+        return CancelResponse.REJECT
+
+    def _follow(self, goal: Goal, chunk: Chunk) -> None:
+        """Publishes the feedback of a chunk and holds it to the goal's tolerances."""
+        prediction, request = chunk.prediction, chunk.request
+        if goal.start is None:
+            goal.start = prediction.start.positions
+        offset_s = (request.stamp_ns - prediction.stamp_ns) / NANO if request.stamp_ns else 0.0
+        path = match_joints(request.trajectory, self._robot, goal.start, allow_missing=True)
+        path = replace(path, times=path.times + offset_s)
+        times, actual = prediction.video.times, prediction.positions
+        if prediction.chunk == 0:  # where the robot is when the plan begins
+            times, actual = np.concatenate([[0.0], times]), np.vstack([goal.start, actual])
+        desired = resample(path, goal.start, times)
+        is_over = prediction.chunk == prediction.num_chunks - 1
+        goal.violation = _violation(
+            'PATH', goal.handle.request.path_tolerance, path.joint_names, desired, actual
+        ) or (
+            _violation(
+                'GOAL', goal.handle.request.goal_tolerance, path.joint_names,
+                path.positions[-1:], actual[-1:],
+            ) if is_over else None
+        )  # fmt: skip
+        time_s, names = float(times[-1]), self._robot.joint_names
+        moved = [at for at, name in enumerate(names) if name in request.trajectory.joint_names]
+        feedback = self._action.Feedback(
+            header=make_header(prediction.stamp_ns + round(time_s * NANO)),
+            joint_names=[names[column] for column in moved],
+            desired=_point(desired[-1, moved], time_s - offset_s),
+            actual=_point(actual[-1, moved], time_s - offset_s),
+            error=_point((desired - actual)[-1, moved], time_s - offset_s),
+        )
+        goal.handle.publish_feedback(feedback)
+        if goal.violation:
+            self._give_up(request.rollout, goal.violation[1])
+
+    def _outcome(self, goal: Goal, ended: Ended) -> tuple[str, str, str]:
+        """The goal's last event, the name of its code, and why in words."""
+        told = _verdict(ended)
+        if goal.violation:
+            code, text = goal.violation
+            return 'abort', code, f'{text}; {told}'
+        if ended.state == 'done':
+            least = self._settings().least_goal_success
+            probability = ended.last.prediction.success.probability if ended.last else float('nan')
+            if least and not probability >= least:
+                text = f"'least_goal_success' asks for {least:g}"
+                return 'abort', 'GOAL_TOLERANCE_VIOLATED', f'{told}; {text}'
+            return 'succeed', 'SUCCESSFUL', told
+        why = ended.text or _WHY.get(ended.state, ended.state)
+        if goal.handle.is_cancel_requested:
+            return 'canceled', 'SUCCESSFUL', f'{why}; {told}'
+        return 'abort', _code(ended.reason), f'{why}; {told}'
+
+    def _conclude(self, goal: Goal, event: str, code: str, text: str) -> None:
+        result = self._action.Result(error_code=getattr(self._action.Result, code))
+        result.error_string = text
+
+        def conclude(handle: ServerGoalHandle) -> Any:
+            getattr(handle, event)()
+            return result
+
+        self._server.conclude(goal.handle, conclude)
+
+
+class _Server(ActionServer):
+    """Goals that end when they are told to.
+
+    rclpy's own way, a coroutine that waits, makes the executor turn without a pause.
+    """
+
+    def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
+        """Does nothing yet."""
+
+    def conclude(self, handle: ServerGoalHandle, conclude: Callable[[Any], Any]) -> None:
+        """Runs what sets the goal's last state and returns its result."""
+        super().notify_execute(handle, conclude)
+
+    def _send_result_response(self, request_header: Any, future: Any) -> None:
+        with suppress(InvalidHandle):  # closed before it was sent
+            super()._send_result_response(request_header, future)
+
+
+def find_action() -> Any:
+    """Returns the type of the action; None = control_msgs is not installed."""
+    try:
+        return importlib.import_module('control_msgs.action').FollowJointTrajectory
+    except ImportError:
+        return None
+
+
+#: why a plan ended that has no text of its own
+_WHY = {
+    'preempted': 'pre-empted by a newer plan',
+    'reset': 'the node was reset',
+}
+
+
+def _code(reason: Reason | None) -> str:
+    """Name of the code for a plan that was refused or failed."""
+    if reason is Reason.JOINT_NAMES:
+        return 'INVALID_JOINTS'
+    return 'OLD_HEADER_TIMESTAMP' if reason is Reason.TRAJECTORY_STALE else 'INVALID_GOAL'
+
+
+def _verdict(ended: Ended) -> str:
+    """What is known of the plan."""
+    if ended.last is None:
+        return 'nothing was imagined'
+    prediction = ended.last.prediction
+    success, reasons = prediction.success, '; '.join(prediction.success.reasons)
+    known = f'{ended.num_chunks} of {prediction.num_chunks} chunks imagined'
+    if isnan(success.probability):
+        return f'{known}; the success estimate abstains: {reasons}'
+    low, high = success.interval
+    return f'{known}; success {success.probability:.2f} ({low:.2f} to {high:.2f}): {reasons}'
+
+
+def _violation(
+    kind: str, tolerances: Any, names: tuple[str, ...], desired: FloatArray, actual: FloatArray
+) -> tuple[str, str] | None:
+    """Name of the code and text of the first tolerance on a position that is violated."""
+    for tolerance in tolerances:
+        column = names.index(tolerance.name)
+        far = float(np.abs(desired[:, column] - actual[:, column]).max())
+        if 0 < tolerance.position < far - _ROUNDING:
+            text = (
+                f"joint '{tolerance.name}' is {far:.4f} from the {kind.lower()}; "
+                f'{kind.lower()}_tolerance allows {tolerance.position:g} (rad or m)'
+            )
+            return f'{kind}_TOLERANCE_VIOLATED', text
+    return None
+
+
+def _point(positions: FloatArray, seconds: float) -> JointTrajectoryPoint:
+    sec, nanosec = divmod(max(0, round(seconds * NANO)), NANO)
+    return JointTrajectoryPoint(
+        positions=[float(x) for x in positions],
+        time_from_start=Duration(sec=sec, nanosec=nanosec),
+    )
+
+
+def _never(_: ServerGoalHandle) -> None:
+    """Goals end by `conclude`."""
+    raise AssertionError
