@@ -205,6 +205,11 @@ def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
 
 def save_rollout(path: Path, rollout: StoredRollout) -> None:
     """Writes a rollout beside its name and renames it; see `MAX_SIDE` and `MAX_FRAMES`."""
+    write_whole(path, rollout_bytes(rollout))
+
+
+def rollout_bytes(rollout: StoredRollout) -> bytes:
+    """Returns the file of a rollout that `load_rollout` reads."""
     kept = _bounded(rollout)
     shape = kept.real.shape[:4]
     held: dict[str, Any] = {
@@ -224,7 +229,7 @@ def save_rollout(path: Path, rollout: StoredRollout) -> None:
         held[name] = np.packbits(getattr(kept, name))
     archive = BytesIO()
     np.savez_compressed(archive, **held)
-    write_whole(path, archive.getvalue())
+    return archive.getvalue()
 
 
 def load_rollout(path: Path) -> StoredRollout:

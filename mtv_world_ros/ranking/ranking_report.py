@@ -16,6 +16,7 @@ from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
 from mtv_world_ros.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
+from mtv_world_ros.ranking.rollout_cards import rollout_cards
 from mtv_world_ros.ranking.rollout_jobs import THRESHOLD
 
 TITLE = 'Policy ranking'
@@ -303,11 +304,50 @@ def write_ranking(summary: Summary, out: Path) -> Path:
         for judge in JUDGES
         if any(summary.judged_rate(p, task, judge).count for p in summary.policies)
     ]
-    policies = _points(summary, next(iter(JUDGES)), None)
-    write_whole(
-        path, render('ranking.html.j2', **_content(summary), charts=charts, policies=policies)
+    page = render(
+        'ranking.html.j2',
+        **_content(summary),
+        answer=_answer(summary),
+        tiles=_tiles(summary),
+        charts=charts,
+        policies=_points(summary, next(iter(JUDGES)), None),
+        rollouts=rollout_cards(summary.results, out),
+        # the videos lie beside the page: a thousand of them would not fit into it
+        files=" 'self' file:",
     )
+    write_whole(path, page)
     return path
+
+
+def _answer(summary: Summary) -> tuple[str, bool]:
+    """Returns whether looking at the imagined pictures pays, and whether that is shown."""
+    found = summary.gain_over_rule
+    shares = (
+        f'imagination is right in {found.imagined:.2f} of {len(summary.results)} rollouts, a rule '
+        f'that sees the commands and the first frame alone in {found.rule:.2f}: '
+        f'{found.difference:+.2f} {_interval(found.interval)}'
+    )
+    if found.interval[0] > 0:
+        return f'Yes: {shares}.', True
+    if found.interval[1] < 0:
+        return f'No, they mislead: {shares}.', False
+    return f'Not shown: {shares}.', False
+
+
+def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
+    """Name, number and what is below it."""
+    tiles = []
+    for name, label in (('pearson', "Pearson's r"), ('mmrv', 'MMRV, 0 is perfect')):
+        judges = {
+            'imagined': summary.agreement('imagined', None)[name],
+            'no-picture rule': summary.rule_agreement[name],
+            "simulator's frames": summary.agreement('seen', None)[name],
+        }
+        for who, found in judges.items():
+            value = f'{found.value:.2f}' if isfinite(found.value) else DASH
+            below = _interval(found.interval) if isfinite(found.value) else 'not defined'
+            tiles.append((f'{label}, {who}', value, below))
+    return tiles
 
 
 def _content(summary: Summary) -> dict[str, Any]:

@@ -19,9 +19,14 @@ from mtv_world_ros.evaluation.metrics.policy_agreement import (
     PoweredMean,
     rates,
 )
-from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson, Interval, wilson
-from mtv_world_ros.ranking.optimism import Optimism
-from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
+from mtv_world_ros.evaluation.metrics.statistics import (
+    clustered_wilson,
+    Interval,
+    mean_interval,
+    wilson,
+)
+from mtv_world_ros.ranking.optimism import judged_by, Optimism
+from mtv_world_ros.ranking.rollout_jobs import Job, Result
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'
@@ -34,6 +39,8 @@ JUDGES = {
     'imagined': 'imagined episodes',
     'seen': "the same estimator on the simulator's frames",
 }
+#: the judge that sees the commands and the first frame alone
+RULE = 'no_picture'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +103,23 @@ class Agreement:
         }
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gain:
+    """How often imagination and the no-picture rule are right; an abstention is half right.
+
+    Attributes:
+        imagined: share of the rollouts.
+        rule: share of the same rollouts.
+        difference: of the two.
+        interval: 95 % t interval of the difference over scenes; NaN where these are too few.
+    """
+
+    imagined: float
+    rule: float
+    difference: float
+    interval: Interval
+
+
 @dataclass(frozen=True)
 class Summary:
     """A ranking's results as numbers.
@@ -143,6 +167,29 @@ class Summary:
     def agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
         """Returns r and MMRV of a judge's rates with the simulator's, over the policies."""
         return self._agreements[judge, task]
+
+    @cached_property
+    def rule_agreement(self) -> dict[str, Agreement]:
+        """Agreement of the no-picture rule's rates, all tasks."""
+        return self._agreement(RULE, None)
+
+    @cached_property
+    def gain_over_rule(self) -> Gain:
+        """How much more often imagination is right than the no-picture rule, by scene."""
+        scenes: dict[tuple[str, int], list[tuple[float, float]]] = {}
+        for result in self.results:
+            pair = _rightness(result, 'imagined'), _rightness(result, RULE)
+            scenes.setdefault((result.task, result.index), []).append(pair)
+        sums = np.array([np.sum(np.subtract.reduce(np.array(s), axis=1)) for s in scenes.values()])
+        counts = np.array([float(len(pairs)) for pairs in scenes.values()])
+        mean, ends = mean_interval(sums[:, None], counts[:, None], low=-1.0, high=1.0)
+        shares = np.mean([pair for pairs in scenes.values() for pair in pairs], axis=0)
+        return Gain(
+            imagined=float(shares[0]),
+            rule=float(shares[1]),
+            difference=float(mean[0]),
+            interval=(float(ends[0, 0]), float(ends[1, 0])),
+        )
 
     @cached_property
     def _agreements(self) -> dict[tuple[str, str | None], dict[str, Agreement]]:
@@ -275,9 +322,9 @@ class Summary:
         return table
 
 
-def judged_by(result: Result, judge: str) -> Judged:
-    """Returns one of a result's estimates; judges are the keys of `JUDGES`."""
-    return result.imagined if judge == 'imagined' else result.seen
+def _rightness(result: Result, judge: str) -> float:
+    said = judged_by(result, judge).success
+    return float(said == result.final) if isfinite(said) else 0.5
 
 
 def _expected(results: Sequence[Result]) -> list[float]:

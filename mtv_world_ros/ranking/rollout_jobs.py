@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import isfinite, nan
 from typing import Any
 
@@ -33,6 +33,10 @@ DEFAULT_TASKS = ('place_block_a2b_left', 'place_bread_plate', 'stack_blocks_two'
 _MAX_ATTEMPTS = 25
 #: probability from which an estimate counts as a success
 THRESHOLD = 0.5
+#: commands that differ by more have parted [rad or m]
+COMMANDS_PART = 0.02
+#: an object has parted where its masks in the two worlds overlap by less in every view, J
+OBJECTS_PART = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,6 +120,51 @@ def _number(value: float | None) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """How a rollout went in both worlds, by frame of the model.
+
+    Attributes:
+        times: (T,) since the first observation [s].
+        command_gaps: (T,) largest difference between the commands of a joint in the two worlds
+            [rad or m]; NaN = one world has ended.
+        overlaps: (T,) least J of an object's masks in the two worlds, in the view in which it is
+            largest; NaN = one world has ended, or no object is seen.
+        ends: times at which an estimate was made [s].
+        seen: estimates on the simulator's frames at these times; NaN = it abstains or has ended.
+        imagined: estimates on the imagined frames.
+        commands_part_s: when commands first differ by more than `COMMANDS_PART`; NaN = never.
+        objects_part_s: when an object's overlap falls below `OBJECTS_PART`; NaN = never.
+        parted_object: name of that object.
+        verdicts_part_s: when one estimate first calls a success what the other calls a failure;
+            NaN = never.
+    """
+
+    times: tuple[float, ...]
+    command_gaps: tuple[float, ...]
+    overlaps: tuple[float, ...]
+    ends: tuple[float, ...]
+    seen: tuple[float, ...]
+    imagined: tuple[float, ...]
+    commands_part_s: float = nan
+    objects_part_s: float = nan
+    parted_object: str = ''
+    verdicts_part_s: float = nan
+
+    @property
+    def part_s(self) -> float:
+        """When commands or objects first part [s]; NaN = never."""
+        known = [t for t in (self.commands_part_s, self.objects_part_s) if isfinite(t)]
+        return min(known, default=nan)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Course:
+        """Reads plain values, NaN as None."""
+        many = ('times', 'command_gaps', 'overlaps', 'ends', 'seen', 'imagined')
+        read = {key: nan if value is None else value for key, value in values.items()}
+        return cls(**{**read, **{key: tuple(map(_number, values[key])) for key in many}})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
     """One policy on one episode.
 
@@ -136,8 +185,8 @@ class Result:
         seconds: time by stage [s].
         end: why the simulated episode ended; empty = not known.
         imagined_end: why the imagined one ended.
-        last_frames: PNG of the last real and imagined frames in base64, where it is not yet
-            written to its file.
+        course: how it went in both worlds; None = not known.
+        files: pictures of it in base64 by suffix, where they are not yet written beside it.
     """
 
     policy: str
@@ -155,7 +204,8 @@ class Result:
     seconds: Mapping[str, float]
     end: str = ''
     imagined_end: str = ''
-    last_frames: str = ''
+    course: Course | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""
@@ -165,7 +215,9 @@ class Result:
     def from_json(cls, values: Mapping[str, Any]) -> Result:
         """Reads what `as_json` returned, NaN as null."""
         judged = {key: Judged.from_json(values[key]) for key in ('imagined', 'seen', 'no_picture')}
-        return cls(**{**values, **judged})
+        course = values.get('course')
+        told = {'course': None if course is None else Course.from_json(course)}
+        return cls(**{**values, **judged, **told})
 
 
 def policies_named(text: str) -> tuple[str, ...]:

@@ -14,12 +14,12 @@ import numpy as np
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.ranking.both_worlds import BothWorlds
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.ranking.optimism import last_frames_png
 from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
 from mtv_world_ros.ranking.worlds import (
     ImaginedWorld,
-    judge,
     PolicyRun,
     run_policy,
     SimulatedWorld,
@@ -103,13 +103,20 @@ class RolloutRunner:
         world = real.world
         begun = time.perf_counter()
         observed = self._begin(real, job)
-        seen = judge(observed, world.chunks)
+        found = [observed.observe(chunk.frames, chunk.positions) for chunk in world.chunks]
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
         episode = self._begin(real, job)
         imagined = ImaginedWorld(episode, world.start)
         run = self._run(real.policy, imagined, real.instruction, job)
         imagining_s = time.perf_counter() - begun
+        both = BothWorlds(
+            fps=self.pipeline.spec.fps,
+            real=world.chunks,
+            observed=found,
+            imagined=imagined.chunks,
+        )
+        last = last_frames_png(observed.observation.frames, episode.observation.frames)
         return Result(
             policy=job.policy,
             task=job.task,
@@ -118,7 +125,7 @@ class RolloutRunner:
             ever=real.ever,
             final=real.final,
             imagined=Judged.of(imagined.success),
-            seen=Judged.of(seen),
+            seen=Judged.of(found[-1].success if found else None),
             no_picture=_judge_without_pictures(self._begin(real, job), world),
             num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
@@ -132,9 +139,8 @@ class RolloutRunner:
                 'judging the simulated frames': judging_s,
                 'imagining': imagining_s,
             },
-            last_frames=base64.b64encode(
-                last_frames_png(observed.observation.frames, episode.observation.frames)
-            ).decode(),
+            course=both.course(),
+            files={'.png': base64.b64encode(last).decode(), **both.files()},
         )
 
     def _begin(self, real: SimulatedRollout, job: Job) -> ImaginedEpisode:

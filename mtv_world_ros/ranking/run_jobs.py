@@ -50,8 +50,9 @@ def run_jobs(
 ) -> tuple[list[list[Result]], dict[Job, str]]:
     """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
 
-    Each result is written beside its name and renamed, and its last frames as a PNG, real ones
-    over imagined ones; jobs that are there already with the same settings are not run again.
+    Each result is written beside its name and renamed, and so are its last frames as a PNG, real
+    ones over imagined ones, a video, a contact sheet and the frames of both worlds; jobs that are
+    there already with the same settings are not run again.
 
     Args:
         jobs: what to run; each is simulated once for all checkpoints.
@@ -112,9 +113,9 @@ class _Store:
 
     def add(self, job: Job, values: dict[str, Any]) -> None:
         """Writes a result."""
-        path, picture = _path(self._out, job), base64.b64decode(values.pop('last_frames', ''))
-        if picture:
-            write_whole(path.with_suffix('.png'), picture)
+        path = _path(self._out, job)
+        for suffix, data in values.pop('files', {}).items():
+            write_whole(path.with_name(f'{job.name}{suffix}'), base64.b64decode(data))
         stored = {'settings': self._settings, 'definition': job.definition, 'result': values}
         write_json(path, stored)
         self.found[job] = Result.from_json(values)

@@ -22,6 +22,7 @@ from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
+from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ranking.rollout_jobs import Judged
 from mtv_world_ros.rendering.resize import resize_frames
 from mtv_world_ros.sim.collect.record import START_NS
@@ -129,7 +130,7 @@ class ImaginedWorld:
 
     Attributes:
         observation: what is seen now: the real one, then the last predicted frame.
-        success: the estimate at the end; None before the first answer.
+        chunks: that were imagined.
 
     Args:
         episode: that answers are imagined in.
@@ -139,12 +140,16 @@ class ImaginedWorld:
     def __init__(self, episode: ImaginedEpisode, start: Observation) -> None:
         self._episode, self._start = episode, start
         self.observation = start
-        self.success: SuccessEstimate | None = None
+        self.chunks: list[Prediction] = []
+
+    @property
+    def success(self) -> SuccessEstimate | None:
+        """The estimate at the end; None before the first answer."""
+        return self.chunks[-1].success if self.chunks else None
 
     def execute(self, answer: JointTrajectory) -> None:
         """Imagines an answer."""
-        for prediction in self._episode.extend(answer):
-            self.success = prediction.success
+        self.chunks += self._episode.extend(answer)
         height, width = self._start.frames.shape[1:3]
         seen = self._episode.observation
         # a policy meets one size of images, whoever shows them
@@ -156,14 +161,6 @@ class ImaginedWorld:
         """Tells what the estimate says at the end of the last answer; None = it abstains."""
         success = Judged.of(self.success).success
         return bool(success) if isfinite(success) else None
-
-
-def judge(episode: ImaginedEpisode, chunks: Sequence[SeenChunk]) -> SuccessEstimate | None:
-    """Returns the estimate of an episode that is seen, not imagined; None without a chunk."""
-    success = None
-    for chunk in chunks:
-        success = episode.observe(chunk.frames, chunk.positions).success
-    return success
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

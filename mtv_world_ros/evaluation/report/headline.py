@@ -7,12 +7,13 @@ from math import nan
 from typing import Any, NamedTuple
 
 from markupsafe import Markup
+import numpy as np
 
 from mtv_world_ros.documents import DASH, number, Table, with_interval
 from mtv_world_ros.evaluation.metrics.horizon import curve
-from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES
+from mtv_world_ros.evaluation.metrics.statistics import mean_interval, MIN_EPISODES
 from mtv_world_ros.evaluation.report.charts import Dot, dot_chart, Line, line_chart
-from mtv_world_ros.evaluation.report.read_back import Evaluated
+from mtv_world_ros.evaluation.report.read_back import Evaluated, ranked_by, scores
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
 _KEYS = (
@@ -100,6 +101,35 @@ def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
         ],
         'panels': [(v, _dots(evaluations, v, keys)) for v in all_views(evaluations)],
     }
+
+
+def compared(evaluations: Sequence[Evaluated]) -> list[tuple[Mark | None, str, bool]]:
+    """Returns how each further evaluation does against the first on the episodes of both.
+
+    Mark, sentence, and whether the interval of the difference leaves out 0. Differences are
+    paired within the episodes.
+    """
+    _, key, _ = ranked_by(evaluations)
+    words = 'J of ' + _keys(evaluations)[1]
+    first, *others = (scores(found, key) for found in evaluations)
+    sentences = []
+    for index, other in enumerate(others, start=1):
+        names = sorted(set(first) & set(other))
+        gained = np.array([[other[name] - first[name]] for name in names]).reshape(-1, 1)
+        mean, ends = mean_interval(gained, np.ones_like(gained), low=-1, high=1)
+        low, high = float(ends[0, 0]), float(ends[1, 0])
+        text = (
+            f'{letter(index)} - {letter(0)}, {words}: {with_interval(mean[0], (low, high))} over '
+            f'{len(names)} episodes of both; '
+        )
+        verdict = 'better' if low > 0 else 'worse' if high < 0 else ''
+        text += (
+            f'{letter(index)} is {verdict}.'
+            if verdict
+            else 'these episodes do not tell them apart.'
+        )
+        sentences.append((mark(index, evaluations), text, bool(verdict)))
+    return sentences
 
 
 def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:

@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.documents import DASH, number, render
-from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.metrics.statistics import METHOD
 from mtv_world_ros.evaluation.report import details
-from mtv_world_ros.evaluation.report.headline import cell, headline, horizon, mark
-from mtv_world_ros.evaluation.report.read_back import Evaluated, Pick, picks, read_evaluations
-from mtv_world_ros.evaluation.report.rollout_clips import Clip, make_clip
+from mtv_world_ros.evaluation.report.episode_cards import episode_cards
+from mtv_world_ros.evaluation.report.headline import cell, compared, headline, horizon, mark
+from mtv_world_ros.evaluation.report.read_back import Evaluated, read_evaluations
 from mtv_world_ros.files import write_whole
-
-#: of all embedded videos [bytes]; base64 adds a third
-VIDEO_BUDGET = 6_000_000
 
 
 def write_report(folders: Sequence[Path], path: Path) -> Path:
@@ -50,7 +47,8 @@ def page(evaluations: Sequence[Evaluated]) -> str:
         header=[{'mark': letter, **_header(found)} for letter, found in marked],
         headline=headline(evaluations),
         horizon=horizon(evaluations),
-        videos=_videos(evaluations),
+        compared=compared(evaluations),
+        cards=episode_cards(evaluations),
         paper=details.paper_tables(evaluations),
         tasks=details.task_tables(evaluations),
         success=details.success(evaluations),
@@ -87,37 +85,3 @@ def _tiles(found: Evaluated) -> list[tuple[str, str, str]]:
         seconds = number(metrics.get('seconds_per_chunk'), 2)
         tiles.append(('real-time factor', number(factor, 1), f'{seconds} s a chunk'))
     return tiles
-
-
-def _videos(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
-    words, chosen = picks(evaluations)
-    budget = VIDEO_BUDGET // max(len(chosen) * len(evaluations), 1)
-    return {'words': words, 'picks': [_picked(pick, evaluations, budget) for pick in chosen]}
-
-
-def _picked(pick: Pick, evaluations: Sequence[Evaluated], budget: int) -> dict[str, Any]:
-    result = next(f.results[pick.episode] for f in evaluations if pick.episode in f.results)
-    about = [part for part in (result.task, f'recorded outcome: {result.outcome}') if part]
-    return {
-        'episode': pick.episode,
-        'heading': f'{pick.title}: {pick.episode} (J {pick.score:.3f})',
-        'about': ' · '.join(about),
-        'clips': [
-            (mark(index, evaluations), found.name if len(evaluations) > 1 else '', *clip)
-            for index, found in enumerate(evaluations)
-            if (clip := _clip(pick.episode, found, budget)) is not None
-        ],
-    }
-
-
-def _clip(episode: str, found: Evaluated, budget: int) -> tuple[Clip | None, str] | None:
-    """An episode's video, or why there is none; None = the evaluation has no such episode."""
-    if episode not in found.results:
-        return None
-    try:
-        rollout = found.rollout(episode)
-    except EpisodeError as error:
-        return None, str(error)
-    if rollout is None:
-        return None, ' its frames were not kept'
-    return make_clip(rollout, max_bytes=budget), ''

@@ -132,25 +132,33 @@ def scores(evaluated: Evaluated, key: str) -> dict[str, float]:
     return {name: value for name, value in means.items() if np.isfinite(value)}
 
 
-def picks(evaluations: Sequence[Evaluated]) -> tuple[str, list[Pick]]:
-    """Returns what episodes are ranked by, and the best, the median and the worst one.
+def ranked_by(evaluations: Sequence[Evaluated]) -> tuple[str, str, dict[str, float]]:
+    """Returns what episodes are ranked by: words, the number's name, its mean by episode.
 
-    Ranked by J of the objects that move, where any episode has it, else by J of all objects;
-    by the mean over the evaluations that scored the episode.
+    J of the objects that move, where any episode has it, else J of all objects; the mean over the
+    evaluations that scored the episode.
     """
-    words, found = 'the objects that move', [scores(item, 'j_moving') for item in evaluations]
+    words, key = 'the objects that move', 'j_moving'
+    found = [scores(item, key) for item in evaluations]
     if not any(found):
-        words, found = 'all objects', [scores(item, 'j_object_mean') for item in evaluations]
+        words, key = 'all objects', 'j_object_mean'
+        found = [scores(item, key) for item in evaluations]
     names = sorted({name for part in found for name in part})
     means = {
         name: float(mean_of_known(np.array([part.get(name, np.nan) for part in found])))
         for name in names
     }
-    ranked = sorted(names, key=lambda name: (-means[name], name))
+    return words, key, means
+
+
+def picks(evaluations: Sequence[Evaluated]) -> list[Pick]:
+    """Returns the best, the median and the worst episode; see `ranked_by`."""
+    means = ranked_by(evaluations)[2]
+    ranked = sorted(means, key=lambda name: (-means[name], name))
     chosen = {0: 'Best', len(ranked) // 2: 'Median', len(ranked) - 1: 'Worst'}
     if len(ranked) < 3:
         chosen = ({}, {0: 'The only one'}, {0: 'Best', 1: 'Worst'})[len(ranked)]
-    return words, [
+    return [
         Pick(title=title, episode=ranked[place], score=means[ranked[place]])
         for place, title in chosen.items()
     ]

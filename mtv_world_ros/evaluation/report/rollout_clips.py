@@ -38,7 +38,7 @@ class Clip:
         num_frames: of the video.
         width: of the video [px].
         height: of the video [px].
-        sheet: WebP; some of the same frames.
+        sheet: WebP; some of the same frames; empty = not wanted.
         outlines: (object, RGB) pairs.
     """
 
@@ -50,34 +50,47 @@ class Clip:
     outlines: tuple[tuple[str, tuple[int, int, int]], ...]
 
 
-def make_clip(rollout: StoredRollout, *, max_bytes: int) -> Clip:
+def make_clip(
+    rollout: StoredRollout,
+    *,
+    max_bytes: int,
+    tile_width: int = _VIDEO_TILE,
+    with_sheet: bool = True,
+) -> Clip:
     """Returns a rollout's video and contact sheet.
 
     Args:
         rollout: what to show.
         max_bytes: the video's quality is lowered until it takes no more, down to a limit.
+        tile_width: width up to which small frames are enlarged in the video [px].
+        with_sheet: also make the contact sheet.
     """
-    shown = outlined(rollout, _VIDEO_TILE)
+    shown = outlined(rollout, tile_width)
     frames = side_by_side(shown, tile_width=shown.real.shape[3])
     video = b''
     for crf in _CRFS:
         video = encode_video(frames, rollout.fps, crf=crf)
         if len(video) <= max_bytes:
             break
-    small = outlined(rollout, _SHEET_TILE)
-    sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE)
-    done, data = cv2.imencode('.webp', sheet[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])
-    assert done
     return Clip(
         video=video,
         num_frames=len(frames),
         width=frames.shape[2],
         height=frames.shape[1],
-        sheet=data.tobytes(),
+        sheet=_sheet(rollout) if with_sheet else b'',
         outlines=tuple(
             (name, OUTLINES[index % len(OUTLINES)]) for index, name in enumerate(rollout.objects)
         ),
     )
+
+
+def _sheet(rollout: StoredRollout) -> bytes:
+    """Some frames as a WebP."""
+    small = outlined(rollout, _SHEET_TILE)
+    sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE)
+    done, data = cv2.imencode('.webp', sheet[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])
+    assert done
+    return data.tobytes()
 
 
 def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
