@@ -70,7 +70,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.viewing.sheets import write_pictures
 
-    pictures = write_pictures([arguments.episode, out], out)
+    pictures = write_pictures([out], out)
     print(summary)
     print(f'written: {" ".join(map(str, pictures))}')
     return 0

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_overwrite
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
-    from mtv_world_ros.evaluation.results import StoredRollout
+    from mtv_world_ros.viewing.scored_rollout import ScoredRollout
     from mtv_world_ros.viewing.streams import Streams
 
 _DESCRIPTION = """\
 Shows real, drawn and imagined frames of every view on one timeline, masks outlined, joints, the
 success estimate and its reasons. PATH is an episode, predictions, an imagined episode, the folder
-of mtv-world demo, or an evaluation (its episodes are tabs); bags of the same time that are given
-together are shown together, e.g. an episode and its predictions. Needs the extra `view`.
+of mtv-world demo, an evaluation (its episodes are tabs) or a ranking (its worst rollouts are
+tabs); bags of the same time that are given together are shown together, e.g. an episode and its
+predictions. --live shows what the cameras and the node publish now. Needs the extra `view`.
 """
 
 
@@ -26,10 +27,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'view',
-        help='show episodes, predictions and evaluations in the Rerun viewer',
+        help='show episodes, predictions, evaluations, rankings or a running node in Rerun',
         description=_DESCRIPTION,
     )
-    parser.add_argument('paths', type=Path, nargs='+', metavar='PATH')
+    parser.add_argument('paths', type=Path, nargs='*', metavar='PATH')
+    parser.add_argument(
+        '--live', action='store_true', help='show topics beside a running node, until Ctrl-C'
+    )
     parser.add_argument(
         '--port', type=int, default=9090, help='of the viewer for browsers on this machine'
     )
@@ -38,52 +42,68 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--native', action='store_true', help='open a window, not a browser page')
     parser.add_argument(
-        '--episodes', type=int, default=8, metavar='N', help='of an evaluation, the first N'
+        '--episodes',
+        type=int,
+        default=8,
+        metavar='N',
+        help='of an evaluation the first N, of a ranking the worst N',
     )
     add_overwrite(parser)
     parser.set_defaults(handler=_view)
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    if bool(arguments.paths) == arguments.live:
+        raise ConfigError('give one PATH or more to show, or --live for what is published now')
     for path in arguments.paths:
         if not path.exists():
             raise EpisodeError(f"there is no '{path}'")
     if arguments.save is not None:
         check_free(arguments.save, arguments.overwrite, '--save FILE')
+    return _view_live(arguments) if arguments.live else _view_paths(arguments)
+
+
+def _view_paths(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.viewing import rerun_log
 
     stream = rerun_log.recording('_'.join(path.name for path in arguments.paths))
     shown = _shown(arguments)
-    blueprint = rerun_log.layout(shown)
-    if arguments.save is not None:
-        rerun_log.save(stream, blueprint, arguments.save)
-    elif arguments.native:
-        stream.spawn(default_blueprint=blueprint)
-    else:
-        print(f'open {rerun_log.serve(stream, blueprint, arguments.port)}', flush=True)
-    _log(stream, shown)
+    told = rerun_log.open_viewer(
+        stream, rerun_log.layout(shown), arguments.port, arguments.save, arguments.native
+    )
+    if arguments.save is None:
+        print(told, flush=True)
+    for root, one in shown.items():
+        rerun_log.log_any(stream, one, root)
     stream.flush()
     if arguments.save is not None:
-        print(f'written: {arguments.save}')
+        print(told)
     elif not arguments.native:
         _wait()
     return 0
 
 
-def _shown(arguments: argparse.Namespace) -> dict[str, Streams | StoredRollout]:
+def _view_live(arguments: argparse.Namespace) -> int:
+    import runpy
+    import sys
+
+    sys.argv = ['mtv-world view', '--port', str(arguments.port)]
+    sys.argv += ['--native'] if arguments.native else []
+    sys.argv += ['--save', str(arguments.save)] if arguments.save is not None else []
+    runpy.run_module('mtv_world_ros.ros.live_viewer', run_name='__main__')
+    return 0
+
+
+def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
     """What the paths hold, by path of its entities."""
-    from mtv_world_ros.evaluation.report.read_back import read_evaluations
+    from mtv_world_ros.viewing.scored_rollout import is_scored, scored_rollouts
     from mtv_world_ros.viewing.streams import read_streams
 
-    found: dict[str, Any] = {}
+    found: dict[str, Streams | ScoredRollout] = {}
     bags = []
     for path in arguments.paths:
-        if (path / 'metrics.json').is_file():
-            for evaluated in read_evaluations(path):
-                names = sorted(evaluated.results)[: arguments.episodes]
-                rollouts = {name: evaluated.rollout(name) for name in names}
-                label = evaluated.metrics.get('label') or path.name
-                found |= {f'/{label}/{n}': r for n, r in rollouts.items() if r is not None}
+        if is_scored(path):
+            found |= {f'/{one.name}': one for one in scored_rollouts(path, arguments.episodes)}
         else:
             bags.append(path / 'predictions' if (path / 'predictions').is_dir() else path)
     if bags:
@@ -91,17 +111,6 @@ def _shown(arguments: argparse.Namespace) -> dict[str, Streams | StoredRollout]:
     if not found:
         raise EpisodeError(f'no frames were kept in {", ".join(map(str, arguments.paths))}')
     return found
-
-
-def _log(stream: Any, shown: dict[str, Streams | StoredRollout]) -> None:
-    from mtv_world_ros.viewing import rerun_log
-    from mtv_world_ros.viewing.streams import Streams
-
-    for root, one in shown.items():
-        if isinstance(one, Streams):
-            rerun_log.log_streams(stream, one, root)
-        else:
-            rerun_log.log_rollout(stream, one, root)
 
 
 def _wait() -> None:

@@ -41,7 +41,8 @@ def record_through_node(
 ) -> None:
     """Plays an episode into a node and records what it publishes in `out/predictions`.
 
-    The episode's clock is the ROS clock, so predictions carry the times they are about. After
+    The cameras' images lie beside them. The episode's clock is the ROS clock, so predictions
+    carry the times they are about. After
     each trajectory the player waits until the node has answered it (a slow machine loses
     nothing). Logs of the processes go to `out/logs`.
 
@@ -58,8 +59,10 @@ def record_through_node(
         recorded += [f'{NODE}/{topic}' for topic in TOPICS]
         command = module_command('bags.recorder', str(out / 'predictions'), *recorded)
         command += ['--overwrite', '--stamp', 'header', '--wait-timeout', str(_NODE_START_S)]
+        cameras = [f'/{view}/image_raw/compressed' for view in views]
+        command += ['--if-published', *cameras]
         recorder = start_process('recorder', command, logs, environment)
-        wanted = [f'/{view}/image_raw/compressed' for view in views] + ['/joint_trajectory']
+        wanted = [*cameras, '/joint_trajectory']
         command = module_command(
             'bags.player', str(episode), '--clock', '--lock-step', '--wait-for', *wanted, *recorded
         )

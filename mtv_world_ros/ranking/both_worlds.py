@@ -50,7 +50,7 @@ class BothWorlds:
         """Returns how the rollout went."""
         commands = [chunk.positions[1:] for chunk in self.real]
         gaps = command_gaps(commands, [chunk.positions for chunk in self.imagined])
-        overlaps = np.full((0, len(gaps)))
+        overlaps = np.full((0, len(gaps)), nan)
         names: tuple[str, ...] = ()
         if self.observed and self.imagined:
             overlaps = object_overlaps(_masks(self.observed), _masks(self.imagined))

@@ -24,10 +24,7 @@ _WIDTH, _HEIGHT = 320, 64
 
 
 def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
-    """Returns the filters and the cards of all rollouts, the worst first.
-
-    The worst are those whose imagined estimate is farthest from what really happened; of equal
-    ones, those whose worlds part first.
+    """Returns the filters and the cards of all rollouts; see `worst_first`.
 
     Args:
         results: of a ranking.
@@ -36,31 +33,34 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
     policy = Filter(key='policy', label='policy', options=_options(r.policy for r in results))
     task = Filter(key='task', label='task', options=_options(r.task for r in results))
     outcome = Filter(key='outcome', label='in the simulator', options=('success', 'failure'))
-    verdict = Filter(key='verdict', label='imagined verdict', options=_VERDICTS)
+    verdicts = Filter(key='verdict', label='imagined verdict', options=_VERDICTS)
     parts = Filter(key='parts', label='what parts first', options=_PARTS)
     cards = []
-    for result in sorted(results, key=_rank):
+    for result in worst_first(results):
         classes = [
             policy.classes(result.policy),
             task.classes(result.task),
             outcome.classes(_word(result.final)),
-            verdict.classes(_verdict(result)),
+            verdicts.classes(verdict(result)),
             parts.classes(_first_to_part(result.course)),
         ]
         cards.append(
             {
                 'title': f'{result.policy} · {result.task} {result.index}',
                 'verdict': f'{_word(result.final)} in the simulator; imagined '
-                f'{_told(result.imagined)}: {_verdict(result)}',
-                'parts': _parts(result.course),
+                f'{told(result.imagined)}: {verdict(result)}',
+                'parts': [
+                    f'{what} at {time:.1f} s'
+                    for time, what in (when_they_part(result.course) if result.course else ())
+                ],
                 'judged': [
-                    ('imagined', _told(result.imagined), '; '.join(result.imagined.reasons)),
+                    ('imagined', told(result.imagined), '; '.join(result.imagined.reasons)),
                     (
                         "on the simulator's frames",
-                        _told(result.seen),
+                        told(result.seen),
                         '; '.join(result.seen.reasons),
                     ),
-                    ('no-picture rule', _told(result.no_picture), ''),
+                    ('no-picture rule', told(result.no_picture), ''),
                 ],
                 'ends': [
                     f'{where}: {end}'
@@ -71,12 +71,20 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
                     if end
                 ],
                 'curves': curves(result.course) if result.course else '',
-                'video': _file(out, result, VIDEO),
-                'sheet': _file(out, result, SHEET),
+                'video': _address(out, result, VIDEO),
+                'sheet': _address(out, result, SHEET),
                 'classes': ' '.join(found for found in classes if found),
             }
         )
-    return {'cards': cards, 'filters': filters(policy, task, outcome, verdict, parts)}
+    return {'cards': cards, 'filters': filters(policy, task, outcome, verdicts, parts)}
+
+
+def worst_first(results: Sequence[Result]) -> list[Result]:
+    """Returns the rollouts, those first whose imagined estimate is farthest from what happened.
+
+    Of equal ones, those whose worlds part first.
+    """
+    return sorted(results, key=_rank)
 
 
 def _options(values: Iterable[str]) -> tuple[str, ...]:
@@ -94,14 +102,16 @@ def _word(final: bool) -> str:
     return 'success' if final else 'failure'
 
 
-def _verdict(result: Result) -> str:
+def verdict(result: Result) -> str:
+    """Returns what the imagined verdict is: right, a false success or failure, or none."""
     said = result.imagined.success
     if not isfinite(said):
         return 'abstains'
     return 'right' if said == result.final else f'false {_word(bool(said))}'
 
 
-def _told(judged: Judged) -> str:
+def told(judged: Judged) -> str:
+    """Returns an estimate in words."""
     return number(judged.probability, 2) if isfinite(judged.probability) else 'abstains'
 
 
@@ -114,23 +124,25 @@ def _first_to_part(course: Course | None) -> str:
     return 'commands' if course.commands_part_s == course.part_s else 'objects'
 
 
-def _parts(course: Course | None) -> list[str]:
-    """When what parts, in words."""
-    if course is None:
-        return []
+def when_they_part(course: Course) -> list[tuple[float, str]]:
+    """Returns when [s] what parts in the two worlds, the first one first."""
     whats = {
         'commands': course.commands_part_s,
         f'objects ({course.parted_object})': course.objects_part_s,
         'estimates': course.verdicts_part_s,
     }
-    found = sorted((time, what) for what, time in whats.items() if isfinite(time))
-    return [f'{what} at {time:.1f} s' for time, what in found]
+    return sorted((time, what) for what, time in whats.items() if isfinite(time))
 
 
-def _file(out: Path, result: Result, suffix: str) -> str:
+def rollout_file(out: Path, result: Result, suffix: str) -> Path:
+    """Returns where a file of a rollout lies in a ranking's folder."""
+    return out / FOLDER / f'{name_of(result)}{suffix}'
+
+
+def _address(out: Path, result: Result, suffix: str) -> str:
     """Address of a rollout's file from the page; empty = there is none."""
-    name = f'{name_of(result)}{suffix}'
-    return f'{FOLDER}/{quote(name)}' if (out / FOLDER / name).is_file() else ''
+    path = rollout_file(out, result, suffix)
+    return f'{FOLDER}/{quote(path.name)}' if path.is_file() else ''
 
 
 def curves(course: Course) -> Markup:

@@ -147,6 +147,24 @@ def _stored(out: Path, job: Job, settings: Mapping[str, Any]) -> Result | None:
     return result if same and values.get('definition', '') == job.definition else None
 
 
+def read_results(out: Path) -> list[Result]:
+    """Reads the results of a ranking's folder, whatever their settings.
+
+    Raises:
+        ConfigError: one is of another version.
+    """
+    found = []
+    for path in sorted((out / FOLDER).glob('*.json')):
+        try:
+            found.append(Result.from_json(json.loads(path.read_text(encoding='utf-8'))['result']))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"'{path}' cannot be read ({type(error).__name__}: {error}); run `mtv-world rank` "
+                'again: it goes on where it stopped'
+            ) from error
+    return found
+
+
 def _check_same_policy(path: Path, job: Job) -> None:
     """Refuses a result of another policy that had this name."""
     try:

@@ -100,7 +100,8 @@ def replay_offline(
     The estimates remember the episode's recorded frames since its first trajectory, as the node's
     do in mode observe.
 
-    Frames that the next trajectory supersedes are left out. What is wrong with one trajectory
+    The predictions hold the recorded images of the same times too. Frames that the next
+    trajectory supersedes are left out. What is wrong with one trajectory
     rejects that one alone, with its reason in the summary and in `/world_model/report`.
 
     Args:
@@ -150,6 +151,7 @@ def replay_offline(
                 summary.rejected.append((stamp, str(error)))
                 writer.write_report(stamp, ERROR, f'rejected: {error}', {})
             bar.update()
+        _write_observed(writer, episode, spec.fps)
         if not summary.num_chunks:
             raise EpisodeError(
                 f"'{episode_path}': none of its {len(starts)} trajectories can be imagined; the "
@@ -180,6 +182,21 @@ def _write_rollout(
     if last is not None:
         summary.num_trajectories += 1
         summary.probabilities.append(last.success.probability)
+
+
+def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> None:
+    """What the cameras showed when frames were predicted: the nearest within half a frame."""
+    reach_ns = round(0.5e9 / fps)
+    for view, camera in episode.cameras.items():
+        known = episode.images[view].stamps_ns
+        chosen = {
+            index
+            for stamp_ns in writer.frame_stamps
+            for index in [int(np.abs(known - stamp_ns).argmin())]
+            if abs(int(known[index]) - stamp_ns) <= reach_ns
+        }
+        for index in sorted(chosen):
+            writer.write_observed(camera, int(known[index]), episode.images[view].frames[index])
 
 
 def _chunk_values(chunk: Prediction) -> dict[str, object]:

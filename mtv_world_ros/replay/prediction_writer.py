@@ -25,11 +25,16 @@ OK, ERROR = 0, 2
 class PredictionWriter(BagWriter):
     """Records chunks: images, masks, joint states, estimates; stamps are the predicted times.
 
+    Beside them what the cameras really showed then, where that is known.
+
     Args:
         path: folder to make; written beside and renamed when the block ends.
         joint_names: J names, in the robot's order.
         jpeg_quality: of the predicted images, 1 to 100.
         overwrite: replace an existing folder.
+
+    Attributes:
+        frame_stamps: of the frames that were recorded [ns].
     """
 
     def __init__(
@@ -43,6 +48,7 @@ class PredictionWriter(BagWriter):
         super().__init__(path, overwrite=overwrite)
         self._joint_names = tuple(joint_names)
         self._jpeg_quality = jpeg_quality
+        self.frame_stamps: list[int] = []
 
     def write_chunk(self, prediction: Prediction, until_ns: int | None = None) -> int:
         """Records a chunk's frames, those up to `until_ns` alone; returns how many.
@@ -56,9 +62,14 @@ class PredictionWriter(BagWriter):
         ]
         for index in kept:
             self._write_frame(prediction, index, stamps[index])
+            self.frame_stamps.append(stamps[index])
         if len(kept) == len(stamps):
             self._write_estimate(prediction, stamps[-1])
         return len(kept)
+
+    def write_observed(self, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
+        """Records what a camera really showed, (H, W, 3) uint8 RGB, under its own topic."""
+        self._write_jpeg(f'/{camera.view}', camera, stamp_ns, rgb)
 
     def write_report(
         self, stamp_ns: int, level: int, text: str, values: Mapping[str, Any]

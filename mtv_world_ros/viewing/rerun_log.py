@@ -11,6 +11,7 @@ import numpy as np
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.results import StoredRollout
+from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 from mtv_world_ros.viewing.streams import KINDS, Streams
 
 APPLICATION = 'mtv_world'
@@ -34,17 +35,27 @@ def recording(name: str) -> Any:
     return rerun.RecordingStream(APPLICATION, recording_id=name)
 
 
-def log_streams(stream: Any, streams: Streams, root: str = '') -> None:
-    """Logs everything that a bag shows, on a timeline in seconds from its first frame.
+def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
+    """Logs a bag or a scored rollout."""
+    if isinstance(shown, Streams):
+        log_streams(stream, shown, root)
+    else:
+        log_rollout(stream, shown, root)
+
+
+def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = None) -> None:
+    """Logs everything that a bag or topics show, on a timeline in seconds.
 
     Args:
         stream: of `recording`.
         streams: what is shown.
         root: path of its entities.
+        begin: stamp of second 0 [ns]; None = that of the first frame.
     """
     import rerun
 
-    begin = min(found[0][0] for found in streams.images.values())
+    if begin is None:
+        begin = min(found[0][0] for found in streams.images.values())
 
     def log(stamp_ns: int, path: str, shown: Any) -> None:
         stream.set_time(_TIMELINE, duration=(stamp_ns - begin) * 1e-9)
@@ -65,25 +76,40 @@ def log_streams(stream: Any, streams: Streams, root: str = '') -> None:
         log(stamp, 'words', rerun.TextLog(text))
 
 
-def log_rollout(stream: Any, rollout: StoredRollout, root: str) -> None:
-    """Logs a scored episode: frames of all kinds, masks outlined, J per object."""
+def log_rollout(stream: Any, scored: ScoredRollout, root: str) -> None:
+    """Logs a scored rollout: frames of all kinds, masks outlined, J per object, estimates."""
     import rerun
 
+    rollout = scored.rollout
+    for who, estimates in scored.estimates.items():
+        for time, value in estimates:
+            stream.set_time(_TIMELINE, duration=time)
+            stream.log(f'{root}/success/{who}', rerun.Scalars(value))
+    for time, text in scored.words:
+        stream.set_time(_TIMELINE, duration=time)
+        stream.log(f'{root}/words', rerun.TextLog(text))
     for index, time in enumerate(rollout.times):
         stream.set_time(_TIMELINE, duration=float(time))
         for v, view in enumerate(rollout.views):
-            shown = {'real': rollout.true_masks, 'imagined': rollout.masks}
-            for kind in KINDS:
-                frame = np.asarray(getattr(rollout, kind)[v, index])
-                stream.log(f'{root}/{view}/{kind}', rerun.Image(frame).compress(jpeg_quality=92))
-                if kind in shown:
-                    labels = np.zeros(frame.shape[:2], np.uint8)
-                    for number, mask in enumerate(shown[kind][v, :, index], start=1):
-                        labels[mask] = number
-                    stream.log(f'{root}/{view}/{kind}/outlines', _outlines(labels))
+            _log_view(stream, rollout, v, index, f'{root}/{view}')
             for o, name in enumerate(rollout.objects):
                 value = float(rollout.j[v, o, index])
                 stream.log(f'{root}/J/{view}/{name}', rerun.Scalars(value))
+
+
+def _log_view(stream: Any, rollout: StoredRollout, v: int, index: int, root: str) -> None:
+    """Frames of all kinds in a view, masks outlined."""
+    import rerun
+
+    shown = {'real': rollout.true_masks, 'imagined': rollout.masks}
+    for kind in KINDS:
+        frame = np.asarray(getattr(rollout, kind)[v, index])
+        stream.log(f'{root}/{kind}', rerun.Image(frame).compress(jpeg_quality=92))
+        if kind in shown:
+            labels = np.zeros(frame.shape[:2], np.uint8)
+            for number, mask in enumerate(shown[kind][v, :, index], start=1):
+                labels[mask] = number
+            stream.log(f'{root}/{kind}/outlines', _outlines(labels))
 
 
 def _outlines(labels: ByteArray) -> Any:
@@ -101,7 +127,7 @@ def _outlines(labels: ByteArray) -> Any:
     return rerun.LineStrips2D(strips, colors=colours, radii=-1.0)
 
 
-def layout(roots: dict[str, Streams | StoredRollout]) -> Any:
+def layout(roots: dict[str, Streams | ScoredRollout]) -> Any:
     """Returns the blueprint: a tab per root; a row per view, its kinds side by side; curves.
 
     Args:
@@ -114,8 +140,15 @@ def layout(roots: dict[str, Streams | StoredRollout]) -> Any:
     )
 
 
-def _tab(root: str, shown: Streams | StoredRollout, rrb: Any) -> Any:
-    kinds = shown.kinds if isinstance(shown, Streams) else KINDS
+def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
+    kinds = KINDS
+    if isinstance(shown, Streams):
+        kinds, views = shown.kinds, shown.views
+        below = [rrb.TimeSeriesView(origin=f'{root}/joints', name='joints')]
+        has_estimates = bool(shown.success)
+    else:
+        views, has_estimates = shown.rollout.views, bool(shown.estimates)
+        below = [rrb.TimeSeriesView(origin=f'{root}/J', name='J per object')]
     rows = [
         rrb.Horizontal(
             *(
@@ -123,25 +156,36 @@ def _tab(root: str, shown: Streams | StoredRollout, rrb: Any) -> Any:
                 for kind in kinds
             )
         )
-        for view in shown.views
+        for view in views
     ]
-    if isinstance(shown, Streams):
-        below = [
-            rrb.TimeSeriesView(origin=f'{root}/joints', name='joints'),
-            rrb.TextLogView(origin=f'{root}/words', name='reports'),
-        ]
-        if shown.success:
-            below.insert(1, rrb.TimeSeriesView(origin=f'{root}/success', name='success'))
-    else:
-        below = [rrb.TimeSeriesView(origin=f'{root}/J', name='J per object')]
+    if has_estimates:
+        below.append(rrb.TimeSeriesView(origin=f'{root}/success', name='success'))
+    below.append(rrb.TextLogView(origin=f'{root}/words', name='reports'))
     name = root.strip('/') or 'recording'
     return rrb.Vertical(*rows, rrb.Horizontal(*below), row_shares=[3] * len(rows) + [2], name=name)
 
 
-def save(stream: Any, blueprint: Any, path: Path) -> None:
-    """Sends what is logged from here on to a file for `rerun FILE`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    stream.save(str(path), default_blueprint=blueprint)
+def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_native: bool) -> str:
+    """Opens the viewer for what is logged from here on; returns what to tell the user.
+
+    Args:
+        stream: of `recording`.
+        blueprint: of `layout`; None = the viewer's own.
+        port: of the page for browsers.
+        save: write a file for `rerun FILE` instead.
+        is_native: open a window instead.
+
+    Raises:
+        ConfigError: a port is taken.
+    """
+    if save is not None:
+        save.parent.mkdir(parents=True, exist_ok=True)
+        stream.save(str(save), default_blueprint=blueprint)
+        return f'written: {save}'
+    if is_native:
+        stream.spawn(default_blueprint=blueprint)
+        return 'opened a window'
+    return f'open {serve(stream, blueprint, port)}'
 
 
 def serve(stream: Any, blueprint: Any, port: int) -> str:

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb, raw_to_rgb
-from mtv_world_ros.data.bag.messages import deserialize, header_stamp
+from mtv_world_ros.data.bag.messages import (
+    COMPRESSED_IMAGE,
+    deserialize,
+    header_stamp,
+    IMAGE,
+    JOINT_STATE,
+)
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
@@ -23,6 +29,12 @@ _IMAGES = re.compile(
     r'^/(?:.+/)?(?P<view>(?!(?:predicted|trajectory|mask)/)[^/]+)/'
     r'(?:(?P<stream>predicted|trajectory|mask)/)?(?:image_raw(?:/compressed)?|mask/compressed)$'
 )
+#: of topics that end so
+_WORDS = {
+    '/success': 'std_msgs/msg/Float64',
+    '/report': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/instruction': 'std_msgs/msg/String',
+}
 _KINDS = {'predicted': 'imagined', 'trajectory': 'trajectory', 'mask': 'imagined', None: 'real'}
 
 
@@ -65,7 +77,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     for bag in bags:
         for message in BagReader(bag).messages():
             try:
-                _take(streams, message)
+                take(streams, message)
             except MtvWorldError as error:
                 raise EpisodeError(f"'{bag}', topic {message.topic}: {error}") from error
     if not streams.images:
@@ -80,24 +92,50 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     return streams
 
 
-def _take(streams: Streams, message: BagMessage) -> None:
-    if match := _IMAGES.match(message.topic):
-        _take_image(streams, message, match)
-    elif message.topic.endswith('/success') and message.msgtype == 'std_msgs/msg/Float64':
-        value = float(deserialize(message.msgtype, message.data).data)
-        streams.success.append((message.stamp_ns, value))
-    elif message.topic.endswith('/report'):
-        report = deserialize(message.msgtype, message.data)
-        texts = [f'{one.message} {_reasons(one)}'.strip() for one in report.status]
-        streams.words.extend((message.stamp_ns, text) for text in texts)
-    elif message.topic == '/instruction':
-        text = deserialize(message.msgtype, message.data).data
-        streams.words.append((message.stamp_ns, f'instruction: {text}'))
-    elif message.msgtype == 'sensor_msgs/msg/JointState':
-        state = deserialize(message.msgtype, message.data)
-        row = np.asarray(state.position, np.float64)
+def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
+    """Returns what a topic shows: image or mask of a kind and view, ...; None = nothing."""
+    match = _IMAGES.match(topic)
+    if match and msgtype in (IMAGE, COMPRESSED_IMAGE):
+        return (
+            'mask' if _is_mask(topic, match) else 'image',
+            _KINDS[match['stream']],
+            match['view'],
+        )
+    if msgtype == JOINT_STATE:
+        return 'joints', topic
+    for suffix, wanted in _WORDS.items():
+        if topic.endswith(suffix) and msgtype == wanted:
+            return suffix, topic
+    return None
+
+
+def take(streams: Streams, message: BagMessage) -> None:
+    """Adds what a message shows.
+
+    Raises:
+        MtvWorldError: it cannot be read.
+    """
+    what = shown_as(message.topic, message.msgtype)
+    if what is None:
+        return
+    read = deserialize(message.msgtype, message.data)
+    if what[0] in ('image', 'mask'):
+        _take_image(streams, message, read, what)
+    elif what[0] == 'joints':
+        row = np.asarray(read.position, np.float64)
         kind = 'imagined' if message.topic.endswith('/predicted/joint_states') else 'real'
-        streams.joints.append((kind, header_stamp(state), tuple(state.name), row))
+        streams.joints.append((kind, header_stamp(read), tuple(read.name), row))
+    elif what[0] == '/success':
+        streams.success.append((message.stamp_ns, float(read.data)))
+    elif what[0] == '/report':
+        texts = [f'{one.message} {_reasons(one)}'.strip() for one in read.status]
+        streams.words.extend((message.stamp_ns, text) for text in texts)
+    else:
+        streams.words.append((message.stamp_ns, f'instruction: {read.data}'))
+
+
+def _is_mask(topic: str, match: re.Match[str]) -> bool:
+    return match['stream'] == 'mask' or '/mask/' in topic
 
 
 def _reasons(status: Any) -> str:
@@ -106,18 +144,17 @@ def _reasons(status: Any) -> str:
     return ' · '.join(f'{key}: {values[key]}' for key in shown if values.get(key))
 
 
-def _take_image(streams: Streams, message: BagMessage, match: re.Match[str]) -> None:
-    image = deserialize(message.msgtype, message.data)
-    key = (_KINDS[match['stream']], match['view'])
-    is_mask = match['stream'] == 'mask' or '/mask/' in message.topic
-    data = np.asarray(image.data, np.uint8)
-    if message.msgtype.endswith('CompressedImage'):
+def _take_image(streams: Streams, message: BagMessage, image: Any, what: tuple[str, ...]) -> None:
+    is_mask, data = what[0] == 'mask', np.asarray(image.data, np.uint8)
+    if message.msgtype == COMPRESSED_IMAGE:
         read = compressed_to_ids if is_mask else compressed_to_rgb
         frame = read(image.format, data)
     elif is_mask:
+        if data.size != image.height * image.step:
+            raise EpisodeError(f'{data.size} bytes are no mask of {image.width}x{image.height}')
         frame = data.reshape(image.height, image.step)[:, : image.width]
     else:
         size = {'height': image.height, 'width': image.width, 'step': image.step}
         frame = raw_to_rgb(data, encoding=image.encoding, **size)
     held = streams.masks if is_mask else streams.images
-    held.setdefault(key, []).append((header_stamp(image), frame))
+    held.setdefault((what[1], what[2]), []).append((header_stamp(image), frame))

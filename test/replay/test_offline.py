@@ -58,6 +58,18 @@ def test_predicted_images_are_read_back_as_views(predictions, recordings):
     assert np.abs(frames.astype(int) - recordings[0].frames[0, 2::2]).mean() < 3
 
 
+def test_what_the_cameras_showed_then_lies_beside_the_predictions(predictions, recordings):
+    out, _ = predictions
+    episode = read_episode(out, views=['low', 'high'], with_cameras=False)
+    for number, view in enumerate(episode.views):
+        track = episode.images[view]
+        assert track.stamps_ns.tolist() == [START_NS + k * 2 * PERIOD_NS for k in range(1, 10)]
+        real = recordings[0].frames[number, 2::2]
+        assert np.abs(np.asarray(track.frames).astype(int) - real).mean() < 3
+        (_, info), *_ = received(out, f'/{view}/camera_info')
+        assert (info.height, info.width) == real.shape[1:3]
+
+
 def test_mask_and_estimate_are_labelled(predictions):
     out, _ = predictions
     _, mask = received(out, '/world_model/low/mask/image_raw')[0]

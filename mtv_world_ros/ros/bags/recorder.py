@@ -140,7 +140,7 @@ class Recorder(Node):
         types = dict(self.get_topic_names_and_types())
         for waiting in (self._pending, self._optional):
             for topic in [t for t in waiting if t in types and self.count_publishers(t)]:
-                self._subscribe(topic, types[topic][0])
+                self._subscribe(topic, types[topic][0], leads=waiting is self._pending)
                 waiting.remove(topic)
 
     def _announce(self) -> None:
@@ -158,7 +158,7 @@ class Recorder(Node):
                 'nothing was recorded'
             )
 
-    def _subscribe(self, topic: str, msgtype: str) -> None:
+    def _subscribe(self, topic: str, msgtype: str, leads: bool) -> None:
         offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
         latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
@@ -175,7 +175,7 @@ class Recorder(Node):
         taken = self.create_subscription(
             message_class(msgtype),
             topic,
-            self._handler(topic, msgtype),
+            self._handler(topic, msgtype, leads),
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
@@ -184,7 +184,8 @@ class Recorder(Node):
         )
         self._taken.append(taken)
 
-    def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:
+    def _handler(self, topic: str, msgtype: str, leads: bool) -> Callable[[bytes], None]:
+        """Writes messages; where it leads, its header dates what has none."""
         by_header = self._options.stamp == 'header'
 
         def write(data: bytes) -> None:
@@ -193,9 +194,10 @@ class Recorder(Node):
             now_ns = self.get_clock().now().nanoseconds
             stamp_ns = now_ns
             if by_header:
-                if has_header(msgtype) and len(data) >= MIN_STAMPED_BYTES:
-                    self._last_stamp_ns = max(read_stamp(data), 0) or now_ns
                 stamp_ns = self._last_stamp_ns or now_ns
+                if has_header(msgtype) and len(data) >= MIN_STAMPED_BYTES:
+                    stamp_ns = max(read_stamp(data), 0) or now_ns
+                    self._last_stamp_ns = stamp_ns if leads else self._last_stamp_ns
             self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
             self._counts[topic] += 1
             if topic not in _ENDLESS:
@@ -229,7 +231,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         choices=('receive', 'header'),
         default='receive',
         help="log time of a message: when it came, or its header's stamp (predictions then lie "
-        'at the time they are about); messages without a header take the last header seen',
+        'at the time they are about); messages without a header take the last header seen of a '
+        'TOPIC',
     )
     add('--wait-timeout', type=float, default=60.0, help='wait for publishers this long [s]')
     add('--duration', type=float, default=float('inf'), help='end after this long [s]')

@@ -1,0 +1,121 @@
+"""Shows what cameras, robots and the world model publish, while they do, in the Rerun viewer."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import sys
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+
+from mtv_world_ros.data.bag.reader import BagMessage
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp
+from mtv_world_ros.ros.run_node import run
+from mtv_world_ros.viewing import rerun_log
+from mtv_world_ros.viewing.streams import shown_as, Streams, take
+
+#: new topics are looked for this often [s]
+_LOOK_PERIOD_S = 0.5
+#: messages kept while the viewer is busy; older ones are dropped
+_DEPTH = 10
+_ROOT = '/live'
+
+
+class LiveViewer(Node):
+    """Subscribes to whatever the viewer can show, as soon as somebody publishes it.
+
+    Args:
+        stream: recording of the viewer, which is served or saved already.
+        name: of the node.
+    """
+
+    def __init__(self, stream: Any, name: str = 'viewer') -> None:
+        super().__init__(name)
+        self._stream = stream
+        self._topics: dict[tuple[str, ...], str] = {}
+        self._shown = Streams()
+        self._begin_ns = self._last_ns = 0
+        self._num_refused = 0
+        self.create_timer(_LOOK_PERIOD_S, self._look)
+
+    def _look(self) -> None:
+        """Subscribes to what is new; of raw and compressed images of one kind, to the latter."""
+        found = dict(self.get_topic_names_and_types())
+        for topic in sorted(found, key=lambda topic: (not topic.endswith('compressed'), topic)):
+            kind = shown_as(topic, found[topic][0])
+            if kind is None or kind in self._topics or not self.count_publishers(topic):
+                continue
+            self._topics[kind] = topic
+            self._subscribe(topic, found[topic][0])
+
+    def _subscribe(self, topic: str, msgtype: str) -> None:
+        offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+        quality = QoSProfile(
+            depth=_DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        self.get_logger().info(f'showing {topic}')
+        self.create_subscription(
+            message_class(msgtype), topic, self._handler(topic, msgtype), quality, raw=True
+        )
+
+    def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:
+        def show(data: bytes) -> None:
+            try:
+                self._show(topic, msgtype, data)
+            except MtvWorldError as error:
+                self._num_refused += 1
+                text = f'{self._num_refused} messages cannot be shown; the last, of {topic}: '
+                self.get_logger().warning(f'{text}{error}', throttle_duration_sec=5.0)
+
+        return show
+
+    def _show(self, topic: str, msgtype: str, data: bytes) -> None:
+        # what has no stamp is about the last frame
+        stamp_ns = read_stamp(data) if has_header(msgtype) else self._last_ns
+        stamp_ns = stamp_ns or self._last_ns or self.get_clock().now().nanoseconds
+        self._begin_ns = self._begin_ns or stamp_ns
+        self._last_ns = stamp_ns
+        taken = Streams()
+        take(
+            taken,
+            BagMessage(
+                topic=topic, msgtype=msgtype, stamp_ns=stamp_ns, data=data, publish_ns=stamp_ns
+            ),
+        )
+        if not {*taken.images} <= {*self._shown.images} or (
+            taken.success and not self._shown.success
+        ):
+            self._shown.images.update({key: [] for key in taken.images})
+            self._shown.success.extend(taken.success)
+            self._stream.send_blueprint(rerun_log.layout({_ROOT: self._shown}))
+        rerun_log.log_streams(self._stream, taken, _ROOT, self._begin_ns)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Shows topics until Ctrl-C; returns the exit status."""
+    arguments = list(sys.argv if args is None else ('live_viewer', *args))
+    parser = argparse.ArgumentParser(prog='live_viewer', description=__doc__)
+    parser.add_argument('--port', type=int, default=9090)
+    parser.add_argument('--save', type=Path)
+    parser.add_argument('--native', action='store_true')
+    options = parser.parse_args(remove_ros_args(arguments)[1:])
+    stream = rerun_log.recording('live')
+    said = rerun_log.open_viewer(stream, None, options.port, options.save, options.native)
+    sys.stdout.write(f'{said}\nCtrl-C ends it\n')
+    sys.stdout.flush()
+    status = run(lambda: LiveViewer(stream), arguments)
+    stream.flush()
+    return status
+
+
+if __name__ == '__main__':
+    sys.exit(main())

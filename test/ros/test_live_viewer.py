@@ -1,0 +1,51 @@
+"""`mtv-world view --live`: what a node and cameras publish, in a file of the viewer."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from std_msgs.msg import Float64
+
+pytest.importorskip('rerun')
+
+
+def test_topics_are_shown_as_they_appear(ros, tmp_path):
+    file = tmp_path / 'live.rrd'
+    command = [sys.executable, '-m', 'mtv_world_ros.cli', 'view', '--live', '--save', str(file)]
+    process = subprocess.Popen(
+        command, env=ros.ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    client = ros.Client()
+    try:
+        stamp_ns = client.now_ns()
+        client.publish('/low/image_raw', ros.make_image('low', stamp_ns))
+        ahead = ros.make_image('low', stamp_ns + 200_000_000)
+        client.publish('/world_model/low/predicted/image_raw', ahead)
+        client.publish('/world_model/success', Float64(data=0.75))
+        client.publish('/instruction', ros.STRING(data='stack the blocks'))
+        broken = ros.make_image('high', stamp_ns)
+        broken.encoding = 'no encoding'
+        client.publish('/high/image_raw', broken)
+        wanted = ('low/real', 'low/imagined', 'live/success', 'live/words')
+        end = time.monotonic() + 60
+        while not all(f'{path}'.encode() in file.read_bytes() for path in wanted):
+            assert time.monotonic() < end and process.poll() is None
+            time.sleep(0.2)
+    finally:
+        client.close()
+        process.send_signal(signal.SIGINT)
+        said, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert f'written: {file}\nCtrl-C ends it' in said
+    assert '1 messages cannot be shown; the last, of /high/image_raw' in errors
+    assert 'Traceback' not in errors and b'high/real' not in file.read_bytes()
+
+
+def test_live_and_paths_exclude_each_other(capsys):
+    from mtv_world_ros.cli import main
+
+    for words in (['view'], ['view', 'somewhere', '--live']):
+        assert main(words) == 1
+        assert 'give one PATH or more to show, or --live' in capsys.readouterr().err
