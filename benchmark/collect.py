@@ -9,14 +9,13 @@ both views. Writing: JPEG, PNG, MCAP.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 import os
 from pathlib import Path
 import tempfile
 import time
 
-import numpy as np
-from page import parse_arguments, publish, table
+from page import measure, parse_arguments, publish, table
 
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
@@ -69,18 +68,15 @@ def _image_parts(config: CollectConfig, seed: int) -> str:
         count = renderer.scene.ngeom
         # the table is the first geom of the world
         shown = {'nothing': 0, 'the table alone': 1, f'all {count} geoms': count}
-        rows = []
-        for name, number in shown.items():
+
+        def render(number: int) -> None:
             renderer.scene.ngeom = number
-            times = [_spent(renderer.render) for _ in range(50)]
-            rows.append((name, f'{1e3 * float(np.median(times)):.2f}'))
+            renderer.render()
+
+        works = {name: partial(render, number) for name, number in shown.items()}
+        found = measure(works, 50)
+    rows = [(name, f'{median:.2f}') for name, (median, *_) in found.items()]
     return table(('an image of', 'CPU-ms'), rows)
-
-
-def _spent(call: Callable[[], object]) -> float:
-    begun = time.process_time()
-    call()
-    return time.process_time() - begun
 
 
 def _body(spent: list[Spent], total: float, config: CollectConfig, seed: int) -> str:

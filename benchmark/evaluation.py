@@ -15,10 +15,11 @@ from datetime import date
 from functools import partial
 import os
 from pathlib import Path
+import statistics
 import tempfile
 import time
 
-from page import machine_line, table
+from page import in_turns, machine_line, table
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -39,6 +40,7 @@ def main() -> None:
     parser.add_argument('--workers', type=int, default=2)
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--repeats', type=int, default=2, help='turns of one process and several')
     parser.add_argument('--machine', default=f'cpu{os.cpu_count()}')
     parser.add_argument('--out', type=Path, help='folder to write the page into')
     options = parser.parse_args()
@@ -57,21 +59,23 @@ def page(options: argparse.Namespace) -> str:
     load = partial(load_pipeline, options.checkpoint, device=options.device, num_threads=1)
     pipeline = load()
     with tempfile.TemporaryDirectory() as folder:
+        made: dict[int, list[Summary]] = {1: [], options.workers: []}
+        used: list[float] = []
 
-        def run(workers: int) -> tuple[Summary, float, float]:
-            begun, used = time.perf_counter(), time.process_time()
+        def run(workers: int) -> None:
+            begun = time.process_time()
             parallel = Parallel(workers=workers, make_pipeline=load, threads=1)
-            found = evaluate(
-                pipeline,
-                selection.paths,
-                Path(folder) / str(workers),
-                parallel=parallel,
-                seed=options.seed,
+            out = Path(folder) / f'{workers}_{len(made[workers])}'
+            made[workers].append(
+                evaluate(pipeline, selection.paths, out, parallel=parallel, seed=options.seed)
             )
-            return found, time.perf_counter() - begun, time.process_time() - used
+            if workers == 1:
+                used.append(time.process_time() - begun)
 
-        one, alone, used = run(1)
-        many, shared, _ = run(options.workers)
+        works = {str(workers): partial(run, workers) for workers in made}
+        spent = in_turns(works, options.repeats, warm_up=0)
+    alone, shared = (statistics.median(spent[str(n)]) for n in (1, options.workers))
+    one, many = made[1][0], made[options.workers][0]
     same = [r.rows for r in one.results] == [r.rows for r in many.results]
     count = len(one.results)
     spec = one.spec
@@ -89,8 +93,8 @@ process.
 
 {_stages(one, count, alone)}
 
-With one process an episode takes {alone / count:.2f} s of wall time and {used / count:.2f} s of
-CPU time.
+With one process an episode takes {alone / count:.2f} s of wall time and
+{statistics.median(used) / count:.2f} s of CPU time; medians of {options.repeats} turns.
 
 {_workers(options.workers, count, alone, shared)}
 

@@ -84,21 +84,45 @@ def measure(
 ) -> dict[str, tuple[float, float, float]]:
     """Returns median, 5th and 95th percentile of the CPU time [ms] of each candidate.
 
-    They take turns, so that whatever else the machine does meets all of them; CPU time of this
-    process, which other work on the machine lengthens less than wall time.
+    CPU time of this process, which other work on the machine lengthens less than wall time.
     """
-    for candidate in candidates.values():
-        candidate()
-    spent = {name: [] for name in candidates}
-    for _ in range(repeats):
-        for name, candidate in candidates.items():
-            begun = time.process_time()
-            candidate()
-            spent[name].append(1e3 * (time.process_time() - begun))
+    spent = in_turns(candidates, repeats, clock=time.process_time)
     return {
-        name: (float(np.median(t)), float(np.percentile(t, 5)), float(np.percentile(t, 95)))
-        for name, t in spent.items()
+        name: tuple(1e3 * float(found) for found in np.percentile(times, (50, 5, 95)))
+        for name, times in spent.items()
     }
+
+
+def in_turns(
+    works: Mapping[str, Callable[[], object]],
+    repeats: int,
+    *,
+    clock: Callable[[], float] = time.perf_counter,
+    warm_up: int = 1,
+) -> dict[str, list[float]]:
+    """Returns the times [s] of pieces of work that take turns, so that they can be compared.
+
+    Whatever else the machine does, heat included, meets all of them alike. Every other turn goes
+    backwards: whoever comes first in a turn is not always the same.
+
+    Args:
+        works: by name.
+        repeats: turns that count.
+        clock: tells the time [s].
+        warm_up: turns before those.
+    """
+    spent: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(warm_up + repeats):
+        for name in sorted(works, key=list(works).index, reverse=turn % 2 == 1):
+            begun = clock()
+            works[name]()
+            spent[name].append(clock() - begun)
+    return {name: times[warm_up:] for name, times in spent.items()}
+
+
+def ratio(above: Sequence[float], below: Sequence[float]) -> float:
+    """Returns the median of the ratios of two works' times of the same turns."""
+    return float(np.median([a / b for a, b in zip(above, below, strict=True)]))
 
 
 def machine_line() -> str:

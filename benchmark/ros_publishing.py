@@ -133,21 +133,20 @@ def send_camera() -> int:
 def measure_arrivals(repeats: int) -> list[list[str]]:
     """Rows of the second table."""
     profile = str(share_path('config', 'fastdds_profile.xml'))
-    rows = []
-    for name, extra in (
-        ('as it is', {}),
-        ('config/fastdds_profile.xml', {'FASTRTPS_DEFAULT_PROFILES_FILE': profile}),
-    ):
-        shares = []
-        for _ in range(repeats):
+    setups = {
+        'as it is': {},
+        'config/fastdds_profile.xml': {'FASTRTPS_DEFAULT_PROFILES_FILE': profile},
+    }
+    shares: dict[str, list[float]] = {name: [] for name in setups}
+    for _ in range(repeats):  # in turns
+        for name, extra in setups.items():
             environment = {**os.environ, **extra}
             viewer = subprocess.Popen(
                 [sys.executable, __file__, '--viewer'], env=environment, stdout=subprocess.PIPE
             )
             subprocess.run([sys.executable, __file__, '--camera'], env=environment, check=True)
-            shares.append(int(viewer.communicate()[0]) / NUM_IMAGES)
-        rows.append([name, ', '.join(f'{share:.0%}' for share in shares)])
-    return rows
+            shares[name].append(int(viewer.communicate()[0]) / NUM_IMAGES)
+    return [[name, ', '.join(f'{x:.0%}' for x in found)] for name, found in shares.items()]
 
 
 ROLES = {'--subscriber': run_subscriber, '--viewer': count_arrivals, '--camera': send_camera}

@@ -3,7 +3,8 @@
     python benchmark/serving_speed.py [--checkpoint bundled] [--threads 2] [--out FOLDER]
 
 Median over chunks of the bundled episode, for several numbers of denoising steps and both number
-formats. Real-time factor: seconds of video for a second of computing, all stages.
+formats, which take turns. Real-time factor: seconds of video for a second of computing, all
+stages.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.files import share_path
+from mtv_world_ros.prediction import Prediction
 
 
 def main() -> None:
@@ -47,32 +49,37 @@ def lines(options: argparse.Namespace) -> list[str]:
     rows = [
         f'# Serving speed, {where}, {date.today()}',
         '',
-        f'{command}: {setting}, median of n = {options.repeats} chunks after one to warm up.',
+        f'{command}: {setting}, median of n = {options.repeats} chunks, one to warm up, in turns.',
         '',
         '| format | steps | chunk [s] | real-time factor | model [s] | all else [s] |',
         '|---|---|---|---|---|---|',
     ]
-    for dtype in ('float32', 'bfloat16'):
-        pipeline = load_pipeline(
+    pipelines = {
+        dtype: load_pipeline(
             options.checkpoint, device=options.device, dtype=dtype, num_threads=options.threads
         )
-        spec = pipeline.spec
-        recording = load_recording(share_path('resource', 'demo_episode'), spec, pipeline.robot)
-        stretch = stretches(recording, spec, 'observe')[0]
-        for steps in (1, 2, 4, 8):
-            chunks = [
-                imagine_stretch(
-                    pipeline, recording, stretch, actions=recording, seed=seed,
-                    num_inference_steps=steps,
-                )[0]
-                for seed in range(options.repeats + 1)
-            ][1:]  # fmt: skip
-            total = statistics.median(sum(c.seconds.values()) for c in chunks)
-            model = statistics.median(c.seconds['model'] for c in chunks)
-            rows.append(
-                f'| {dtype} | {steps} | {total:.3f} | {spec.chunk_seconds / total:.1f} | '
-                f'{model:.3f} | {total - model:.3f} |'
-            )
+        for dtype in ('float32', 'bfloat16')
+    }
+    pipeline = pipelines['float32']
+    spec = pipeline.spec
+    recording = load_recording(share_path('resource', 'demo_episode'), spec, pipeline.robot)
+    stretch = stretches(recording, spec, 'observe')[0]
+    chunks: dict[tuple[str, int], list[Prediction]] = {
+        (dtype, steps): [] for dtype in pipelines for steps in (1, 2, 4, 8)
+    }
+    for seed in range(options.repeats + 1):
+        for (dtype, steps), found in chunks.items():  # in turns
+            found += imagine_stretch(
+                pipelines[dtype], recording, stretch, actions=recording, seed=seed,
+                num_inference_steps=steps,
+            )[:1]  # fmt: skip
+    for (dtype, steps), found in chunks.items():
+        total = statistics.median(sum(c.seconds.values()) for c in found[1:])
+        model = statistics.median(c.seconds['model'] for c in found[1:])
+        rows.append(
+            f'| {dtype} | {steps} | {total:.3f} | {spec.chunk_seconds / total:.1f} | '
+            f'{model:.3f} | {total - model:.3f} |'
+        )
     parameters = sum(np.prod(p.shape) for p in _parameters(pipeline))
     size = f'{len(spec.views)} views x {spec.num_frames} frames of {spec.width}x{spec.height}'
     length = f'at {spec.fps:g} Hz = {spec.chunk_seconds:.1f} s'

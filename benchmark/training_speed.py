@@ -5,8 +5,9 @@
 
 Takes turns, step by step, between this trainer and a straight accelerate loop over the same
 batches with the same optimizer and averaged weights, so that whatever else the machine does meets
-both; then lets the trainer run with its data pipeline, and the pipeline run alone. Medians of wall
-time, after two steps to warm up. MFU: operations of the transformer's forward and backward in a
+both, and the product of large matrices; then lets the trainer run with its data pipeline, and the
+pipeline run alone. Medians of wall time, after two steps to warm up. MFU: operations of the
+transformer's forward and backward in a
 second, as a share of those of the fastest product of large matrices on this machine.
 """
 
@@ -24,7 +25,7 @@ from typing import Any
 import accelerate
 from accelerate import Accelerator
 from diffusers.training_utils import EMAModel
-from page import parse_arguments, publish, table
+from page import in_turns, parse_arguments, publish, ratio, table
 import torch
 
 from mtv_world_ros.assembly import assemble_segmenter, robot_path
@@ -117,26 +118,6 @@ def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[Batch], None]:
     return step
 
 
-def timed(run: Callable[[], object]) -> float:
-    """Seconds that it takes."""
-    started = time.perf_counter()
-    run()
-    return time.perf_counter() - started
-
-
-def alternate(
-    trainer: Trainer, plain: Callable[[Batch], None], batches: list[Batch]
-) -> tuple[float, float, float]:
-    """Median seconds of a step of the trainer and of the plain loop, and of their ratio."""
-    own, other = [], []
-    for batch in batches:
-        own.append(timed(lambda batch=batch: trainer.train_step(batch)))
-        other.append(timed(lambda batch=batch: plain(batch)))
-    own, other = own[_WARM_UP:], other[_WARM_UP:]
-    ratios = [b / a for a, b in zip(own, other, strict=True)]
-    return statistics.median(own), statistics.median(other), statistics.median(ratios)
-
-
 def main() -> None:
     """Measures, and prints the page."""
     options = parse_arguments(__doc__, repeats=10, more=add_options)
@@ -147,22 +128,34 @@ def main() -> None:
     begun = time.perf_counter()
     batches = [source.batch(step) for step in range(steps)]
     clips = steps * len(batches[0].numbers) / (time.perf_counter() - begun)
-    own, other, ratio = alternate(trainer, plain_loop(trainer, dtype), batches)
+    plain, peaks = plain_loop(trainer, dtype), []
+    own_batches, plain_batches = iter(batches), iter(batches)
+    spent = in_turns(
+        {
+            'own': lambda: trainer.train_step(next(own_batches)),
+            'plain': lambda: plain(next(plain_batches)),
+            'peak': lambda: peaks.append(measured_peak(trainer.device, dtype)),
+        },
+        options.repeats,
+        warm_up=_WARM_UP,
+    )
+    own, other = (statistics.median(spent[name]) for name in ('own', 'plain'))
+    gain = ratio(spent['plain'], spent['own'])
     trainer.step = steps
     reports = trainer.run(source, save_every=10**9, on_save=lambda _: None)
     whole = [next(reports) for _ in range(steps)][_WARM_UP:]
     source.close()
     waited = sum(report.waited for report in whole) / sum(report.seconds for report in whole)
     running = statistics.median(report.seconds for report in whole)
-    peak = measured_peak(trainer.device, dtype)
+    peak = statistics.median(peaks[_WARM_UP:])
     ideal = ideal_seconds(trainer.config, trainer.actions, dtype, peak)
     rows = [
         ['steps/s of the trainer with its data', f'{1 / running:.4f}'],
         ['of it waited for data', f'{100 * waited:.2f} %'],
         ['steps/s on batches at hand', f'{1 / own:.4f}'],
         ['steps/s of the plain accelerate loop on the same', f'{1 / other:.4f}'],
-        ['trainer : plain loop (median of the pairs)', f'{ratio:.2f}'],
-        ['MFU of the trainer with its data', f'{100 * ideal / running:.1f} %'],
+        ['trainer : plain loop (median of the pairs)', f'{gain:.2f}'],
+        ['MFU of the trainer on batches at hand', f'{100 * ideal / own:.1f} %'],
         ['measured peak', f'{peak / 1e9:.0f} GFLOP/s'],
         ['operations a step', f'{ideal * peak / 1e9:.1f} GFLOP'],
         ['clips/s of the data pipeline alone', f'{clips:.2f}'],

@@ -22,9 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 import statistics
 import sys
-import time
 
-from page import publish, table
+from page import in_turns, publish, table
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from wan_bench import Bench
@@ -93,10 +92,11 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
     given = plain.encode()
     with FlopCounterMode(display=False) as counter:
         plain.step(given)
-    matrix = matrix_rate(plain)
+    products = Products(plain)
+    matrix = products.flop / seconds(plain, products)
     work = Work(
         flop=counter.get_total_flops(),
-        matrix=matrix,
+        products=products,
         view_frames=len(config.video.views) * config.video.num_frames,
     )
     parameters = sum(p.numel() for p in plain.transformer.parameters())
@@ -126,16 +126,16 @@ def _reason(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """Of a chunk: operations of a step, the machine's in a second, frames of all views."""
+    """Of a chunk: operations of a step, products to compare them with, frames of all views."""
 
     flop: int
-    matrix: float
+    products: Products
     view_frames: int
 
-    def share(self, step: float) -> str:
-        """What a step of so many seconds makes of the machine."""
-        rate = self.flop / step
-        return f'{rate / 1e12:.2f} TFLOP/s, {100 * rate / self.matrix:.0f} %'
+    def share(self, step: float, products: float) -> str:
+        """What a step makes of the machine, by its time [s] and that of the products in turn."""
+        rate, most = self.flop / step, self.products.flop / products
+        return f'{rate / 1e12:.2f} TFLOP/s, {100 * rate / most:.0f} %'
 
 
 def _served(
@@ -155,7 +155,7 @@ def _served(
 
 def _whole(bench: Bench, work: Work, plain: Bench) -> list[str]:
     given = bench.encode()
-    step = seconds(bench, lambda: bench.step(given))
+    step, products = medians(bench, lambda: bench.step(given), work.products)
     rows = [
         ['encode (start images, trajectory videos, history)', _ms(seconds(bench, bench.encode))],
         ['one step of the transformer', _ms(step)],
@@ -164,15 +164,15 @@ def _whole(bench: Bench, work: Work, plain: Bench) -> list[str]:
     memory = _memory(bench.device)
     stock, totals = plain.stock(), []
     for steps in bench.options.steps:
-        ours, theirs = in_turns(bench, lambda n=steps: bench.chunk(n), lambda n=steps: stock(n))
+        ours, theirs = medians(bench, lambda n=steps: bench.chunk(n), lambda n=steps: stock(n))
         rate = f'{work.view_frames / ours:.1f}'
         totals.append([str(steps), _ms(ours), rate, _ms(theirs), f'{theirs / ours:.2f}'])
     header = ['steps', 'chunk [ms]', 'view-frames/s', 'stock pipeline [ms]', 'ratio']
-    return [
-        table(['stage', 'median [ms]'], rows),
-        f'The transformer: {work.share(step)} of that. Most memory held: {memory}.',
-        table(header, totals),
-    ]
+    told = (
+        f'The transformer: {work.share(step, products)} of the matrix product in turns with it. '
+        f'Most memory held: {memory}.'
+    )
+    return [table(['stage', 'median [ms]'], rows), told, table(header, totals)]
 
 
 def _compared(config: TrainingConfig, work: Work, plain: Bench) -> str:
@@ -193,47 +193,59 @@ def _row(config: TrainingConfig, work: Work, plain: Bench, serving: str) -> list
     bench = Bench(config, options, ServingOptions.parse(serving))
     try:
         given = bench.encode()
-        step, usual = in_turns(bench, lambda: bench.step(given), lambda: plain.step(theirs))
+        step, usual, products = medians(
+            bench, lambda: bench.step(given), lambda: plain.step(theirs), work.products
+        )
         decode = seconds(bench, lambda: bench.decode(given.control))
         chunk = seconds(bench, lambda: bench.chunk(options.steps[0]))
         rate = f'{work.view_frames / chunk:.1f}'
-        times = [_ms(step), f'{usual / step:.2f}', work.share(step), _ms(decode), _ms(chunk), rate]
+        times = [
+            _ms(step),
+            f'{usual / step:.2f}',
+            work.share(step, products),
+            _ms(decode),
+            _ms(chunk),
+            rate,
+        ]
         return [*times, _memory(bench.device)]
     finally:
         bench.close()
 
 
-def matrix_rate(bench: Bench) -> float:
-    """FLOP/s of a large matrix product on this device, in the transformer's number format."""
-    size = 8192 if bench.device.type == 'cuda' else 512
-    a, b = (torch.randn(size, size, device=bench.device, dtype=bench.dtype) for _ in range(2))
+class Products:
+    """Products of large matrices in the transformer's number format, to measure steps by."""
 
-    def products() -> None:
+    def __init__(self, bench: Bench) -> None:
+        size = 8192 if bench.device.type == 'cuda' else 512
+        self.flop = 20 * 2 * size**3
+        self._factors = tuple(
+            torch.randn(size, size, device=bench.device, dtype=bench.dtype) for _ in range(2)
+        )
+
+    def __call__(self) -> None:
+        """Computes them."""
         for _ in range(20):
-            torch.mm(a, b)
-
-    return 20 * 2 * size**3 / seconds(bench, products)
+            torch.mm(*self._factors)
 
 
 def seconds(bench: Bench, work: Callable[[], object]) -> float:
     """Median time of a piece of work, after one run to warm up."""
-    return in_turns(bench, work)[0]
+    return medians(bench, work)[0]
 
 
-def in_turns(bench: Bench, *works: Callable[[], object]) -> list[float]:
-    """Median times of pieces of work that take turns, after one run of each to warm up.
+def medians(bench: Bench, *works: Callable[[], object]) -> list[float]:
+    """Median times of pieces of work that take turns, after one run of each to warm up."""
 
-    Whatever else slows the machine, heat included, slows all of them alike.
-    """
-    spent: list[list[float]] = [[] for _ in works]
-    for _ in range(1 + bench.options.repeats):
-        for work, times in zip(works, spent, strict=True):
-            _wait(bench.device)
-            begun = time.perf_counter()
+    def finished(work: Callable[[], object]) -> Callable[[], None]:
+        def run() -> None:
             work()
             _wait(bench.device)
-            times.append(time.perf_counter() - begun)
-    return [statistics.median(times[1:]) for times in spent]
+
+        return run
+
+    _wait(bench.device)
+    named = {str(number): finished(work) for number, work in enumerate(works)}
+    return [statistics.median(t) for t in in_turns(named, bench.options.repeats).values()]
 
 
 def _wait(device: torch.device) -> None:

@@ -7,7 +7,7 @@ weights, AdamW, gradient checkpointing as in the preset) on latents at hand, as 
 `--latent-cache`; filling that cache is the autoencoder's work on a clip, CLIP's is not in it.
 Medians of wall time after one step to warm up. MFU: operations of the transformer's forward and
 backward in a second, without what gradient checkpointing computes again, as a share of those of
-the fastest product of large matrices.
+the fastest product of large matrices, which takes turns with the steps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 
-from page import parse_arguments, publish, table
+from page import in_turns, parse_arguments, publish, table
 import torch
 from wan_bench import Bench
 
@@ -118,13 +118,15 @@ def main() -> None:
     batch = repeated(clip, bench, size)
     with tempfile.TemporaryDirectory() as work:
         trainer = make(bench, config, encoders, Path(work))
-        seconds = []
-        for _ in range(1 + options.repeats):
-            begun = time.perf_counter()
-            trainer.train_step(batch)
-            seconds.append(time.perf_counter() - begun)
-    step = statistics.median(seconds[1:])
-    peak = measured_peak(bench.device, bench.dtype)
+        peaks: list[float] = []
+        spent = in_turns(
+            {
+                'step': lambda: trainer.train_step(batch),
+                'peak': lambda: peaks.append(measured_peak(bench.device, bench.dtype)),
+            },
+            options.repeats,
+        )
+    step, peak = statistics.median(spent['step']), statistics.median(peaks[1:])
     ideal = ideal_seconds(config, None, bench.dtype, peak)
     memory = '–'
     if bench.device.type == 'cuda':

@@ -35,6 +35,15 @@ def test_every_page_names_its_commit_and_checkpoint(page):
         )
 
 
+def test_what_is_compared_takes_turns_and_first_place_changes(page):
+    order, clock = [], iter(range(1000))
+    works = {name: (lambda name=name: order.append(name)) for name in 'ab'}
+    spent = page.in_turns(works, 3, clock=lambda: next(clock))
+    assert ''.join(order) == 'abbaabba' and spent == {'a': [1, 1, 1], 'b': [1, 1, 1]}
+    # the machine gets slower: the ratio of the same turns does not notice
+    assert page.ratio([2.0, 4.0, 40.0], [1.0, 2.0, 20.0]) == 2.0
+
+
 def test_a_page_older_than_what_it_describes_is_found(page, tmp_path):
     def git(*words):
         identity = ['-c', 'user.name=a', '-c', 'user.email=a@example.org']

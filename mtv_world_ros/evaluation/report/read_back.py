@@ -99,10 +99,13 @@ def check_evaluation(folder: Path) -> str:
 
 
 def _read(folder: Path, metrics: dict[str, Any]) -> Evaluated:
-    results = {name: _result(folder, name) for name in metrics['episodes']}
     missing = sorted(_NEEDED - set(metrics))
     if missing:
-        raise KeyError(', '.join(missing))
+        raise ConfigError(
+            f"the evaluation in '{folder}' was written by another version (metrics.json lacks "
+            f'{", ".join(missing)}); evaluate again into another --out'
+        )
+    results = {name: _result(folder, name) for name in metrics['episodes']}
     return Evaluated(folder=folder, metrics=metrics, results=results)
 
 
