@@ -45,11 +45,15 @@ from mtv_world_ros.evaluation.references import ACTIONS
 from mtv_world_ros.evaluation.report.comparison import write_comparison
 from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.report.tables import estimates_json
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.checkpoint import load_checkpoint
-from mtv_world_ros.model.runtime import choose_dtype
-from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_config import (
+    load_training_config,
+    TrainingConfig,
+    TrainingRun,
+)
 from mtv_world_ros.training.training_run import spread, train
 
 
@@ -109,16 +113,19 @@ def train_row(name: str, options: argparse.Namespace) -> dict[str, Any]:
             )
         return known
     checkpoint = train(
-        config,
-        spread(select(options.train, options.split).paths, options.episodes),
-        folder,
+        TrainingRun(
+            config=config,
+            dataset=select(options.train, options.split).paths,
+            num_episodes=options.episodes,
+            out=folder,
+            seed=options.seed,
+            device=options.device,
+            dtype=options.dtype,
+            save_every=options.save_every,
+            cache=options.work / 'cache',
+        ),
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter('colour'),
-        seed=options.seed,
-        device=options.device,
-        dtype=choose_dtype(options.dtype, options.device),
-        save_every=options.save_every,
-        cache=options.work / 'cache',
     )
     log = [json.loads(line) for line in (folder / 'log.jsonl').read_text().splitlines()]
     found = {
@@ -153,13 +160,15 @@ def score_row(name: str, options: argparse.Namespace) -> Summary:
         load(),
         spread(select(options.held_out, options.held_out_split).paths, options.held_out_episodes),
         options.work / name / 'scores',
+        EvaluationConfig(
+            seed=options.seed,
+            num_inference_steps=options.denoising_steps,
+            actions=ACTIONS,
+            ceiling=False,
+        ),
         name=fingerprint(checkpoint),
         label=ROWS[name].title,
         parallel=Parallel(workers=options.workers, make_pipeline=load, threads=options.threads),
-        seed=options.seed,
-        num_inference_steps=options.denoising_steps,
-        actions=ACTIONS,
-        ceiling=False,
     )
 
 

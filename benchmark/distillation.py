@@ -15,15 +15,12 @@ from pathlib import Path
 import shlex
 import sys
 
-from model_scores import add_options, cells, chunk_seconds, COLUMNS, overrides, score
+from model_scores import add_options, cells, chunk_seconds, COLUMNS, overrides, run_of, score
 from page import publish, table
 import torch
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
-from mtv_world_ros.data.splits import select
-from mtv_world_ros.model.runtime import choose_dtype
 from mtv_world_ros.training.distillation import distill, DistillConfig
-from mtv_world_ros.training.training_config import load_training_config
 
 
 def student(steps: int, options: argparse.Namespace) -> Path:
@@ -31,17 +28,10 @@ def student(steps: int, options: argparse.Namespace) -> Path:
     teacher = checkpoint_path(options.checkpoint)
     return distill(
         teacher,
-        select(options.train, 'all').paths,
-        options.work / f'student{steps}',
-        load_training_config(options.preset, overrides(options)),
+        run_of(options, f'student{steps}', overrides(options)),
         DistillConfig(num_steps=steps, teacher_steps=options.path_steps),
         robot=checkpoint_robot(teacher),
         segmenter=assemble_segmenter('colour'),
-        seed=options.seed,
-        device=options.device,
-        dtype=choose_dtype(options.dtype, options.device),
-        num_episodes=options.episodes,
-        cache=options.work / 'cache',
     )
 
 

@@ -26,6 +26,7 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
 from mtv_world_ros.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 
 
 def main() -> None:
@@ -63,11 +64,11 @@ def page(options: argparse.Namespace) -> str:
         used: list[float] = []
 
         def run(workers: int) -> None:
-            begun = time.process_time()
+            begun, config = time.process_time(), EvaluationConfig(seed=options.seed)
             parallel = Parallel(workers=workers, make_pipeline=load, threads=1)
             out = Path(folder) / f'{workers}_{len(made[workers])}'
             made[workers].append(
-                evaluate(pipeline, selection.paths, out, parallel=parallel, seed=options.seed)
+                evaluate(pipeline, selection.paths, out, config, parallel=parallel)
             )
             if workers == 1:
                 used.append(time.process_time() - begun)

@@ -35,6 +35,7 @@ from mtv_world_ros.data_types import ByteArray, History
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
 from mtv_world_ros.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import write_json
 from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -110,16 +111,18 @@ def score(checkpoint: str, options: argparse.Namespace) -> dict[str, Summary]:
             make(),
             episodes,
             options.work / ''.join(c if c.isalnum() else '_' for c in name),
+            EvaluationConfig(
+                mode='imagine',
+                seed=options.seed,
+                num_inference_steps=options.denoising_steps,
+                actions=('true',),
+                ceiling=False,
+            ),
             name=name,
             label=way,
             parallel=Parallel(
                 workers=options.workers, make_pipeline=make, threads=options.threads
             ),
-            mode='imagine',
-            seed=options.seed,
-            num_inference_steps=options.denoising_steps,
-            actions=('true',),
-            ceiling=False,
         )
     return found
 

@@ -15,7 +15,9 @@ from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
 from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import share_path
+from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import spread
 
 #: columns of a table, and what `Summary.estimates` calls them
@@ -75,13 +77,29 @@ def score(
         load(),
         spread(select(options.held_out, 'all').paths, options.held_out_episodes),
         out,
+        EvaluationConfig(
+            mode=mode,
+            seed=options.seed,
+            num_inference_steps=steps,
+            actions=('true',),
+            ceiling=False,
+        ),
         name=fingerprint(checkpoint),
         parallel=Parallel(workers=options.workers, make_pipeline=load, threads=options.threads),
-        mode=mode,
+    )
+
+
+def run_of(options: argparse.Namespace, name: str, changes: dict[str, object]) -> TrainingRun:
+    """Returns a training of the preset with changes, whose folder is `name`."""
+    return TrainingRun(
+        config=load_training_config(options.preset, changes),
+        dataset=select(options.train, 'all').paths,
+        num_episodes=options.episodes,
+        out=options.work / name,
         seed=options.seed,
-        num_inference_steps=steps,
-        actions=('true',),
-        ceiling=False,
+        device=options.device,
+        dtype=options.dtype,
+        cache=options.work / 'cache',
     )
 
 

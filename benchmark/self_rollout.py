@@ -17,7 +17,7 @@ from pathlib import Path
 import shlex
 import sys
 
-from model_scores import add_options, cells, COLUMNS, loader, overrides, score
+from model_scores import add_options, cells, COLUMNS, loader, overrides, run_of, score
 import numpy as np
 from page import publish, table
 import torch
@@ -27,8 +27,6 @@ from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoi
 from mtv_world_ros.data.recording import cached_recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
-from mtv_world_ros.model.runtime import choose_dtype
-from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.training.training_run import spread, train
 
 #: RGB difference (of 255) from which a pixel counts as changed
@@ -46,17 +44,9 @@ def trained(share: float, options: argparse.Namespace) -> Path:
         'self_rollout.max_chunks': options.max_chunks,
     }
     return train(
-        load_training_config(options.preset, changes),
-        select(options.train, 'all').paths,
-        options.work / f'share{share:g}',
+        run_of(options, f'share{share:g}', changes).replace(initial=initial),
         robot=checkpoint_robot(initial),
         segmenter=assemble_segmenter('colour'),
-        seed=options.seed,
-        device=options.device,
-        dtype=choose_dtype(options.dtype, options.device),
-        num_episodes=options.episodes,
-        initial=initial,
-        cache=options.work / 'cache',
     )
 
 

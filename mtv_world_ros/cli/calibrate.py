@@ -123,6 +123,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
+    from mtv_world_ros.evaluation.settings import EvaluationConfig
     from mtv_world_ros.pipeline import SEED_STEP
 
     load = partial(
@@ -138,6 +139,13 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
             pipeline,
             selection.paths,
             arguments.out / f'seed_{index}',
+            EvaluationConfig(
+                mode='imagine',
+                seed=arguments.seed + SEED_STEP * index,
+                num_inference_steps=arguments.steps,
+                actions=('true',),
+                ceiling=False,
+            ),
             name=fingerprint(
                 arguments.checkpoint,
                 calibrated=False,
@@ -151,12 +159,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
                 make_pipeline=partial(load, num_threads=threads),
                 threads=threads,
             ),
-            mode='imagine',
-            seed=arguments.seed + SEED_STEP * index,
-            num_inference_steps=arguments.steps,
             overwrite=arguments.overwrite,
-            actions=('true',),
-            ceiling=False,
         )
         for index in range(arguments.seeds)
     ]

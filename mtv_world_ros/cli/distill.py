@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_dtype
-from mtv_world_ros.cli.train import add_saving
+from mtv_world_ros.cli.train import add_run_options, run_of, set_overrides, use_threads
 
 #: overrides of the preset: a student starts from a trained model, close to its goal
 _DEFAULTS = {
@@ -32,30 +31,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='denoising steps of the teacher; default: 8 times those of the student',
     )
     parser.add_argument('--preset', default='small', help='optimizer, loss and augmentation')
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides',
-        help='e.g. optimizer.steps=2000',
-    )  # fmt: skip
-    parser.add_argument(
-        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
-    )
-    parser.add_argument(
-        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
-    )
-    parser.add_argument('--cache', type=Path, metavar='DIR', help='see train')
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--device', default='cpu')
-    add_dtype(parser)
-    parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all cores')
-    add_saving(parser)
+    add_run_options(parser)
     parser.set_defaults(handler=_distill)
 
 
 def _distill(arguments: argparse.Namespace) -> int:
-    import os
-
     from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
-    from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.training.training_config import load_training_config
 
@@ -65,32 +46,20 @@ def _distill(arguments: argparse.Namespace) -> int:
     config = load_training_config(arguments.preset, overrides)
     paths = select(arguments.dataset, arguments.split, default='train').paths
     # importing torch takes seconds: what is often mistyped is checked before
-    import torch
-
-    from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.distillation import distill, DistillConfig
 
     settings = DistillConfig(
         num_steps=arguments.steps, teacher_steps=arguments.teacher_steps or 8 * arguments.steps
     )
-    torch.set_num_threads(arguments.threads or len(os.sched_getaffinity(0)))
+    use_threads(arguments)
     refuse_test_kinds(paths, 'training')
     folder = distill(
         teacher,
-        paths,
-        arguments.out,
-        config,
+        run_of(arguments, config, paths),
         settings,
         robot=robot,
         segmenter=assemble_segmenter(device=arguments.device),
-        seed=arguments.seed,
-        device=arguments.device,
-        dtype=choose_dtype(arguments.dtype, arguments.device),
-        save_every=arguments.save_every,
-        save_seconds=60 * arguments.save_minutes,
-        num_episodes=arguments.episodes,
-        cache=arguments.cache,
     )
     print(f'checkpoint for {settings.num_steps} denoising steps: {folder}')
     return 0

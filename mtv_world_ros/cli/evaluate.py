@@ -195,6 +195,7 @@ def _score(
     from mtv_world_ros.assembly import assemble_describer, fingerprint, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
+    from mtv_world_ros.evaluation.settings import EvaluationConfig
 
     load = partial(
         load_pipeline,
@@ -207,6 +208,19 @@ def _score(
         pipeline,
         selection.paths,
         out,
+        EvaluationConfig(
+            mode=arguments.mode,
+            seed=arguments.seed,
+            num_seeds=arguments.seeds,
+            num_inference_steps=arguments.steps,
+            actions=arguments.actions,
+            ceiling=arguments.ceiling,
+            use_ids=arguments.truth == 'simulator',
+            quality=arguments.quality,
+            fid_weights=arguments.fid_weights,
+            fvd_weights=arguments.fvd_weights,
+            source=load_source(arguments.topics, arguments.calibration),
+        ),
         name=fingerprint(entry.path, adapter=arguments.adapter, task=arguments.task),
         label=_row(entry, pipeline),
         zero_shot=selection.zero_shot,
@@ -221,17 +235,6 @@ def _score(
         ),
         describer=arguments.describer and assemble_describer(arguments.describer),
         overwrite=arguments.overwrite,
-        mode=arguments.mode,
-        seed=arguments.seed,
-        num_seeds=arguments.seeds,
-        num_inference_steps=arguments.steps,
-        actions=arguments.actions,
-        ceiling=arguments.ceiling,
-        use_ids=arguments.truth == 'simulator',
-        quality=arguments.quality,
-        fid_weights=arguments.fid_weights,
-        fvd_weights=arguments.fvd_weights,
-        source=load_source(arguments.topics, arguments.calibration),
     )
 
 

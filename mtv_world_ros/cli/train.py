@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.evaluation.results import StoredRollout
-    from mtv_world_ros.training.training_config import TrainingConfig
+    from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
     from mtv_world_ros.training.training_run import HeldOut, Judge
 
 
@@ -36,9 +36,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--out', type=Path, help='resumes what is there')
     parser.add_argument('--preset', default='small', help='name or YAML file')
     parser.add_argument(
-        '--set', action='append', default=[], metavar='SECTION.KEY=VALUE', dest='overrides'
-    )
-    parser.add_argument(
         '--control',
         help='how actions enter: trajectory_video, policy2vec, ee_mlp or fast_tokens; '
         'default: what the preset says',
@@ -52,18 +49,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
     parser.add_argument(
-        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
-    )
-    parser.add_argument(
-        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
-    )
-    parser.add_argument(
-        '--cache',
-        type=Path,
-        metavar='DIR',
-        help='keeps the decoded recordings; several runs may share it',
-    )
-    parser.add_argument(
         '--latent-cache',
         type=Path,
         metavar='DIR',
@@ -71,16 +56,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'share it',
     )
     add_source(parser)
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--device', default='cpu')
-    add_dtype(parser)
-    parser.add_argument(
-        '--threads',
-        type=int,
-        default=0,
-        help='CPU threads per process; 0 = its share of all cores',
-    )
-    add_saving(parser)
+    add_run_options(parser)
     parser.add_argument(
         '--data-workers',
         type=int,
@@ -101,8 +77,37 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(handler=_train)
 
 
-def add_saving(parser: argparse.ArgumentParser) -> None:
-    """Adds `--save-every` and `--save-minutes`."""
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Adds what `train` and `distill` share: overrides, episodes, seed, device, saving."""
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='SECTION.KEY=VALUE',
+        dest='overrides',
+        help='of the preset, e.g. optimizer.steps=2000',
+    )
+    parser.add_argument(
+        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
+    )
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
+    )
+    parser.add_argument(
+        '--cache',
+        type=Path,
+        metavar='DIR',
+        help='keeps the decoded recordings; several runs may share it',
+    )
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--device', default='cpu')
+    add_dtype(parser)
+    parser.add_argument(
+        '--threads',
+        type=int,
+        default=0,
+        help='CPU threads per process; 0 = its share of all cores',
+    )
     parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
     parser.add_argument(
         '--save-minutes',
@@ -113,8 +118,6 @@ def add_saving(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    import os
-
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.training.training_config import load_training_config
@@ -135,8 +138,6 @@ def _train(arguments: argparse.Namespace) -> int:
         select(arguments.dataset)  # says that it holds no episodes
     if arguments.init:
         read_card(checkpoint_path(arguments.init))
-    import torch
-
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.runtime import choose_dtype
@@ -146,29 +147,20 @@ def _train(arguments: argparse.Namespace) -> int:
     source = load_source(arguments.topics, arguments.calibration)
     dtype = choose_dtype(arguments.dtype, arguments.device)
     paths = select(arguments.dataset, arguments.split, default='train').paths
-    processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
-    cores = max(1, len(os.sched_getaffinity(0)) // processes)
-    torch.set_num_threads(arguments.threads or cores)
+    use_threads(arguments)
     refuse_test_kinds(paths, 'training')
+    run = run_of(arguments, config, paths).replace(
+        initial=checkpoint_path(arguments.init) if arguments.init else None,
+        data_workers=arguments.data_workers,
+        peak_tflops=arguments.peak_tflops,
+        latent_cache=arguments.latent_cache,
+        source=source,
+    )
     folder = train(
-        config,
-        paths,
-        arguments.out,
+        run,
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter(device=arguments.device),
-        seed=arguments.seed,
-        device=arguments.device,
-        dtype=dtype,
-        save_every=arguments.save_every,
-        save_seconds=60 * arguments.save_minutes,
-        num_episodes=arguments.episodes,
-        initial=arguments.init and checkpoint_path(arguments.init),
-        cache=arguments.cache,
         held_out=held_out(arguments, paths, dtype, source),
-        data_workers=arguments.data_workers,
-        peak_flops=arguments.peak_tflops * 1e12,
-        latent_cache=arguments.latent_cache,
-        source_of_episodes=source,
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
@@ -177,6 +169,37 @@ def _train(arguments: argparse.Namespace) -> int:
     words = [model[0], dataset, *model[1:], '--out', str(out)]
     print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
     return 0
+
+
+def use_threads(arguments: argparse.Namespace) -> None:
+    """Lets torch use the threads of `--threads`: 0 = the process's share of the cores."""
+    import os
+
+    import torch
+
+    processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
+    cores = max(1, len(os.sched_getaffinity(0)) // processes)
+    torch.set_num_threads(arguments.threads or cores)
+
+
+def run_of(
+    arguments: argparse.Namespace, config: TrainingConfig, paths: Sequence[Path]
+) -> TrainingRun:
+    """Returns the training of the options that `add_run_options` adds."""
+    from mtv_world_ros.training.training_config import TrainingRun
+
+    return TrainingRun(
+        config=config,
+        dataset=tuple(paths),
+        out=arguments.out,
+        num_episodes=arguments.episodes,
+        seed=arguments.seed,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        save_every=arguments.save_every,
+        save_minutes=arguments.save_minutes,
+        cache=arguments.cache,
+    )
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -331,6 +354,7 @@ def make_judge(
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.evaluation.results import load_rollout, rollout_path
+    from mtv_world_ros.evaluation.settings import EvaluationConfig
     from mtv_world_ros.model.lora import ADAPTER
     from mtv_world_ros.training.training_run import Judged
 
@@ -348,10 +372,8 @@ def make_judge(
             pipeline,
             paths,
             folder,
-            actions=('true',),
-            ceiling=False,
+            EvaluationConfig(actions=('true',), ceiling=False, source=source or EpisodeSource()),
             show_progress=False,
-            source=source or EpisodeSource(),
         )
         for result in summary.results:
             show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)

@@ -30,7 +30,7 @@ from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.evaluation.references import round_trip
 from mtv_world_ros.evaluation.report.evaluation_summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.evaluation.settings import config_from, EvaluationConfig
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import check_same_settings, plain, write_json
 from mtv_world_ros.parallel import score_all
 from mtv_world_ros.pipeline import Pipeline
@@ -38,6 +38,7 @@ from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.describers.scene_objects import names_of
 from mtv_world_ros.vision.jaccard import mean_of_known
 
+DEFAULTS = EvaluationConfig()
 #: makes the pipeline anew, in another process
 MakePipeline = Callable[[], Pipeline]
 
@@ -61,6 +62,7 @@ def evaluate(
     pipeline: Pipeline,
     episode_paths: Sequence[Path],
     out: Path,
+    config: EvaluationConfig = DEFAULTS,
     *,
     name: str = '',
     label: str = '',
@@ -70,7 +72,6 @@ def evaluate(
     describer: Describer | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
-    **options: Any,
 ) -> Summary:
     """Scores a pipeline and writes `metrics.json`, `rows.csv` and `tables.md`.
 
@@ -81,6 +82,7 @@ def evaluate(
         pipeline: imagines and segments.
         episode_paths: recorded episodes.
         out: folder for the results.
+        config: what is imagined and how it is scored.
         name: identifies the checkpoint; only results of the same name are taken over, and none
             without a name.
         label: of its rows in tables that compare checkpoints.
@@ -90,19 +92,17 @@ def evaluate(
         describer: names the objects from each episode's first frame; None = see `Job.objects`.
         overwrite: replace results of other settings; only asked where there is a name.
         show_progress: draw a progress bar.
-        **options: fields of `EvaluationConfig`.
 
     Returns:
         What was found.
 
     Raises:
-        ConfigError: unknown option or mode, weights that are not there, or `out` holds results of
+        ConfigError: weights that are not there, or `out` holds results of
             other settings.
         EpisodeError: no episode can be used.
     """
-    config, out = config_from(options), Path(out)
     if not config.num_inference_steps:  # results say the number
-        config = replace(config, num_inference_steps=pipeline.spec.num_inference_steps)
+        config = config.replace(num_inference_steps=pipeline.spec.num_inference_steps)
     run = _Run(pipeline, out, name, config, parallel, describer)
     check_same_settings(out / 'episodes', run.settings, overwrite or not name)
     jobs = make_jobs(episode_paths, zero_shot, config.seed)

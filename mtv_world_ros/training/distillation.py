@@ -24,17 +24,20 @@ Shape letters: B batch, n the student's steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from diffusers import FlowMatchEulerDiscreteScheduler
+from pydantic import Field, model_validator
 import torch
 from torch import Tensor
 
-from mtv_world_ros.errors import ConfigError, TrainingError
+from mtv_world_ros.config import Schema
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning
@@ -48,32 +51,34 @@ from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.encoding import encode_batch, Encoders
 from mtv_world_ros.training.objective import Draws, Loss, sample_loss
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import LoraSettings, TrainingConfig, VideoConfig
+from mtv_world_ros.training.training_config import (
+    LoraSettings,
+    TrainingConfig,
+    TrainingRun,
+    VideoConfig,
+)
 from mtv_world_ros.training.training_run import train
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 _SETTINGS = 'distillation.json'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DistillConfig:
-    """Numbers of denoising steps.
+class DistillConfig(Schema):
+    """Numbers of denoising steps."""
 
-    Attributes:
-        num_steps: the student's.
-        teacher_steps: the teacher's, a multiple of `num_steps`.
-    """
+    num_steps: int = Field(default=4, description="the student's")
+    teacher_steps: int = Field(default=32, description="the teacher's, a multiple of `num_steps`")
 
-    num_steps: int = 4
-    teacher_steps: int = 32
-
-    def __post_init__(self) -> None:
+    @model_validator(mode='after')
+    def _steps_divide(self) -> Self:
         if self.num_steps < 1:
-            raise ConfigError(f'--steps is {self.num_steps}; the student needs at least 1')
+            raise ValueError(f'--steps is {self.num_steps}; the student needs at least 1')
         if self.teacher_steps < self.num_steps or self.teacher_steps % self.num_steps:
-            raise ConfigError(
+            raise ValueError(
                 f'--teacher-steps is {self.teacher_steps}; it must be a multiple of --steps, '
                 f'e.g. {8 * self.num_steps}'
             )
+        return self
 
     @property
     def substeps(self) -> int:
@@ -189,7 +194,7 @@ class DistillTrainer(Trainer):
             **self.trained_on,
             'steps': self.step,
             'seed': self.seed,
-            'distilled': asdict(self.distill),
+            'distilled': self.distill.model_dump(),
             'teacher': self.parts.card['trained_on'],
         }
         card = {
@@ -210,33 +215,35 @@ class DistillTrainer(Trainer):
 
 
 def distill(
-    checkpoint: Path, dataset: Any, out: Path, config: TrainingConfig, settings: DistillConfig,
-    **options: Any,
-) -> Path:  # fmt: skip
-    """Distils a checkpoint, resuming what `out` holds; returns the student's folder.
+    checkpoint: Path,
+    run: TrainingRun,
+    settings: DistillConfig,
+    *,
+    robot: RobotModel,
+    segmenter: Segmenter,
+) -> Path:
+    """Distils a checkpoint, resuming what `run.out` holds; returns the student's folder.
 
     Args:
         checkpoint: the teacher.
-        dataset: episodes; start frames and actions are inputs, later frames only give pixel
-            weights.
-        out: see `train`.
-        config: its optimizer, objective and augmentation are used; the rest is the teacher's.
+        run: the training. Start frames and actions of its episodes are inputs, later frames only
+            give pixel weights. Optimizer, objective and augmentation of its preset are used; the
+            rest is the teacher's.
         settings: numbers of steps.
-        options: of `train`.
+        robot: of the episodes.
+        segmenter: finds the objects of the first frames.
 
     Raises:
         CheckpointError: the teacher cannot be loaded.
         TrainingError: `out` holds another distillation; see also `train`.
     """
     teacher = load_checkpoint(checkpoint)
-    _check_same(out, {**asdict(settings), 'teacher': teacher.card['trained_on']})
+    _check_same(run.out, {**settings.model_dump(), 'teacher': teacher.card['trained_on']})
     return train(
-        student_config(config, teacher),
-        dataset,
-        out,
-        initial=checkpoint,
+        run.replace(config=student_config(run.config, teacher), initial=checkpoint),
+        robot=robot,
+        segmenter=segmenter,
         make_trainer=partial(DistillTrainer, teacher=teacher, distill=settings),
-        **options,
     )
 
 

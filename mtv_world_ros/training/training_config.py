@@ -1,4 +1,4 @@
-"""Training presets."""
+"""Training presets, and a training as a whole: preset, data, where and how it runs."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from mtv_world_ros.config import (
     Share,
     validated,
 )
+from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import bundled
@@ -265,6 +266,57 @@ class TrainingConfig(Schema):
             'num_inference_steps': self.sampling.num_inference_steps,
             'trained_on': dict(trained_on),
         }
+
+
+class TrainingRun(Schema):
+    """A training: what `mtv-world train` and `distill` are told."""
+
+    section: ClassVar = ''
+
+    config: TrainingConfig = Field(description='the preset')
+    dataset: Path | ListOf[Path] = Field(description='folder of episodes, or the episode folders')
+    out: Path = Field(
+        description='gets `state/` (to resume), `log.jsonl`, TensorBoard events and `checkpoint/`'
+    )
+    num_episodes: Count | None = Field(
+        default=None, description='use this many episodes, spread evenly over the data set'
+    )
+    source: EpisodeSource = Field(
+        default=EpisodeSource(),
+        description="how episodes are read that are not this package's own",
+    )
+    initial: Path | None = Field(
+        default=None,
+        description='checkpoint whose weights a new run starts from; a resumed run has its own. '
+        'For an adapter or a model with text, its other parts are used too, also when resumed',
+    )
+    seed: int = Field(default=0, description='of weights, noise and batches')
+    device: str = Field(default='cpu', description='e.g. `cpu`, `cuda`')
+    dtype: str = Field(
+        default='float32', description='of forward and backward, of `runtime.choose_dtype`'
+    )
+    save_every: Count = Field(default=250, description='steps between saved states')
+    save_minutes: float = Field(
+        default=10.0, ge=0, description='longest time between saved states [min]'
+    )
+    cache: Path | None = Field(
+        default=None,
+        description="keeps the recordings at the model's size; default: `out/cache`. Runs may "
+        'share it',
+    )
+    latent_cache: Path | None = Field(
+        default=None,
+        description='keeps what the encoders make of the clips; None = encode in every step',
+    )
+    data_workers: int = Field(
+        default=0, ge=0, description='processes that prepare clips; 0 = a thread of this one'
+    )
+    peak_tflops: float | None = Field(
+        default=None,
+        ge=0,
+        description="peak rate of a process's device [10^12 operations/s], for the utilisation in "
+        'the log; 0 = measure it, None = log no utilisation',
+    )
 
 
 def load_training_config(

@@ -13,7 +13,6 @@ import threading
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from mtv_world_ros.data.bag_mapping import EpisodeSource
@@ -32,7 +31,7 @@ from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model.card import CAMERAS, CARD, ROBOT_FOLDER
-from mtv_world_ros.model.runtime import check_device
+from mtv_world_ros.model.runtime import check_device, choose_dtype
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.clips.fit_actions import kept_actions
@@ -42,7 +41,7 @@ from mtv_world_ros.training.latent_cache.latent_clips import cached, CachedSourc
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -99,56 +98,27 @@ def load_recordings(
 
 
 def train(
-    config: TrainingConfig,
-    dataset: Path | Sequence[Path],
-    out: Path,
+    run: TrainingRun,
     *,
     robot: RobotModel,
     segmenter: Segmenter,
-    seed: int = 0,
-    device: str = 'cpu',
-    dtype: torch.dtype = torch.float32,
-    save_every: int = 250,
-    save_seconds: float = math.inf,
-    num_episodes: int | None = None,
-    initial: Path | None = None,
-    cache: Path | None = None,
-    make_trainer: Callable[..., Trainer] = Trainer,
     held_out: HeldOut | None = None,
-    peak_flops: float | None = None,
-    data_workers: int = 0,
-    latent_cache: Path | None = None,
-    source_of_episodes: EpisodeSource = DEFAULT,
+    make_trainer: Callable[..., Trainer] = Trainer,
 ) -> Path:
-    """Trains, resuming what `out` holds, and returns the folder of the result.
+    """Trains, resuming what `run.out` holds, and returns the folder of the result.
 
-    That is a checkpoint, or an adapter for the checkpoint `initial` where the preset trains one.
+    That is a checkpoint, or an adapter for the checkpoint `run.initial` where the preset trains
+    one.
 
     Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
     clips, and the main one alone writes; `out` and `cache` must be the same for all.
 
     Args:
-        config: the preset.
-        dataset: folder with episode folders in it, or the episode folders.
-        out: gets `state/` (to resume), `log.jsonl`, TensorBoard events and `checkpoint/`.
+        run: the training.
         robot: of the episodes.
         segmenter: finds the objects of the first frames.
-        seed: of weights, noise and batches.
-        device: e.g. `cpu`, `cuda`.
-        dtype: of forward and backward.
-        save_every: steps between saved states.
-        save_seconds: longest time between saved states [s].
-        num_episodes: use this many episodes, spread evenly over the data set.
-        initial: checkpoint whose weights a new run starts from; a resumed run has its own. For an
-            adapter or a model with text, its other parts are used too, also when resumed.
-        cache: keeps the recordings at the model's size; default: `out/cache`. Runs may share it.
-        make_trainer: makes the trainer, with the arguments of `Trainer`.
         held_out: scores checkpoints on held-out episodes and keeps the best.
-        peak_flops: peak rate of a process's device [operations/s], for the utilisation in the log;
-            0 = measure it, None = log no utilisation.
-        data_workers: processes that prepare clips; 0 = a thread of this one.
-        latent_cache: keeps what the encoders make of the clips; None = encode in every step.
-        source_of_episodes: how episodes are read that are not this package's own.
+        make_trainer: makes the trainer, with the arguments of `Trainer`.
 
     Raises:
         ConfigError: the device is not there.
@@ -157,22 +127,23 @@ def train(
             holds a training of another architecture.
         DiskError: a file cannot be written.
     """
-    config = config.replace(video=config.video.replace(robot=robot.name))  # not a path
-    check_device(device)
+    config = run.config.replace(video=run.config.video.replace(robot=robot.name))  # not a path
+    out, dtype = run.out, choose_dtype(run.dtype, run.device)
+    check_device(run.device)
     check_architecture(out, config)
-    processes = Processes(device)
+    processes = Processes(run.device)
     out.mkdir(parents=True, exist_ok=True)
-    paths = find_episodes(dataset) if isinstance(dataset, Path) else list(dataset)
+    paths = find_episodes(run.dataset) if isinstance(run.dataset, Path) else run.dataset
     with processes.main_first():
         recordings, skipped = load_recordings(
-            spread(paths, num_episodes),
+            spread(paths, run.num_episodes),
             config.spec,
             robot,
-            cache or out / 'cache',
-            source_of_episodes,
+            run.cache or out / 'cache',
+            run.source,
         )
         actions = kept_actions(
-            out, config.video.control, recordings, config.spec, robot, initial=initial
+            out, config.video.control, recordings, config.spec, robot, initial=run.initial
         )
     _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
     source: BatchSource | CachedSource = BatchSource(
@@ -180,24 +151,30 @@ def train(
         config,
         robot=robot,
         segmenter=segmenter,
-        seed=seed,
+        seed=run.seed,
         actions=actions,
-        workers=data_workers,
+        workers=run.data_workers,
         numbers=processes.share(config.optimizer.batch_size),
     )
     base = None
     if make_trainer is Trainer and needs_base(config):  # another trainer brings its own
-        base = load_base(config, initial, processes.device, dtype, seed=seed)
-    if latent_cache is not None:
+        base = load_base(config, run.initial, processes.device, dtype, seed=run.seed)
+    if run.latent_cache is not None:
         with processes.main_first():
             source = cached(
-                source, latent_cache, config, base, seed=seed, dtype=dtype, processes=processes
+                source,
+                run.latent_cache,
+                config,
+                base,
+                seed=run.seed,
+                dtype=dtype,
+                processes=processes,
             )
     trainer = make_trainer(
         config.with_steps(source.num_clips),
         out,
-        seed=seed,
-        device=device,
+        seed=run.seed,
+        device=run.device,
         dtype=dtype,
         trained_on={
             'episodes': len(recordings),
@@ -211,8 +188,8 @@ def train(
     )
     with processes.main_first():
         resumed = trainer.load_state()
-    if initial is not None and base is None and not resumed:
-        trainer.start_from(initial)
+    if run.initial is not None and base is None and not resumed:
+        trainer.start_from(run.initial)
     if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
         trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
@@ -226,12 +203,12 @@ def train(
         for line in counted(skipped):
             tqdm.write(f'left out: {line}')
     ideal = None
-    if peak_flops is not None and processes.is_main:
-        peak = peak_flops or measured_peak(processes.device, dtype)
+    if run.peak_tflops is not None and processes.is_main:
+        peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
         ideal = ideal_seconds(config, actions, dtype, peak * processes.count)
     try:
         with disk_errors_named(out):
-            _loop(trainer, source, save_every, save_seconds, held_out, ideal)
+            _loop(trainer, source, run, held_out, ideal)
     finally:
         source.close()
     return trainer.result
@@ -272,8 +249,7 @@ def _steps_of(result: Path) -> int | None:
 def _loop(
     trainer: Trainer,
     source: BatchSource | CachedSource,
-    save_every: int,
-    save_seconds: float,
+    run: TrainingRun,
     held_out: HeldOut | None,
     ideal: float | None,
 ) -> None:
@@ -283,8 +259,8 @@ def _loop(
     with StopSignals() as signals, log:
         reports = trainer.run(
             source,
-            save_every=save_every,
-            save_seconds=save_seconds,
+            save_every=run.save_every,
+            save_seconds=60 * run.save_minutes,
             on_save=lambda _: trainer.export(trainer.result),
             should_stop=signals.came,
         )

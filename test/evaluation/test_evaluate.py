@@ -6,12 +6,21 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 
-def run(pipeline, episodes, out, **options):
-    options = {'show_progress': False, **options}
-    summary = evaluate(pipeline, episodes, out, **options)
+def run(pipeline, episodes, out, *, name='', zero_shot=None, overwrite=False, **config):
+    summary = evaluate(
+        pipeline,
+        episodes,
+        out,
+        EvaluationConfig(**config),
+        name=name,
+        zero_shot=zero_shot or {},
+        overwrite=overwrite,
+        show_progress=False,
+    )
     return json.loads((out / 'metrics.json').read_text()), summary.markdown()
 
 

@@ -5,6 +5,7 @@ from small_episodes import persistence
 
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, make_jobs, Parallel
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import plain
 
 QUIET = {'show_progress': False}
@@ -32,11 +33,9 @@ def test_two_workers_find_what_one_finds(make, episodes, tmp_path):
 
 def test_what_a_worker_lacks_is_the_reason(make, episodes, tmp_path):
     parallel = Parallel(workers=2, make_pipeline=make, threads=1)
-    missing = tmp_path / 'weights.pth'
+    config = EvaluationConfig(fid_weights=tmp_path / 'weights.pth')
     with pytest.raises(EpisodeError, match="fid_weights '.*weights.pth' does not exist"):
-        evaluate(
-            make(), episodes[:2], tmp_path / 'o', parallel=parallel, fid_weights=missing, **QUIET
-        )
+        evaluate(make(), episodes[:2], tmp_path / 'o', config, parallel=parallel, **QUIET)
 
 
 def test_less_than_one_worker_is_an_error(make, episodes, tmp_path):

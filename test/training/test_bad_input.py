@@ -25,7 +25,7 @@ from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -77,7 +77,8 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     rewrite(episode, data / 'other_robot', other_robot)
     rewrite(episode, data / 'moved', moving_camera)
     out = tmp_path / 'run'
-    train(tiny, data, out, robot=robot, segmenter=ColourSegmenter())
+    run = TrainingRun(config=tiny, dataset=data, out=out)
+    train(run, robot=robot, segmenter=ColourSegmenter())
     reasons = {Path(k).name: v for k, v in json.loads((out / 'skipped.json').read_text()).items()}
     assert sorted(reasons) == ['moved', 'other_robot', 'stateless_a', 'stateless_b', 'viewless']
     assert 'joint_states' in reasons['stateless_a']
@@ -92,7 +93,7 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
         (data / name).rename(tmp_path / name)
     rewrite(episode, tmp_path / 'only' / 'bad', without('/joint_states'))
     with pytest.raises(TrainingError, match='no usable episode: 1 x .*joint_states'):
-        train(tiny, tmp_path / 'only', out, robot=robot, segmenter=ColourSegmenter())
+        train(run.replace(dataset=tmp_path / 'only'), robot=robot, segmenter=ColourSegmenter())
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(

@@ -20,7 +20,11 @@ from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.training.clips.fit_actions import fit_actions
 from mtv_world_ros.training.objective import Draws, pooled_weights
 from mtv_world_ros.training.trainer import _kept
-from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_config import (
+    load_training_config,
+    TrainingConfig,
+    TrainingRun,
+)
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -32,7 +36,8 @@ def with_control(config: TrainingConfig, control: str, **video: object) -> Train
 
 
 def run(config: TrainingConfig, episode: Path, out: Path, robot: RobotModel, **options) -> Path:
-    return train(config, episode.parent, out, robot=robot, segmenter=ColourSegmenter(), **options)
+    training = TrainingRun(config=config, dataset=episode.parent, out=out, **options)
+    return train(training, robot=robot, segmenter=ColourSegmenter())
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:

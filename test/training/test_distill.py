@@ -23,7 +23,7 @@ from mtv_world_ros.training.distillation import (
     student_config,
 )
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import HistoryConfig, TrainingConfig
+from mtv_world_ros.training.training_config import HistoryConfig, TrainingConfig, TrainingRun
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
@@ -130,9 +130,7 @@ def test_another_teacher_into_the_same_folder_is_refused(
     with pytest.raises(TrainingError, match='another distillation: its teacher differ'):
         distill(
             teacher,
-            episode.parent,
-            tmp_path,
-            tiny,
+            TrainingRun(config=tiny, dataset=episode.parent, out=tmp_path),
             DistillConfig(),
             robot=robot,
             segmenter=ColourSegmenter(),

@@ -14,7 +14,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.lora import add_adapter, save_adapter
 from mtv_world_ros.training.distillation import distill, DistillConfig
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 SHORT = {'optimizer.steps': 1, 'optimizer.batch_size': 1, 'optimizer.learning_rate': 1e-8}
@@ -43,9 +43,7 @@ def first_loss(
     file.write_text(json.dumps({**before, 'fps': 5.0, **card}))
     student = distill(
         teacher,
-        episode.parent,
-        out,
-        load_training_config('small', SHORT),
+        TrainingRun(config=load_training_config('small', SHORT), dataset=episode.parent, out=out),
         DistillConfig(num_steps=2, teacher_steps=2),
         robot=robot,
         segmenter=ColourSegmenter(),

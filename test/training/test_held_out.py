@@ -13,7 +13,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.video import decode_video
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.training_run import HeldOut, Judged, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -28,9 +28,7 @@ def test_the_best_checkpoint_by_the_judge_is_kept(
         return Judged(score=scores[step], numbers={'j_moving': scores[step]})
 
     train(
-        tiny,
-        episode.parent,
-        tmp_path,
+        TrainingRun(config=tiny, dataset=episode.parent, out=tmp_path),
         robot=robot,
         segmenter=ColourSegmenter(),
         held_out=HeldOut(judge, 1),

@@ -21,6 +21,7 @@ from mtv_world_ros.training.training_config import (
     load_training_config,
     OptimizerConfig,
     TrainingConfig,
+    TrainingRun,
 )
 from mtv_world_ros.training.training_run import find_episodes, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
@@ -148,9 +149,8 @@ def test_trains_from_a_folder_to_a_checkpoint_that_serves(
     episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
 ) -> None:
     out = tmp_path / 'run'
-    folder = train(
-        tiny, episode.parent, out, robot=robot, segmenter=ColourSegmenter(), save_every=2
-    )
+    run = TrainingRun(config=tiny, dataset=episode.parent, out=out, save_every=2)
+    folder = train(run, robot=robot, segmenter=ColourSegmenter())
     pipeline = load_pipeline(folder, dtype='float32')
     assert pipeline.spec.num_frames == 2
     assert json.loads((folder / 'world_model.json').read_text())['trained_on']['steps'] == 4
@@ -169,7 +169,8 @@ def test_episodes_that_cannot_be_used_are_named(
     copied.mkdir()
     for file in episode.iterdir():
         (copied / file.name).write_bytes(file.read_bytes())
-    train(tiny, dataset, tmp_path / 'run', robot=robot, segmenter=ColourSegmenter())
+    run = TrainingRun(config=tiny, dataset=dataset, out=tmp_path / 'run')
+    train(run, robot=robot, segmenter=ColourSegmenter())
     skipped = json.loads((tmp_path / 'run' / 'skipped.json').read_text())
     assert [Path(path).name for path in skipped] == ['broken']
 

@@ -22,7 +22,11 @@ from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.base import load_base
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.training.training_config import (
+    load_training_config,
+    TrainingConfig,
+    TrainingRun,
+)
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -241,7 +245,11 @@ def test_without_a_base_the_command_to_make_one_is_named(
     config: TrainingConfig, episode: Path, robot: RobotModel, tmp_path: Path
 ) -> None:
     with pytest.raises(TrainingError, match=r'--init FOLDER.*import-weights'):
-        train(config, episode.parent, tmp_path, robot=robot, segmenter=ColourSegmenter())
+        train(
+            TrainingRun(config=config, dataset=episode.parent, out=tmp_path),
+            robot=robot,
+            segmenter=ColourSegmenter(),
+        )
 
 
 def test_the_presets_are_the_papers_setting() -> None:

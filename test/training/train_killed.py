@@ -19,7 +19,7 @@ import torch
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -36,8 +36,8 @@ def start(out: Path, episodes: Path, preset: Path) -> int:
         torch.set_num_threads(1)
         robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
         config = load_training_config(preset)
-        segmenter = ColourSegmenter()
-        train(config, episodes, out, robot=robot, segmenter=segmenter, save_every=3)
+        run = TrainingRun(config=config, dataset=episodes, out=out, save_every=3)
+        train(run, robot=robot, segmenter=ColourSegmenter())
         code = 0
     finally:
         os._exit(code)

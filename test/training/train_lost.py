@@ -17,7 +17,7 @@ import torch
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -39,7 +39,8 @@ def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> in
         torch.set_num_threads(1)
         robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
         config = load_training_config(preset)
-        train(config, episodes, out, robot=robot, segmenter=ColourSegmenter(), save_every=5)
+        run = TrainingRun(config=config, dataset=episodes, out=out, save_every=5)
+        train(run, robot=robot, segmenter=ColourSegmenter())
     except MtvWorldError as error:
         (out / 'said').write_text(f'{type(error).__name__}: {error}')
     finally:

@@ -16,7 +16,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -44,9 +44,7 @@ if __name__ == '__main__':
     folder, episodes, preset = (Path(argument) for argument in sys.argv[1:])
     record(folder)
     train(
-        load_training_config(preset),
-        episodes,
-        folder,
+        TrainingRun(config=load_training_config(preset), dataset=episodes, out=folder),
         robot=load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')),
         segmenter=ColourSegmenter(),
     )

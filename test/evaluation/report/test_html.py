@@ -10,7 +10,7 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.evaluation.evaluate_episodes import DEFAULTS, evaluate
 from mtv_world_ros.evaluation.report.charts import (
     Dot,
     dot_chart,
@@ -23,6 +23,7 @@ from mtv_world_ros.evaluation.report.comparison import write_comparison
 from mtv_world_ros.evaluation.report.html import write_report
 from mtv_world_ros.evaluation.report.rollout_clips import make_clip, outlined, OUTLINES
 from mtv_world_ros.evaluation.results import load_rollout, rollout_path
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 
 EVIL_NAME = '<script>alert("name")<x onload=y>'
 EVIL_EPISODE = 'b"><script>alert(1)<img src=x onerror=e>'
@@ -48,8 +49,8 @@ class Page(HTMLParser):
         return [attributes for found, attributes in self.tags if found == tag]
 
 
-def scored(pipeline, episodes, out, **options):
-    evaluate(pipeline, episodes, out, show_progress=False, **options)
+def scored(pipeline, episodes, out, config=DEFAULTS, **options):
+    evaluate(pipeline, episodes, out, config, show_progress=False, **options)
     return out
 
 
@@ -162,7 +163,7 @@ def test_page_shows_the_numbers_of_metrics_json(held, page):
 
 
 def test_chained_rollouts_show_how_j_falls_from_chunk_to_chunk(make_pipeline, episodes, tmp_path):
-    out = scored(make_pipeline(), episodes, tmp_path, mode='imagine')
+    out = scored(make_pipeline(), episodes, tmp_path, EvaluationConfig(mode='imagine'))
     found = report(out)
     overall = json.loads((out / 'metrics.json').read_text())['overall']
     values = overall['j_moving_by_chunk']

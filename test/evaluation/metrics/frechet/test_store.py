@@ -10,6 +10,7 @@ from mtv_world_ros.evaluation.metrics.frechet.feature_store import (
     FeatureTaker,
     load_features,
 )
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 
 
 def mean_colour(frames):
@@ -66,17 +67,17 @@ def test_distances_reach_metrics_and_are_kept_for_the_next_run(
 ):
     module = 'mtv_world_ros.evaluation.evaluate_episodes'
     monkeypatch.setattr(f'{module}.frame_features', lambda path, device: mean_colour)
-    options = {'fid_weights': tmp_path / 'w.pth', 'show_progress': False}
+    config = EvaluationConfig(fid_weights=tmp_path / 'w.pth')
     pipeline = make_pipeline(oracle)
-    evaluate(pipeline, episodes, tmp_path, name='x', **options)
+    evaluate(pipeline, episodes, tmp_path, config, name='x', show_progress=False)
     metrics = json.loads((tmp_path / 'metrics.json').read_text())
     # the oracle draws what was recorded
     assert metrics['views']['low']['fid'] == pytest.approx(0, abs=1e-6)
     assert metrics['views']['low']['intervals']['fid'][0] is not None
     assert metrics['views']['low']['fvd'] is None and metrics['overall']['fid'] is None
     calls = oracle.num_calls
-    evaluate(pipeline, episodes, tmp_path, name='x', **options)
+    evaluate(pipeline, episodes, tmp_path, config, name='x', show_progress=False)
     assert oracle.num_calls == calls
     (tmp_path / 'episodes' / 'episode_0.features.npz').unlink()
-    evaluate(pipeline, episodes, tmp_path, name='x', **options)
+    evaluate(pipeline, episodes, tmp_path, config, name='x', show_progress=False)
     assert oracle.num_calls > calls
