@@ -19,10 +19,10 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.robot_shape import load_shape, rods
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector
-from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
+from mtv_world_ros.inspection.inspect import Inspector
+from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualSearch
 
-CONFIG = InspectionConfig(residual=ResidualConfig(lags_s=(0.0,)))
+SEARCH = ResidualSearch(lags_s=(0.0,))
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
     if not episodes:
         parser.error(f"'{options.dataset}' holds no episodes")
     for shape in (load_shape(robot), rods(robot, 'for comparison')):
-        inspector = Inspector(robot, shape, CONFIG)
+        inspector = Inspector(robot, shape, SEARCH)
         distances, passed, found = [], [], []
         for path in episodes:
             for distance, right, wrong in _judge(path, inspector, options.pixels):
@@ -64,7 +64,7 @@ def _judge(
         track = track._replace(frames=np.asarray(track.frames))
         one = replace(episode, views=(view,), images={view: track})
         x, y = measure_residual(
-            track, camera, inspector.robot, inspector.shape.parts, joints, CONFIG.residual
+            track, camera, inspector.robot, inspector.shape.parts, joints, SEARCH
         ).shift_px
         verdicts = []
         for shift in ((0, 0), (pixels, 0), (-pixels, 0), (0, pixels), (0, -pixels)):

@@ -103,7 +103,7 @@ class EpisodeWriter(BagWriter):
             step=3 * width,
             data=np.ascontiguousarray(rgb).ravel(),
         )
-        self._write(image_topic(view), messages.IMAGE, stamp_ns, message)
+        self.write_message(image_topic(view), messages.IMAGE, stamp_ns, message)
 
     def write_mask(self, view: str, stamp_ns: int, ids: ByteArray) -> None:
         """Records object masks, (H, W) uint8: 0 = none, i + 1 = objects[i]."""
@@ -119,7 +119,7 @@ class EpisodeWriter(BagWriter):
     def write_camera_info(self, view: str, stamp_ns: int, camera: CameraModel) -> None:
         """Records the view's intrinsics."""
         message = messages.make_camera_info(stamp_ns, camera, optical_frame(view))
-        self._write(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
+        self.write_message(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
 
     def write_joint_states(
         self,
@@ -130,23 +130,23 @@ class EpisodeWriter(BagWriter):
     ) -> None:
         """Records measured positions (J,) [rad or m] and, if known, velocities (J,)."""
         message = messages.make_joint_state(stamp_ns, names, positions, velocities)
-        self._write(JOINT_STATES, messages.JOINT_STATE, stamp_ns, message)
+        self.write_message(JOINT_STATES, messages.JOINT_STATE, stamp_ns, message)
 
     def write_trajectory(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
         """Records a commanded trajectory that starts at `stamp_ns`."""
         message = messages.make_joint_trajectory(stamp_ns, trajectory)
-        self._write(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
+        self.write_message(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
 
     def write_object_poses(self, stamp_ns: int, T_base_object: ArrayLike) -> None:
         """Records object poses (O, 4, 4) in the order of their names [m]."""
         message = messages.make_pose_array(stamp_ns, 'base_link', T_base_object)
-        self._write(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
+        self.write_message(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
 
     def write_instruction(self, stamp_ns: int, text: str | None = None) -> None:
         """Records the instruction (latched); by default the episode's own."""
         self.declare(INSTRUCTION, messages.STRING, LATCHED)
         message = messages.make(messages.STRING, data=self.instruction if text is None else text)
-        self._write(INSTRUCTION, messages.STRING, stamp_ns, message)
+        self.write_message(INSTRUCTION, messages.STRING, stamp_ns, message)
 
     def close(self) -> None:
         """Finishes the record; raises EpisodeError where `outcome` is not a known word."""
@@ -179,7 +179,4 @@ class EpisodeWriter(BagWriter):
             format=layout,
             data=np.frombuffer(data, np.uint8),
         )
-        self._write(topic, messages.COMPRESSED_IMAGE, stamp_ns, message)
-
-    def _write(self, topic: str, msgtype: str, stamp_ns: int, message: object) -> None:
-        self.write_raw(topic, msgtype, stamp_ns, messages.serialize(msgtype, message))
+        self.write_message(topic, messages.COMPRESSED_IMAGE, stamp_ns, message)

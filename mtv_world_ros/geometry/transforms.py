@@ -1,4 +1,4 @@
-"""Rigid poses (4, 4): from quaternions, from Denavit-Hartenberg rows, inverted."""
+"""Rigid poses (4, 4): from quaternions, directions and Denavit-Hartenberg rows, inverted."""
 
 from __future__ import annotations
 
@@ -49,6 +49,14 @@ def pose(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation(quaternion_xyzw), place
     return T
+
+
+def looking_along(ahead: FloatArray) -> FloatArray:
+    """Returns the (3, 3) rotation of an upright camera: x right, y down, z along `ahead`."""
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(ahead, right), ahead], axis=1)
 
 
 def denavit_hartenberg(a: float, alpha: float, d: float, theta: float) -> FloatArray:

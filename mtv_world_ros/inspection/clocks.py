@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicious
@@ -18,39 +16,25 @@ from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicio
 Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClockConfig:
-    """From where on a clock is suspicious.
-
-    Attributes:
-        gap: a pause this many times the median period is a gap.
-        max_skew_s: views further apart are refused by the node [s].
-        max_joint_age_s: a frame's nearest joint state may be this far away [s].
-        min_coverage: share of the frames within the joint states; below half of it is broken.
-        max_response_s: the joints may follow their commands this late [s].
-    """
-
-    gap: float = 2.5
-    max_skew_s: float = 0.05
-    max_joint_age_s: float = 0.1
-    min_coverage: float = 0.95
-    max_response_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ('gap', 'max_skew_s', 'max_joint_age_s', 'min_coverage', 'max_response_s'):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f'clocks.{name} is {getattr(self, name)}, must be positive')
+#: a pause this many times the median period is a gap
+_GAP = 2.5
+#: views further apart are refused by the node [s]
+_MAX_SKEW_S = 0.05
+#: a frame's nearest joint state may be this far away [s]
+_MAX_JOINT_AGE_S = 0.1
+#: share of the frames within the joint states; below half of it is broken
+_MIN_COVERAGE = 0.95
+#: the joints may follow their commands this late [s]
+_MAX_RESPONSE_S = 0.5
 
 
-def check_rate(
-    what: str, stamps_ns: Stamps, config: ClockConfig
-) -> tuple[dict[str, str], list[Finding]]:
+def check_rate(what: str, stamps_ns: Stamps) -> tuple[dict[str, str], list[Finding]]:
     """Median rate and gaps of one stream."""
     if len(stamps_ns) < 2:
         return {}, [broken(f'{what}: {len(stamps_ns)} message, at least 2 are needed')]
     periods = np.diff(stamps_ns) * 1e-9
     period = float(np.median(periods))
-    gaps = periods > config.gap * period
+    gaps = periods > _GAP * period
     measures = {f'{what} rate': f'{1 / period:.4g} Hz, {len(stamps_ns)} messages'}
     if not gaps.any():
         return measures, []
@@ -62,9 +46,7 @@ def check_rate(
     return measures, [suspicious(text)]
 
 
-def check_skew(
-    view: str, images: Mapping[str, Track], config: ClockConfig
-) -> tuple[dict[str, str], list[Finding]]:
+def check_skew(view: str, images: Mapping[str, Track]) -> tuple[dict[str, str], list[Finding]]:
     """How far a view's frames are from the first view's nearest ones."""
     first = next(iter(images))
     if view == first or not len(images[view].stamps_ns):
@@ -75,18 +57,18 @@ def check_skew(
         return {}, [broken(f"its frames and those of '{first}' are at different times")]
     away = nearest_distance_s(own[within], other)
     measures = {f"skew to '{first}'": f'{np.median(away):.3g} s, at most {away.max():.3g} s'}
-    if np.median(away) <= config.max_skew_s:
+    if np.median(away) <= _MAX_SKEW_S:
         return measures, []
     return measures, [
         suspicious(
             f"its frames are {np.median(away):.3g} s away from those of '{first}'; the node "
-            f'refuses more than max_view_skew_s = {config.max_skew_s:g} s'
+            f'refuses more than max_view_skew_s = {_MAX_SKEW_S:g} s'
         )
     ]
 
 
 def check_joint_states(
-    stamps_ns: Stamps, joints: JointTrack, config: ClockConfig
+    stamps_ns: Stamps, joints: JointTrack
 ) -> tuple[dict[str, str], list[Finding]]:
     """Joint states against a view's frames."""
     covered = float(joints.covers(stamps_ns).mean())
@@ -95,22 +77,22 @@ def check_joint_states(
         'frames within the joint states': f'{covered:.0%}',
         'nearest joint state': f'{np.median(away):.3g} s, at most {away.max():.3g} s',
     }
-    if covered < config.min_coverage / 2:
+    if covered < _MIN_COVERAGE / 2:
         text = (
             f'only {covered:.0%} of the frames are within the joint states: are their stamps of '
             'the same clock?'
         )
         return measures, [broken(text)]
     findings = []
-    if covered < config.min_coverage:
+    if covered < _MIN_COVERAGE:
         findings.append(
             suspicious(f'only {covered:.0%} of the frames are within the joint states')
         )
-    if away.max() > config.max_joint_age_s:
+    if away.max() > _MAX_JOINT_AGE_S:
         findings.append(
             suspicious(
                 f'a frame is {away.max():.3g} s away from the nearest joint state (more than '
-                f'{config.max_joint_age_s:g} s)'
+                f'{_MAX_JOINT_AGE_S:g} s)'
             )
         )
     return measures, findings
@@ -121,7 +103,6 @@ def check_commands(
     origin_ns: int,
     frames_ns: Stamps,
     joints: JointTrack,
-    config: ClockConfig,
 ) -> tuple[dict[str, str], list[Finding]]:
     """Commands against frames, and how late the joints follow them.
 
@@ -130,7 +111,6 @@ def check_commands(
         origin_ns: their time zero.
         frames_ns: of the first view.
         joints: measured.
-        config: limits.
     """
     if commands is None:
         return {'commands': 'none'}, [
@@ -150,7 +130,7 @@ def check_commands(
         else 'not measured: nothing moves'
     )
     findings = []
-    if abs(late) > config.max_response_s:
+    if abs(late) > _MAX_RESPONSE_S:
         findings.append(
             suspicious(
                 f'the joints follow the commands {late:.2f} s late: are their stamps of the same '

@@ -21,6 +21,7 @@ from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.inspection.camera_pose import (
     CameraEstimate,
     covered_frames,
@@ -301,10 +302,8 @@ def _looking(
     """A camera somewhere around a point, not below it, that looks near it, upright."""
     turn, up = generator.uniform(0, 2 * np.pi), np.arcsin(generator.uniform(-0.15, 0.98))
     ahead = -np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
-    right = np.cross(ahead, (0, 0, 1.0))
-    right /= np.linalg.norm(right)
     T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    T[:3, :3] = looking_along(ahead)
     aside = generator.normal(0, 0.25 * reach, 2)
     T[:3, 3] = centre - away * ahead + T[:3, :2] @ aside
     return T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ import numpy as np
 from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import RobotModel
@@ -29,7 +29,6 @@ from mtv_world_ros.inspection.clocks import (
     check_joint_states,
     check_rate,
     check_skew,
-    ClockConfig,
     JointTrack,
 )
 from mtv_world_ros.inspection.inspection_report import (
@@ -43,7 +42,9 @@ from mtv_world_ros.inspection.inspection_report import (
 from mtv_world_ros.inspection.motion_residual import (
     measure_residual,
     MotionResidual,
-    ResidualConfig,
+    REACH,
+    ResidualSearch,
+    WHOLE_SEARCH,
 )
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
@@ -56,39 +57,16 @@ Checked = tuple[dict[str, str], list[Finding]]
 _LEAST_IN_IMAGE = 0.5
 #: recorded joint states overshoot by this much [rad or m]
 _LIMIT_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InspectionConfig:
-    """From where on a view is suspicious or broken.
-
-    Attributes:
-        suspicious_residual: distance of drawn robot and moving pixels, share of the image width.
-        broken_residual: likewise.
-        rods_factor: both times this, where the robot's shape is not known.
-        min_match: correlation of drawn and seen motion below which they are unrelated.
-        better_match: gain in that correlation from which on another roll or focal length is taken
-            to be the right one, as a share.
-        max_lag_s: delay of the images against the joint states from which on it matters [s].
-        residual: how it is measured.
-        clocks: limits of the clock checks.
-    """
-
-    suspicious_residual: float = 0.012
-    broken_residual: float = 0.03
-    rods_factor: float = 6.0
-    min_match: float = 0.12
-    better_match: float = 0.1
-    max_lag_s: float = 0.1
-    residual: ResidualConfig = field(default_factory=ResidualConfig)
-    clocks: ClockConfig = field(default_factory=ClockConfig)
-
-    def __post_init__(self) -> None:
-        if not 0 < self.suspicious_residual <= self.broken_residual:
-            raise ConfigError(
-                f'inspection.suspicious_residual is {self.suspicious_residual}, must be in 0 .. '
-                f'broken_residual = {self.broken_residual}'
-            )
+#: distance of drawn robot and moving pixels from which a view is suspicious, broken [image width]
+_SUSPICIOUS, _BROKEN = 0.012, 0.03
+#: both times this, where the robot's shape is not known
+_RODS_FACTOR = 6.0
+#: correlation of drawn and seen motion below which they are unrelated
+_MIN_MATCH = 0.12
+#: gain in that correlation, as a share, from which another roll or focal length is taken for right
+_BETTER_MATCH = 0.1
+#: delay of the images against the joint states from which on it matters [s]
+_MAX_LAG_S = 0.1
 
 
 class Inspector:
@@ -97,18 +75,15 @@ class Inspector:
     Args:
         robot: the robot.
         shape: what it looks like.
-        config: limits.
+        search: what is tried to measure the residual.
     """
 
     def __init__(
-        self, robot: RobotModel, shape: RobotShape, config: InspectionConfig | None = None
+        self, robot: RobotModel, shape: RobotShape, search: ResidualSearch = WHOLE_SEARCH
     ) -> None:
-        self.robot = robot
-        self.shape = shape
-        self._config = config or InspectionConfig()
-        factor = 1.0 if shape.is_known else self._config.rods_factor
-        self._suspicious = factor * self._config.suspicious_residual
-        self._broken = factor * self._config.broken_residual
+        self.robot, self.shape, self._search = robot, shape, search
+        factor = 1.0 if shape.is_known else _RODS_FACTOR
+        self._suspicious, self._broken = factor * _SUSPICIOUS, factor * _BROKEN
 
     def inspect(self, episode: Episode) -> Inspection:
         """Checks an episode that was read with its cameras.
@@ -139,7 +114,6 @@ class Inspector:
 
     def _view(self, episode: Episode, view: str, joints: JointTrack) -> Section:
         track, camera = episode.images[view], episode.cameras[view]
-        clocks = self._config.clocks
         residual = self._residual(episode, view, joints)
         if isinstance(residual, Finding):
             measured: Checked = ({}, [residual])
@@ -151,9 +125,9 @@ class Inspector:
             [
                 check_visibility(camera, self.robot, joints.at(track.stamps_ns)),
                 measured,
-                check_rate('frames', track.stamps_ns, clocks),
-                check_skew(view, episode.images, clocks),
-                check_joint_states(track.stamps_ns, joints, clocks),
+                check_rate('frames', track.stamps_ns),
+                check_skew(view, episode.images),
+                check_joint_states(track.stamps_ns, joints),
             ],
             notes,
         )
@@ -168,7 +142,7 @@ class Inspector:
                 self.robot,
                 self.shape.parts,
                 joints,
-                self._config.residual,
+                self._search,
             )
         except EpisodeError as error:
             return broken(f'its images cannot be read: {error}')
@@ -192,7 +166,7 @@ class Inspector:
                 f'only gross errors were looked for: the robot is drawn with {self.shape.source}'
             )
             findings.append(not_checked(text))
-        if abs(residual.lag_s) >= self._config.max_lag_s - 1e-9:
+        if abs(residual.lag_s) >= _MAX_LAG_S - 1e-9:
             findings.append(
                 suspicious(
                     f'the images fit the joint states best {residual.lag_s:+.1f} s later: their '
@@ -202,10 +176,10 @@ class Inspector:
         return (measures, findings), (f'the robot is drawn with {self.shape.source}',)
 
     def _distance(self, residual: MotionResidual, camera: CameraModel) -> list[Finding]:
-        if residual.match < self._config.min_match:
+        if residual.match < _MIN_MATCH:
             text = (
                 f'what moves in the images does not move like the drawn robot (match '
-                f'{residual.match:.2f}, at least {self._config.min_match:g} is expected): wrong '
+                f'{residual.match:.2f}, at least {_MIN_MATCH:g} is expected): wrong '
                 'camera, pose or robot'
             )
             return [broken(text)]
@@ -216,7 +190,7 @@ class Inspector:
             f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset (`mtv-world '
             'calibrate-camera` estimates the pose)'
         )
-        border = max(abs(x), abs(y)) >= self._config.residual.reach * camera.width - 1
+        border = max(abs(x), abs(y)) >= REACH * camera.width - 1
         if border or distance > self._broken * camera.width:
             return [broken(text)]
         return [suspicious(text)] if distance > self._suspicious * camera.width else []
@@ -224,7 +198,7 @@ class Inspector:
     def _better_fit(self, residual: MotionResidual) -> list[Finding]:
         """A roll or a focal length with which the drawn robot fits clearly better."""
         name, match = residual.best_change
-        if not self.shape.is_known or match <= residual.match * (1 + self._config.better_match):
+        if not self.shape.is_known or match <= residual.match * (1 + _BETTER_MATCH):
             return []
         text = (
             f'the drawn robot fits the moving pixels better with {name} (match {match:.2f}, as it '
@@ -235,16 +209,16 @@ class Inspector:
 
     def _recording(self, episode: Episode, joints: JointTrack) -> Section:
         frames_ns = episode.images[episode.views[0]].stamps_ns
-        clocks, origin = self._config.clocks, int(frames_ns[0])
+        origin = int(frames_ns[0])
         checks = [
             check_limits('measured', self.robot, joints.positions),
-            check_rate('joint states', joints.stamps_ns, clocks),
+            check_rate('joint states', joints.stamps_ns),
         ]
         try:
             commands = self._commands(episode, origin)
             if commands is not None:
                 checks.append(check_limits('commanded', self.robot, commands.positions))
-            checks.append(check_commands(commands, origin, frames_ns, joints, clocks))
+            checks.append(check_commands(commands, origin, frames_ns, joints))
         except MtvWorldError as error:
             checks.append(({}, [broken(f'commands: {error}')]))
         warnings = [suspicious(text) for text in episode.warnings]
@@ -257,14 +231,14 @@ class Inspector:
         return stitch(matched, origin_ns)
 
 
-def load_inspector(robot_file: Path, config: InspectionConfig | None = None) -> Inspector:
+def load_inspector(robot_file: Path, search: ResidualSearch = WHOLE_SEARCH) -> Inspector:
     """Returns the inspector of a robot YAML.
 
     Raises:
         ConfigError, RobotError: the robot cannot be used.
     """
     robot = load_robot(robot_file)
-    return Inspector(robot, load_shape(robot), config)
+    return Inspector(robot, load_shape(robot), search)
 
 
 def _section(name: str, checks: Iterable[Checked], notes: Sequence[str]) -> Section:

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.inspection.camera_pose import shrunk
 from mtv_world_ros.inspection.clocks import JointTrack
 
 FloatImage = NDArray[np.float32]
@@ -26,41 +26,36 @@ FloatImage = NDArray[np.float32]
 _LEAST_AREA_PX = 20
 #: share of the drawn motion that must stay in the image under a shift
 _LEAST_INSIDE = 0.5
+#: images are shrunk to this width [px]
+_WIDTH = 384
+#: time between the two frames of a pair [s]
+_STEP_S = 0.5
+#: search radius, as a share of the image width
+REACH = 0.08
+#: standard deviation that both motions are blurred by [px]
+_BLUR_PX = 1.5
+#: grey levels from which a pixel counts as moving, so that one that changes more counts no more
+_SATURATION = 25.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ResidualConfig:
-    """How the residual is measured.
+class ResidualSearch:
+    """What is tried to measure the residual.
 
     Attributes:
-        width: images are shrunk to this width [px].
-        step_s: time between the two frames of a pair [s].
-        max_pairs: pairs compared, spread over the recording.
-        reach: search radius, as a share of the image width.
-        blur_px: standard deviation that both motions are blurred by [px].
-        saturation: grey levels from which a pixel counts as moving, so that one that changes
-            more counts no more.
-        lags_s: delays of the images against the joint states that are tried [s].
-        rolls_deg: turns of the camera about its axis that are tried.
-        zooms: factors of the focal length that are tried.
+        max_pairs: pairs of frames, spread over the recording.
+        lags_s: delays of the images against the joint states, 0 among them [s].
+        rolls_deg: turns of the camera about its axis.
+        zooms: factors of the focal length.
     """
 
-    width: int = 384
-    step_s: float = 0.5
     max_pairs: int = 45
-    reach: float = 0.08
-    blur_px: float = 1.5
-    saturation: float = 25.0
     lags_s: tuple[float, ...] = (-0.8, -0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4, 0.8)
     rolls_deg: tuple[float, ...] = (-30.0, -10.0, 10.0, 30.0)
     zooms: tuple[float, ...] = (0.75, 0.9, 1.1, 1.33)
 
-    def __post_init__(self) -> None:
-        for name in ('width', 'step_s', 'max_pairs', 'reach', 'blur_px', 'saturation'):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f'residual.{name} is {getattr(self, name)}, must be positive')
-        if 0.0 not in self.lags_s:
-            raise ConfigError(f'residual.lags_s is {self.lags_s}, must contain 0')
+
+WHOLE_SEARCH = ResidualSearch()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,11 +88,11 @@ def measure_residual(
     robot: RobotModel,
     shapes: Sequence[LinkShape],
     joints: JointTrack,
-    config: ResidualConfig,
+    search: ResidualSearch = WHOLE_SEARCH,
 ) -> MotionResidual:
     """Compares the motion that joint states and calibration predict with the one in the images.
 
-    For pairs of frames `step_s` apart, each link's silhouettes at both times are drawn; where
+    For pairs of frames half a second apart, each link's silhouettes at both times are drawn; where
     they differ the image should have changed. The maps of all pairs are correlated with the
     images' differences over shifts, for each link on its own. Links count alike, so that one
     whose drawn shape is wrong does not decide; a calibration error moves all of them.
@@ -108,23 +103,23 @@ def measure_residual(
         robot: gives the links' poses.
         shapes: of the links.
         joints: measured positions.
-        config: how.
+        search: what is tried.
     """
     if camera.mount_link in moving_links(robot):
         return MotionResidual(reason=f"the camera moves with '{camera.mount_link}'")
-    pairs = _pairs(track.stamps_ns, joints, config)
+    pairs = _pairs(track.stamps_ns, joints, search.max_pairs)
     if len(pairs) == 0:
         return MotionResidual(
-            reason=f'no two frames {config.step_s:g} s apart with joint states and motion'
+            reason=f'no two frames {_STEP_S:g} s apart with joint states and motion'
         )
-    small = _shrunk(camera, config.width)
-    seen = _seen_motion(track, pairs, small, config)
+    small = shrunk(camera, _WIDTH)
+    seen = _seen_motion(track, pairs, small)
 
     def surface(
         part: slice, lag_s: float = 0.0, drawn_by: CameraModel = small
     ) -> FloatArray | None:
         stamps_ns = track.stamps_ns[pairs[part]].ravel() - round(lag_s * 1e9)
-        return _surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes, config)
+        return _surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes)
 
     now = surface(slice(None))
     if now is None:
@@ -132,30 +127,30 @@ def measure_residual(
     shift = _peak(now) * camera.width / small.width
     spread = float(now.std())
     third = slice(None, None, 3)
-    changes = {name: _top(surface(third, 0.0, c)) for name, c in _changes(small, config).items()}
+    changes = {name: _top(surface(third, 0.0, c)) for name, c in _changes(small, search).items()}
     gain = float(now.max()) - _top(surface(third))
     best = max(changes, key=changes.__getitem__, default='')
     return MotionResidual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
-        lag_s=_best_lag([(lag, surface(third, lag)) for lag in config.lags_s]),
+        lag_s=_best_lag([(lag, surface(third, lag)) for lag in search.lags_s]),
         best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
     )
 
 
-def _changes(camera: CameraModel, config: ResidualConfig) -> dict[str, CameraModel]:
+def _changes(camera: CameraModel, search: ResidualSearch) -> dict[str, CameraModel]:
     """Cameras that are rolled, or have another focal length, by name."""
     found = {}
-    for degrees in config.rolls_deg:
+    for degrees in search.rolls_deg:
         turn = np.eye(4)
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         turn[:2, :2] = [[c, -s], [s, c]]
         found[f'the camera rolled by {degrees:+g} degrees'] = replace(
             camera, T_mount_camera=camera.T_mount_camera @ turn
         )
-    for factor in config.zooms:
+    for factor in search.zooms:
         K = camera.K.copy()
         K[:2, :2] *= factor
         found[f'{factor:g} times the focal length'] = replace(camera, K=K)
@@ -166,34 +161,26 @@ def _top(surface: FloatArray | None) -> float:
     return -np.inf if surface is None else float(surface.max())
 
 
-def _shrunk(camera: CameraModel, width: int) -> CameraModel:
-    if camera.width <= width:
-        return camera
-    return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
-
-
-def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, config: ResidualConfig) -> np.ndarray:
+def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, count: int) -> np.ndarray:
     """(P, 2) indices of frames between which a joint moves."""
-    later = np.searchsorted(stamps_ns, stamps_ns + round(config.step_s * 1e9) - 1000)
+    later = np.searchsorted(stamps_ns, stamps_ns + round(_STEP_S * 1e9) - 1000)
     first = np.flatnonzero(later < len(stamps_ns))
     pairs = np.stack([first, later[first]], axis=-1)
     span = (stamps_ns[pairs[:, 1]] - stamps_ns[pairs[:, 0]]) * 1e-9
-    pairs = pairs[span < 2 * config.step_s]
+    pairs = pairs[span < 2 * _STEP_S]
     pairs = pairs[joints.covers(stamps_ns[pairs]).all(axis=1)] if len(pairs) else pairs
     if len(pairs) == 0:
         return pairs
     moved = np.abs(np.diff(joints.at(stamps_ns[pairs].ravel()).reshape(*pairs.shape, -1), axis=1))
     pairs = pairs[(moved[:, 0] > 1e-3).any(axis=1)]
-    chosen = np.linspace(0, len(pairs) - 1, min(config.max_pairs, len(pairs)))
+    chosen = np.linspace(0, len(pairs) - 1, min(count, len(pairs)))
     return pairs[np.unique(chosen.round().astype(int))]
 
 
-def _seen_motion(
-    track: Track, pairs: np.ndarray, small: CameraModel, config: ResidualConfig
-) -> list[FloatImage]:
+def _seen_motion(track: Track, pairs: np.ndarray, small: CameraModel) -> list[FloatImage]:
     """How much each pixel changed between the frames of a pair, 0 .. 1, NaN around the image."""
     grey = {int(i): _grey(track.frames[int(i)], small) for i in np.unique(pairs)}
-    return [_softened(np.abs(grey[int(j)] - grey[int(i)]), config) for i, j in pairs]
+    return [_softened(np.abs(grey[int(j)] - grey[int(i)])) for i, j in pairs]
 
 
 def _grey(frame: NDArray[np.uint8], small: CameraModel) -> FloatImage:
@@ -201,15 +188,15 @@ def _grey(frame: NDArray[np.uint8], small: CameraModel) -> FloatImage:
     return resized.astype(np.float32).mean(axis=-1)
 
 
-def _softened(change: FloatImage, config: ResidualConfig) -> FloatImage:
-    blurred = cv2.GaussianBlur(change, (0, 0), config.blur_px)
-    moving = np.minimum(blurred / np.float32(config.saturation), 1)
-    rim = _radius(change.shape[1], config)
+def _softened(change: FloatImage) -> FloatImage:
+    blurred = cv2.GaussianBlur(change, (0, 0), _BLUR_PX)
+    moving = np.minimum(blurred / np.float32(_SATURATION), 1)
+    rim = _radius(change.shape[1])
     return np.pad(moving, rim, constant_values=np.nan)
 
 
-def _radius(width: int, config: ResidualConfig) -> int:
-    return max(2, round(config.reach * width))
+def _radius(width: int) -> int:
+    return max(2, round(REACH * width))
 
 
 def _surface(
@@ -218,12 +205,11 @@ def _surface(
     small: CameraModel,
     robot: RobotModel,
     shapes: Sequence[LinkShape],
-    config: ResidualConfig,
 ) -> FloatArray | None:
     """(2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
-    radius = _radius(small.width, config)
+    radius = _radius(small.width)
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
     for link in dict.fromkeys(shape.link for shape in shapes):
         parts = [
@@ -231,14 +217,14 @@ def _surface(
             for part in shapes
             if part.link == link
         ]
-        surface, count = _correlate(seen, fill(parts, small), config, radius)
+        surface, count = _correlate(seen, fill(parts, small), radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
     return total / weights if weights else None
 
 
 def _correlate(
-    seen: Sequence[FloatImage], drawn: NDArray[np.uint8], config: ResidualConfig, radius: int
+    seen: Sequence[FloatImage], drawn: NDArray[np.uint8], radius: int
 ) -> tuple[FloatArray, int]:
     """One link's normalised correlation over shifts, and the pairs in which it moves.
 
@@ -252,7 +238,7 @@ def _correlate(
         differs = cv2.absdiff(before, after)
         if cv2.countNonZero(differs) < _LEAST_AREA_PX:
             continue
-        template, window = _cut(differs, change, radius, config.blur_px)
+        template, window = _cut(differs, change, radius)
         inside = np.isfinite(window).astype(np.float32)
         window = np.nan_to_num(window - np.nanmean(window))
         total += cv2.matchTemplate(window, template, cv2.TM_CCORR)
@@ -267,18 +253,15 @@ def _correlate(
 
 
 def _cut(
-    differs: NDArray[np.uint8] | cv2.typing.MatLike,
-    change: FloatImage,
-    radius: int,
-    blur_px: float,
+    differs: NDArray[np.uint8] | cv2.typing.MatLike, change: FloatImage, radius: int
 ) -> tuple[FloatImage, FloatImage]:
     """The drawn motion's surroundings, mean removed, and the window of `change` to search."""
-    rim = round(5 * blur_px)
+    rim = round(5 * _BLUR_PX)
     left, top, width, height = cv2.boundingRect(differs)
     right, bottom = left + width + rim, top + height + rim
     left, top = max(left - rim, 0), max(top - rim, 0)
     part = np.asarray(differs[top:bottom, left:right], np.float32)
-    template = cv2.GaussianBlur(part, (0, 0), blur_px)
+    template = cv2.GaussianBlur(part, (0, 0), _BLUR_PX)
     height, width = template.shape
     window = change[top : top + height + 2 * radius, left : left + width + 2 * radius]
     return _centred(template), window

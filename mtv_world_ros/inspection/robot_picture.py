@@ -9,6 +9,7 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import load_shape, project_part, RobotShape
+from mtv_world_ros.geometry.transforms import looking_along
 
 _SIZE, _FOCAL = 480, 520.0
 #: colours of x, y and z axes
@@ -65,12 +66,9 @@ def _camera(cloud: FloatArray, angle: float) -> CameraModel:
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.05)
     ahead = -np.array([np.cos(angle), np.sin(angle), 0.45])
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, (0, 0, 1.0))
-    right /= np.linalg.norm(right)
     T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    T[:3, 3] = centre - ahead * radius * 2.6
+    T[:3, :3] = looking_along(ahead)
+    T[:3, 3] = centre - T[:3, 2] * radius * 2.6
     K = np.array([[_FOCAL, 0, _SIZE / 2], [0, _FOCAL, _SIZE / 2], [0, 0, 1]])
     return CameraModel(
         view='picture', width=_SIZE, height=_SIZE, K=K, mount_link='', T_mount_camera=T

@@ -89,7 +89,7 @@ class PredictionWriter(BagWriter):
         )
         header = messages.make_header(stamp_ns, '')
         report = messages.make(DIAGNOSTICS, header=header, status=[status])
-        self._write(f'{NODE}/report', DIAGNOSTICS, stamp_ns, report)
+        self.write_message(f'{NODE}/report', DIAGNOSTICS, stamp_ns, report)
 
     def _write_frame(self, prediction: Prediction, index: int, stamp_ns: int) -> None:
         for number, camera in enumerate(prediction.start.cameras):
@@ -100,7 +100,7 @@ class PredictionWriter(BagWriter):
             self._write_jpeg(f'{base}/trajectory', camera, stamp_ns, control)
             self._write_labels(f'{base}/mask', camera, stamp_ns, prediction.masks, number, index)
         state = messages.make_joint_state(stamp_ns, self._joint_names, prediction.positions[index])
-        self._write(f'{NODE}/predicted/joint_states', messages.JOINT_STATE, stamp_ns, state)
+        self.write_message(f'{NODE}/predicted/joint_states', messages.JOINT_STATE, stamp_ns, state)
 
     def _write_jpeg(self, base: str, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
         frame_id = optical_frame(camera.view)
@@ -111,9 +111,9 @@ class PredictionWriter(BagWriter):
             data=np.frombuffer(messages.encode_jpeg(rgb, self._jpeg_quality), np.uint8),
         )
         topic = f'{base}/image_raw/compressed'
-        self._write(topic, messages.COMPRESSED_IMAGE, stamp_ns, image)
+        self.write_message(topic, messages.COMPRESSED_IMAGE, stamp_ns, image)
         info = messages.make_camera_info(stamp_ns, camera, frame_id)
-        self._write(f'{base}/camera_info', messages.CAMERA_INFO, stamp_ns, info)
+        self.write_message(f'{base}/camera_info', messages.CAMERA_INFO, stamp_ns, info)
 
     def _write_labels(
         self,
@@ -137,20 +137,17 @@ class PredictionWriter(BagWriter):
             step=camera.width,
             data=labels.ravel(),
         )
-        self._write(f'{base}/image_raw', messages.IMAGE, stamp_ns, image)
+        self.write_message(f'{base}/image_raw', messages.IMAGE, stamp_ns, image)
 
     def _write_estimate(self, prediction: Prediction, stamp_ns: int) -> None:
         success = prediction.success
         value = messages.make(FLOAT64, data=float(success.probability))
-        self._write(f'{NODE}/success', FLOAT64, stamp_ns, value)
+        self.write_message(f'{NODE}/success', FLOAT64, stamp_ns, value)
         labels = (
             f'view: {", ".join(prediction.video.views)}',
             f'object: {", ".join(prediction.masks.names)}',
         )
-        self._write(f'{NODE}/jaccard', ARRAY, stamp_ns, _array(success.jaccard, labels))
-
-    def _write(self, topic: str, msgtype: str, stamp_ns: int, message: object) -> None:
-        self.write_raw(topic, msgtype, stamp_ns, messages.serialize(msgtype, message))
+        self.write_message(f'{NODE}/jaccard', ARRAY, stamp_ns, _array(success.jaccard, labels))
 
 
 def _array(values: np.ndarray, labels: Sequence[str]) -> Any:

@@ -14,12 +14,10 @@ from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape, rods
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector, load_inspector
-from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualConfig
+from mtv_world_ros.inspection.inspect import Inspector, load_inspector
+from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualSearch
 
-QUICK = InspectionConfig(
-    residual=ResidualConfig(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
-)
+QUICK = ResidualSearch(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
 
 
 @pytest.fixture(scope='module')
@@ -79,7 +77,7 @@ def test_the_residual_says_where_the_moving_pixels_are(episode, inspector):
     measured = [
         measure_residual(
             e.images['low'], e.cameras['low'], inspector.robot, inspector.shape.parts,
-            JointTrack(e.joint_states, inspector.robot), QUICK.residual,
+            JointTrack(e.joint_states, inspector.robot), QUICK,
         ).shift_px
         for e in (episode, shifted_k(episode, 'low', 12, -7))
     ]  # fmt: skip
@@ -111,7 +109,7 @@ def test_an_inverted_pose_and_swapped_views_are_broken(episode, inspector):
 
 
 def test_late_images_are_found(episode, inspector):
-    lags = replace(QUICK, residual=ResidualConfig(lags_s=(0.0, 0.1, 0.2), rolls_deg=(), zooms=()))
+    lags = ResidualSearch(lags_s=(0.0, 0.1, 0.2), rolls_deg=(), zooms=())
     inspector = Inspector(inspector.robot, inspector.shape, lags)
     track = episode.images['low']
     late = {'low': track._replace(stamps_ns=track.stamps_ns + 200_000_000)}

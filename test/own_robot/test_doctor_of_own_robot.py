@@ -10,10 +10,10 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.robot_shape import load_shape, moving_links
-from mtv_world_ros.inspection.inspect import InspectionConfig, Inspector
-from mtv_world_ros.inspection.motion_residual import ResidualConfig
+from mtv_world_ros.inspection.inspect import Inspector
+from mtv_world_ros.inspection.motion_residual import ResidualSearch
 
-CONFIG = InspectionConfig(residual=ResidualConfig(max_pairs=20, lags_s=(0.0,)))
+SEARCH = ResidualSearch(max_pairs=20, lags_s=(0.0,))
 
 
 @pytest.fixture(scope='module')
@@ -41,7 +41,7 @@ def test_a_camera_of_the_root_link_is_compared_with_the_images(recorded, tmp_pat
     robot, path = recorded
     assert doctor(robot, path, tmp_path, '--views', 'door') == 0, capsys.readouterr().out
     episode = read_episode(path, views=['door'], with_masks=False)
-    inspector = Inspector(robot, load_shape(robot), CONFIG)
+    inspector = Inspector(robot, load_shape(robot), SEARCH)
     wrong = {
         'rolled': tilted(episode.cameras['door'], 10, 2),
         'zoomed': replace(

@@ -137,6 +137,10 @@ class BagWriter:
             self._last_ns = max(stamp_ns, self._last_ns)
             self._store(self._file.flush)
 
+    def write_message(self, topic: str, msgtype: str, stamp_ns: int, message: object) -> None:
+        """Records a message of `messages.make`; see `write_raw`."""
+        self.write_raw(topic, msgtype, stamp_ns, messages.serialize(msgtype, message))
+
     def flush(self) -> None:
         """Hands what was recorded to the operating system: a kill loses nothing of it.
 

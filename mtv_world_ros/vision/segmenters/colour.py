@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.vision.colour_words import colour_of, PALETTE
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import (
@@ -22,34 +20,16 @@ from mtv_world_ros.vision.segmenters.tracking import (
 )
 
 Floats = NDArray[np.floating]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ColourSegmenterConfig:
-    """Gates of the colour segmenter; saturation is CIELAB chroma / (lightness + 16).
-
-    That ratio keeps its value when a surface is shaded.
-
-    Attributes:
-        max_hue_error: largest distance to the colour word's hue [degrees]; hues nearer to
-            another word are that word's.
-        min_saturation: share of the palette colour's saturation below which nothing is found.
-        edge_range: shares of the object's own saturation between which its edge may lie.
-        min_lightness: darker pixels have no hue [0-100].
-        tracking: from pixels to one mask per frame.
-    """
-
-    max_hue_error: float = 28.0
-    min_saturation: float = 0.3
-    edge_range: tuple[float, float] = (0.25, 0.6)
-    min_lightness: float = 8.0
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.max_hue_error <= 90:
-            raise ConfigError(f'max_hue_error is {self.max_hue_error}; it must lie in [1, 90]')
-        if not 0 <= self.min_saturation <= 1:
-            raise ConfigError(f'min_saturation is {self.min_saturation}; it must lie in [0, 1]')
+# Saturation is CIELAB chroma / (lightness + 16): it keeps its value when a surface is shaded.
+#: largest distance to the colour word's hue [degrees]; hues nearer to another word are that word's
+_MAX_HUE_ERROR = 28.0
+#: share of the palette colour's saturation below which nothing is found
+_MIN_SATURATION = 0.3
+#: shares of the object's own saturation between which its edge may lie
+_EDGE_RANGE = (0.25, 0.6)
+#: darker pixels have no hue [0-100]
+_MIN_LIGHTNESS = 8.0
+_TRACKING = TrackingConfig()
 
 
 class ColourSegmenter:
@@ -62,12 +42,11 @@ class ColourSegmenter:
 
     name = 'colour'
 
-    def __init__(self, config: ColourSegmenterConfig | None = None) -> None:
-        self.config = config or ColourSegmenterConfig()
+    def __init__(self) -> None:
         self._words = tuple(PALETTE)
         colours = _lab(np.array([list(PALETTE.values())], np.uint8))[0]
         self._saturations = _saturation(colours)
-        self._word_of_ab = _hue_table(colours, self.config.max_hue_error)
+        self._word_of_ab = _hue_table(colours)
 
     def segment(
         self,
@@ -97,7 +76,7 @@ class ColourSegmenter:
         lab = cv2.cvtColor(frames.reshape(num_frames * height, width, 3), cv2.COLOR_RGB2LAB)
         lab = np.asarray(lab, np.uint8).reshape(frames.shape)
         words = self._word_of_ab[lab[..., 1], lab[..., 2]]
-        words[lab[..., 0] < self.config.min_lightness * 2.55] = len(self._words)
+        words[lab[..., 0] < _MIN_LIGHTNESS * 2.55] = len(self._words)
         tracks: list[Track] = []
         for index, name in enumerate(names):
             word = colour_of(name)
@@ -110,7 +89,7 @@ class ColourSegmenter:
             first = None if firsts is None or not firsts[index].any() else firsts[index]
             others = _others(tracks, rivals, index)
             pixels = self._pixels(frames, lab, words == self._words.index(word), word)
-            found = track(pixels, first, self.config.tracking, taken=others)
+            found = track(pixels, first, _TRACKING, taken=others)
             if rivals and first is None and found.status == 'ok':
                 found = Track(masks=found.masks, status='ambiguous')
             tracks.append(found)
@@ -135,24 +114,24 @@ class ColourSegmenter:
         pixels = self._pixels(frames, lab, words == self._words.index(word), word)
         others = [track.masks for i, track in enumerate(tracks) if i != index]
         first = None if firsts is None else firsts[index]
-        return with_part(tracks[index], pixels, others, first, self.config.tracking)
+        return with_part(tracks[index], pixels, others, first, _TRACKING)
 
     def _pixels(self, frames: ByteArray, lab: ByteArray, gate: BoolArray, word: str) -> BoolArray:
         """(T, H, W) pixels of a colour, down to where the object makes up half of a pixel."""
-        floor = self.config.min_saturation * self._saturations[self._words.index(word)]
+        floor = _MIN_SATURATION * self._saturations[self._words.index(word)]
         inside = np.flatnonzero(gate)
         saturation = _saturation(_centred(lab.reshape(-1, 3)[inside]))
-        num_core = len(gate) * max(1, self.config.tracking.min_area(gate.shape) // 2)
+        num_core = len(gate) * max(1, _TRACKING.min_area(gate.shape) // 2)
         pixels = np.zeros(gate.shape, np.bool_)
         if np.count_nonzero(saturation > floor) > num_core:
             core = np.partition(saturation, -num_core)[-num_core]
             colour = np.median(frames.reshape(-1, 3)[inside[saturation > 0.8 * core]], axis=0)
-            floor = max(floor, _edge(colour, frames, core, self.config.edge_range))
+            floor = max(floor, _edge(colour, frames, core))
         pixels.reshape(-1)[inside[saturation > floor]] = True
         return pixels
 
 
-def _edge(colour: Floats, frames: ByteArray, core: float, limits: tuple[float, float]) -> float:
+def _edge(colour: Floats, frames: ByteArray, core: float) -> float:
     """Saturation of a pixel that is half object, half background.
 
     A dark object's edge pixels look pale beside it, a light one's do not.
@@ -160,7 +139,7 @@ def _edge(colour: Floats, frames: ByteArray, core: float, limits: tuple[float, f
     background = np.median(frames[:, ::4, ::4].reshape(-1, 3), axis=0)
     mixed = np.round((colour + background) / 2).astype(np.uint8)
     edge = float(_saturation(_lab(mixed[None, None]))[0, 0])
-    return min(max(edge, limits[0] * core), limits[1] * core)
+    return min(max(edge, _EDGE_RANGE[0] * core), _EDGE_RANGE[1] * core)
 
 
 def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolArray | None:
@@ -186,12 +165,12 @@ def _saturation(lab: Floats) -> Floats:
     return np.hypot(lab[..., 1], lab[..., 2]) / (lab[..., 0] + 16)
 
 
-def _hue_table(colours: Floats, max_error: float) -> ByteArray:
+def _hue_table(colours: Floats) -> ByteArray:
     """(256, 256) index of the palette word nearest in hue for each 8-bit a, b; N = none."""
     a, b = np.meshgrid(np.arange(256) - 128, np.arange(256) - 128, indexing='ij')
     hues = np.degrees(np.arctan2(colours[:, 2], colours[:, 1]))
     error = np.degrees(np.arctan2(b, a))[..., None] - hues
     error = np.abs((error + 180) % 360 - 180)
     word = error.argmin(-1)
-    word[error.min(-1) > max_error] = len(colours)
+    word[error.min(-1) > _MAX_HUE_ERROR] = len(colours)
     return word.astype(np.uint8)

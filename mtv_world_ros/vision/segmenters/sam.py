@@ -29,6 +29,19 @@ from mtv_world_ros.vision.segmenters.weights import (
 _BOX_LABELS = (2, 3)
 
 
+def _session(kind: Any, height: int, width: int, device: str) -> Any:
+    import torch
+
+    return kind(
+        video_height=height,
+        video_width=width,
+        inference_device=device,
+        inference_state_device=device,
+        video_storage_device=device,
+        dtype=torch.float32,
+    )
+
+
 class Sam2Video:
     """`Sam2VideoModel` frame by frame; a `SamVideo`."""
 
@@ -40,17 +53,9 @@ class Sam2Video:
 
     def open_session(self, height: int, width: int) -> Any:
         """See `SamVideo.open_session`."""
-        import torch
         from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
-        return Sam2VideoInferenceSession(
-            video_height=height,
-            video_width=width,
-            inference_device=self.device,
-            inference_state_device=self.device,
-            video_storage_device=self.device,
-            dtype=torch.float32,
-        )
+        return _session(Sam2VideoInferenceSession, height, width, self.device)
 
     def advance(self, session: Any, frame: ByteArray, index: int) -> Any:
         """See `SamVideo.advance`."""
@@ -146,17 +151,10 @@ class Sam3Video:
 
     def open_session(self, height: int, width: int) -> Any:
         """See `SamVideo.open_session`."""
-        import torch
         from transformers.models.sam3_tracker_video import modeling_sam3_tracker_video as module
 
-        return module.Sam3TrackerVideoInferenceSession(
-            video_height=height,
-            video_width=width,
-            inference_device=self.device,
-            inference_state_device=self.device,
-            video_storage_device=self.device,
-            dtype=torch.float32,
-        )
+        kind = module.Sam3TrackerVideoInferenceSession
+        return _session(kind, height, width, self.device)
 
     def advance(self, session: Any, frame: ByteArray, index: int) -> Any:
         """See `SamVideo.advance`."""

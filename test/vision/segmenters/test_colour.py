@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ConfigError, ObservationError
+from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.vision.colour_words import PALETTE
 from mtv_world_ros.vision.jaccard import jaccard
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, ColourSegmenterConfig
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from mtv_world_ros.vision.segmenters.segmenter import keep_doubts, masks_from_ids, resize_masks
 
 HEIGHT, WIDTH = 72, 96
@@ -256,11 +256,6 @@ def test_two_views_of_17_frames_take_less_than_50_ms():
         segment(frames, 'red block', 'blue block')
         times.append(time.process_time() - start)
     assert min(times) < 0.05
-
-
-def test_config_out_of_range_names_the_field():
-    with pytest.raises(ConfigError, match='max_hue_error is 200'):
-        ColourSegmenterConfig(max_hue_error=200)
 
 
 def test_identity_image_gives_masks_in_the_order_asked_for():
