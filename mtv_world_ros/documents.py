@@ -120,9 +120,14 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters['number'] = number
+    environment.filters['counted'] = _counted
     environment.filters['data_uri'] = _data_uri
     environment.globals['style'] = (folder / 'style.css').read_text(encoding='utf-8')
     return environment
+
+
+def _counted(count: int, noun: str) -> str:
+    return f'{count} {noun}{"" if count == 1 else "s"}'
 
 
 def _data_uri(data: bytes, kind: str) -> str:

@@ -13,7 +13,7 @@ from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.documents import Table
+from mtv_world_ros.documents import render, Table
 from mtv_world_ros.sim.collect.contact_sheet import SHEET_FILE
 from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, write_file, ZERO_SHOT_SET
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig, plain_config
@@ -36,17 +36,9 @@ KEYS = {
 }
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    return Table(head=head, rows=rows).markdown(aligned=False)
-
-
-def _number(count: int, noun: str) -> str:
-    return f'{count} {noun}{"" if count == 1 else "s"}'
-
-
 def _counts(
     first: str, groups: Mapping[str, Mapping[str, Any]], *, is_filtered: bool = True
-) -> str:
+) -> Table:
     head = (first, 'episodes', 'success', 'failure', 'expert success before filtering', 'length')
     rows = []
     for name, counts in groups.items():
@@ -58,7 +50,7 @@ def _counts(
                 f'{counts["mean_duration_s"]:.1f} s, {counts["mean_frames"]:.0f} frames',
             )
         )  # fmt: skip
-    return _table(head, rows)
+    return Table(head=head, rows=rows)
 
 
 def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[str]:
@@ -112,8 +104,8 @@ def _robot(config: Mapping[str, Any]) -> str:
     return config.get('robot', CollectConfig().robot)
 
 
-def _other_configuration(config: Mapping[str, Any]) -> str:
-    """A line where a command alone does not make the set again."""
+def _is_usual(config: Mapping[str, Any]) -> bool:
+    """Whether a command alone makes the set again."""
     usual = plain_config(CollectConfig(robot=_robot(config)))
     for key in ('moved_share', 'policies', 'kinds', 'siblings'):
         usual |= {key: config[key]} if key in config else {}
@@ -121,15 +113,10 @@ def _other_configuration(config: Mapping[str, Any]) -> str:
         usual['record'][key] = config['record'][key]
     for side in ('width', 'height'):
         usual['randomization'][side] = config['randomization'][side]
-    if config == usual:
-        return ''
-    return (
-        '\nThe set was made from Python (`mtv_world_ros.sim.collect`) with a configuration of its '
-        'own: `config` in `dataset.json`.\n'
-    )
+    return config == usual
 
 
-def _cameras(cameras: Mapping[str, CameraModel], config: Mapping[str, Any]) -> str:
+def _cameras(cameras: Mapping[str, CameraModel]) -> Table:
     rows = []
     for view, camera in cameras.items():
         place = ', '.join(f'{value:.2f}' for value in camera.T_mount_camera[:3, 3])
@@ -139,27 +126,18 @@ def _cameras(cameras: Mapping[str, CameraModel], config: Mapping[str, Any]) -> s
             (view, f'{camera.width} x {camera.height} px', f'{camera.K[0, 0]:.0f} px',
              f'({place}) m', f'{down:.0f} deg')
         )  # fmt: skip
-    jitter, share = config['randomization']['jitter'], config['moved_share']
-    moved = (
-        f' In {100 * share:.0f} % of the episodes all cameras stand elsewhere.' if share else ''
-    )
-    return (
-        _table(('view', 'image', 'focal length', 'position', 'looking down'), rows)
-        + f'\n\nOf the first episode; every episode moves target (+-{jitter["target_m"]} m), '
-        f'distance (+-{jitter["distance_m"]} m) and angles (+-{jitter["angle_deg"]} deg). Exact '
-        "intrinsics are on `camera_info`, poses in each episode's `calibration.yaml`." + moved
-    )
+    return Table(head=('view', 'image', 'focal length', 'position', 'looking down'), rows=rows)
 
 
-def _topics(path: Path) -> tuple[str, dict[str, str]]:
+def _topics(path: Path) -> tuple[Table, dict[str, str]]:
     """Topics of a written episode, and its metadata record."""
     bag = BagReader(path)
     found = Counter((message.topic, message.msgtype) for message in bag.messages())
     rows = [(f'`{topic}`', f'`{kind}`', count) for (topic, kind), count in sorted(found.items())]
-    return _table(('topic', 'type', 'messages'), rows), bag.metadata[METADATA_NAME]
+    return Table(head=('topic', 'type', 'messages'), rows=rows), bag.metadata[METADATA_NAME]
 
 
-def _objects(entries: Iterable[EpisodeEntry]) -> str:
+def _objects(entries: Iterable[EpisodeEntry]) -> Table:
     """Nouns and colours of all objects, by how often they occur."""
     nouns: Counter[str] = Counter()
     colours: dict[str, set[str]] = {}
@@ -171,58 +149,7 @@ def _objects(entries: Iterable[EpisodeEntry]) -> str:
     # by number, then by name: episodes may have been finished in any order
     listed = sorted(nouns.items(), key=lambda item: (-item[1], item[0]))
     rows = [(noun, count, ', '.join(sorted(colours[noun]))) for noun, count in listed]
-    return _table(('object', 'times', 'colours'), rows)
-
-
-def _splits(card: Mapping[str, Any]) -> str:
-    if card['kind'] == ZERO_SHOT_SET:
-        return (
-            'All episodes are for testing (`test`).\n\n'
-            + _counts('zero-shot set', card['zero_shot'])
-            + '\n\n`view`: the tasks from new camera positions and orientations; `task`: an '
-            'unseen task, random pick-and-place; `object`: half of the movable objects are of '
-            'shapes that no task uses.'
-        )
-    train, test = (len(card['splits'][split]) for split in ('train', 'test'))
-    return (
-        f'{train} train, {test} test: by the parity of the index within the task, so 5:5'
-        f'{_misses(card)}. Zero-shot sets are made on their own '
-        '(`mtv-world collect --zero-shot view,task,object`).'
-    )
-
-
-def _misses(card: Mapping[str, Any]) -> str:
-    return '' if card['config']['policies'] else '; two misses in ten, one of either parity'
-
-
-def _arms(config: Mapping[str, Any]) -> str:
-    return f'The robot `{config["robot"]}`' if 'robot' in config else 'Two YAM arms'
-
-
-def _who(card: Mapping[str, Any]) -> str:
-    policies = card['config']['policies']
-    if not policies:
-        return 'a scripted expert'
-    return f'scripted policies that take turns: {", ".join(f"`{name}`" for name in policies)}'
-
-
-def _how(card: Mapping[str, Any]) -> str:
-    if card['config']['policies']:
-        return 'their faults were too large'
-    return 'a grasp misses and the motion goes on'
-
-
-def _filtering(card: Mapping[str, Any]) -> str:
-    if card['config']['policies']:
-        return (
-            'Successes and failures are kept alike; a scene that cannot be built, or in which the '
-            'policy finds no plan, is dropped and the next seed is tried.'
-        )
-    return (
-        "An expert's attempt that fails is dropped and the next seed is tried, scenes that cannot "
-        'be built\nincluded; "before filtering" is the share of attempts that succeeded, of the '
-        'episodes that were to\nsucceed.'
-    )
+    return Table(head=('object', 'times', 'colours'), rows=rows)
 
 
 def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> str:
@@ -235,61 +162,28 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
     """
     first = out / min(entry.name for entry in entries)
     topics, metadata = _topics(first)
-    what = 'Zero-shot set' if card['kind'] == ZERO_SHOT_SET else 'Simulated benchmark'
-    outcomes = Counter(entry.outcome for entry in entries)
-    keys = _table(
-        ('key', 'meaning', 'first episode'),
-        [(f'`{key}`', KEYS.get(key, ''), f'`{text}`') for key, text in metadata.items()],
+    keys = [(f'`{key}`', KEYS.get(key, ''), f'`{text}`') for key, text in metadata.items()]
+    config, is_zero_shot = card['config'], card['kind'] == ZERO_SHOT_SET
+    return render(
+        'dataset.md.j2',
+        is_zero_shot=is_zero_shot,
+        config=config,
+        is_usual=_is_usual(config),
+        num_episodes=len(entries),
+        num_tasks=len(card['tasks']),
+        outcomes=Counter(entry.outcome for entry in entries),
+        sheet=SHEET_FILE,
+        commands=commands(card, entries),
+        tasks=_counts('task', card['tasks'], is_filtered=not config['policies']),
+        zero_shot=_counts('zero-shot set', card['zero_shot']) if is_zero_shot else None,
+        splits=card['splits'],
+        cameras=_cameras(read_episode(first, with_masks=False).cameras),
+        objects=_objects(entries),
+        first=first.name,
+        topics=topics,
+        metadata_name=METADATA_NAME,
+        keys=Table(head=('key', 'meaning', 'first episode'), rows=keys),
     )
-    again = '\n'.join(commands(card, entries))
-    size = f'{_number(len(entries), "episode")} of {_number(len(card["tasks"]), "task")}'
-    return f"""# {what}: {size}
-
-{_arms(card['config'])} in MuJoCo and {_who(card)}. {_number(outcomes['success'], 'episode')} with
-success; in the other {outcomes['failure']} {_how(card)}. Each episode
-is a rosbag2 MCAP folder like a robot's recording; `dataset.json` says the same, and more, as data.
-
-![a success and a failure of every task]({SHEET_FILE})
-
-## Make it again
-
-```
-{again}
-```
-
-The same command gives the same episodes, whatever `--workers` is; an interrupted one goes on
-where it stopped.
-{_other_configuration(card['config'])}
-## Tasks
-
-{_counts('task', card['tasks'], is_filtered=not card['config']['policies'])}
-
-{_filtering(card)}
-
-## Splits
-
-{_splits(card)}
-
-## Cameras
-
-{_cameras(read_episode(first, with_masks=False).cameras, card['config'])}
-
-## Objects
-
-{_objects(entries)}
-
-## Topics
-
-Of `{first.name}`; log times are the headers' stamps.
-
-{topics}
-
-## Metadata
-
-MCAP metadata record `{METADATA_NAME}`, also `custom_data` in `metadata.yaml`:
-
-{keys}
-"""
 
 
 def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> None:
