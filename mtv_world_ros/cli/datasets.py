@@ -78,6 +78,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.files import write_whole
+    from mtv_world_ros.geometry.robot_file import ROBOT_YAML
     from mtv_world_ros.importing.bags import find_bags, import_bags, with_guessed_views
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
@@ -104,7 +105,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for bag, reason in summary.failed.items():
         print(f'{bag}: {reason}', file=sys.stderr)
-    print(f'robot: {summary.robot}')
+    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
     return 1 if summary.failed else 0
 
 

@@ -1,1 +1,1 @@
-"""Public datasets become episodes: LeRobot v2.0, v2.1 and v3.0, with a mapping to the robot."""
+"""Import of LeRobot datasets and of a robot's own bags as episodes; export to LeRobot."""

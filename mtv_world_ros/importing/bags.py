@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-import hashlib
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -16,12 +14,11 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
 from mtv_world_ros.data.episode import Episode
-from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import (
     EpisodeError,
-    MtvWorldError,
     RobotError,
     TrajectoryError,
 )
@@ -30,29 +27,11 @@ from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML, save_robot
 from mtv_world_ros.geometry.robot_guess import guess_robot
-from mtv_world_ros.importing.convert import MAPPING_KEY
+from mtv_world_ros.importing.convert import import_each, ImportSummary, MAPPING_KEY
+from mtv_world_ros.importing.mapping import digest_of
 
 #: a command this many times faster than the joint's limit is a jump
 _JUMP = 2.0
-
-
-@dataclass(slots=True, kw_only=True)
-class BagSummary:
-    """What became of the bags, by their paths.
-
-    Attributes:
-        robot: the robot's file.
-        made: episodes written now.
-        kept: episodes that were there already.
-        failed: why.
-        warnings: what was odd and how it was handled.
-    """
-
-    robot: Path
-    made: list[Path] = field(default_factory=list)
-    kept: list[Path] = field(default_factory=list)
-    failed: dict[Path, str] = field(default_factory=dict)
-    warnings: dict[Path, tuple[str, ...]] = field(default_factory=dict)
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
@@ -132,7 +111,7 @@ def import_bags(
     *,
     calibration: Path | None = None,
     progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
-) -> BagSummary:
+) -> ImportSummary[Path]:
     """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
 
     Args:
@@ -150,39 +129,16 @@ def import_bags(
     inside = out / 'robot'
     if robot_file.parent.resolve() != inside.resolve():
         save_robot(robot_file, inside)
-    summary = BagSummary(robot=inside / ROBOT_YAML)
-    key = _key(mapping, robot_file, calibration)
-    for bag in progress(bags):
-        path = out / _name(bag)
-        try:
-            if path.exists():
-                _check_made_with(path, key)
-                summary.kept.append(path)
-                continue
-            summary.warnings[bag] = convert_bag(bag, path, mapping, robot, calibration, key)
-            summary.made.append(path)
-        except MtvWorldError as error:
-            summary.failed[bag] = str(error)
-    return summary
+    key = digest_of(robot_file, calibration, start=mapping.model_dump_json().encode())
+
+    def convert(bag: Path, path: Path) -> tuple[str, ...]:
+        return convert_bag(bag, path, mapping, robot, calibration, key)
+
+    return import_each(progress(bags), key, lambda bag: out / _name(bag), convert)
 
 
 def _name(bag: Path) -> str:
     return bag.name.split('.')[0] if bag.is_file() else bag.name
-
-
-def _key(mapping: BagMapping, *files: Path | None) -> str:
-    digest = hashlib.sha256(mapping.model_dump_json().encode())
-    for file in files:
-        digest.update(b'' if file is None else file.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _check_made_with(path: Path, key: str) -> None:
-    if read_info(path).metadata.get(MAPPING_KEY, '') != key:
-        raise EpisodeError(
-            f"'{path}' was imported with another mapping, calibration or robot; remove it or "
-            'choose another --out'
-        )
 
 
 def convert_bag(
@@ -193,7 +149,7 @@ def convert_bag(
     calibration: Path | None,
     key: str = '',
 ) -> tuple[str, ...]:
-    """Writes a bag as an episode; nothing is there before it is complete.
+    """Writes a bag as an episode, whose folder appears when it is complete.
 
     Returns:
         What was odd and how it was handled.
@@ -291,7 +247,7 @@ def _in_order(
     commands: Sequence[tuple[int, JointTrajectory]],
     mapping: BagMapping,
 ) -> list[Callable[[], Any]]:
-    """What is to be written, by stamp."""
+    """Returns the write calls, sorted by stamp."""
     entries: list[tuple[int, int, Callable[[], Any]]] = []
 
     def add(stamp: int, rank: int, write: Callable[..., Any], *values: Any) -> None:

@@ -1,4 +1,4 @@
-"""Where a view's images and calibration are from: a calibration file, JSON, or features."""
+"""Sources of a view's images and calibration: a calibration file, JSON, or features."""
 
 from __future__ import annotations
 

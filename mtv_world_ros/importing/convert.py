@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -24,19 +24,54 @@ from mtv_world_ros.importing.mapping import DatasetMapping, load_mapping, Stream
 Item = TypeVar('Item')
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ImportSummary:
-    """What became of the episodes.
+@dataclass(slots=True)
+class ImportSummary(Generic[Item]):
+    """Outcome of an import, by the number of the episode or by bag.
 
     Attributes:
-        made: numbers of those converted now.
-        kept: of those that were there already.
-        failed: why, by number.
+        made: converted now.
+        kept: were there already.
+        failed: why.
+        warnings: what was odd and how it was handled.
     """
 
-    made: tuple[int, ...]
-    kept: tuple[int, ...]
-    failed: dict[int, str]
+    made: list[Item] = field(default_factory=list)
+    kept: list[Item] = field(default_factory=list)
+    failed: dict[Item, str] = field(default_factory=dict)
+    warnings: dict[Item, tuple[str, ...]] = field(default_factory=dict)
+
+
+def import_each(
+    items: Iterable[Item],
+    key: str,
+    place: Callable[[Item], Path],
+    convert: Callable[[Item, Path], tuple[str, ...]],
+) -> ImportSummary[Item]:
+    """Converts what is not there yet.
+
+    Args:
+        items: e.g. numbers of a data set's episodes.
+        key: of mapping, robot and calibration; an episode that was made with others is an error.
+        place: the folder of an item's episode.
+        convert: writes the folder; returns what was odd and how it was handled.
+    """
+    summary = ImportSummary[Item]()
+    for item in items:
+        path = place(item)
+        try:
+            if not path.exists():
+                summary.warnings[item] = convert(item, path)
+                summary.made.append(item)
+            elif read_info(path).metadata.get(MAPPING_KEY, '') == key:
+                summary.kept.append(item)
+            else:
+                raise EpisodeError(
+                    f"'{path}' was imported with another mapping, calibration or robot; remove "
+                    'it or choose another --out'
+                )
+        except MtvWorldError as error:
+            summary.failed[item] = str(error)
+    return summary
 
 
 def import_dataset(
@@ -46,7 +81,7 @@ def import_dataset(
     *,
     episodes: Sequence[int] | None = None,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
-) -> ImportSummary:
+) -> ImportSummary[int]:
     """Converts a LeRobot dataset into episodes `out/episode_<number>`.
 
     Args:
@@ -69,22 +104,18 @@ def import_dataset(
             f"'{dataset}' has no episode {unknown[0]}; it has {len(known)}, from "
             f'{known[0] if known else "-"} to {known[-1] if known else "-"}'
         )
-    made, kept, failed = [], [], {}
-    for number in progress(wanted):
-        path = out / f'episode_{number:06d}'
-        try:
-            if _is_there(path, chosen):
-                kept.append(number)
-            else:
-                convert_episode(source, source.episodes[number], chosen, path)
-                made.append(number)
-        except MtvWorldError as error:
-            failed[number] = str(error)
-    return ImportSummary(made=tuple(made), kept=tuple(kept), failed=failed)
+
+    def convert(number: int, path: Path) -> tuple[str, ...]:
+        convert_episode(source, source.episodes[number], chosen, path)
+        return ()
+
+    return import_each(
+        progress(wanted), chosen.key, lambda number: out / f'episode_{number:06d}', convert
+    )
 
 
 def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
-    """Finds a wrong name at once, not once an episode."""
+    """Checks the names of features before the first episode is read."""
     streams = [chosen.state, *([chosen.action] if chosen.action else [])]
     for stream in streams:
         source.feature(stream.feature)
@@ -96,18 +127,6 @@ def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
             source.feature(name)
 
 
-def _is_there(path: Path, chosen: DatasetMapping) -> bool:
-    if not path.exists():
-        return False
-    made_with = read_info(path).metadata.get(MAPPING_KEY, '')
-    if made_with != chosen.key:
-        raise EpisodeError(
-            f"'{path}' was imported with another mapping, calibration or robot; remove it or "
-            'choose another --out'
-        )
-    return True
-
-
 #: datasets have no date: episodes start at this stamp (0 would mean "not stamped") [ns]
 START_NS = 1_000_000_000
 MAPPING_KEY = 'import_mapping'
@@ -116,7 +135,7 @@ MAPPING_KEY = 'import_mapping'
 def convert_episode(
     dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping, out: Path
 ) -> None:
-    """Writes the episode as the folder `out`; nothing is there before it is complete.
+    """Writes the episode's folder `out`, which appears when it is complete.
 
     Row k has the state and the images of its time; its action is the target that is reached
     `delay_frames` later. Times are the dataset's own.
@@ -221,7 +240,7 @@ def _cameras(
 def _instructions(
     dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
 ) -> list[str]:
-    """What the robot is told at each row."""
+    """The instruction at each row."""
     numbers = rows['task_index'].ravel().astype(int)
     if mapping.instruction:
         return [mapping.instruction] * len(numbers)

@@ -29,7 +29,7 @@ _TIME_TOLERANCE = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoPart:
-    """Where an episode's frames lie: a file, and the time in it at which the episode starts."""
+    """A video file with an episode's frames, and the time at which the episode starts in it."""
 
     file: Path
     start_s: float

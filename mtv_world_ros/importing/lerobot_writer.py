@@ -356,7 +356,7 @@ def _write_video(path: Path, frames: ByteArray, fps: int) -> None:
 
 
 def _statistics(values: np.ndarray, name: str) -> dict[str, Any]:
-    """What normalization needs, of (N, C) values; images have (C, 1, 1) in [0, 1]."""
+    """Statistics for normalisation of (N, C) values; those of images are (C, 1, 1) in [0, 1]."""
     values = values.astype(np.float64)
     found = {
         'min': values.min(0), 'max': values.max(0), 'mean': values.mean(0), 'std': values.std(0),

@@ -1,4 +1,4 @@
-"""The mapping file: what of a dataset is which view, joint and camera."""
+"""The mapping file: which features of a dataset are which view, joint and camera."""
 
 from __future__ import annotations
 
@@ -108,13 +108,13 @@ def load_mapping(path: Path) -> DatasetMapping:
     context: dict[str, Any] = {'folder': path.parent}
     mapping = validated(DatasetMapping, values, str(path), context=context)
     calibrations = [source.calibration for source in mapping.views.values()]
-    mapping._key = _digest([path, context['robot_file'], *calibrations])
+    mapping._key = digest_of(path, context['robot_file'], *calibrations)
     return mapping
 
 
-def _digest(files: list[Path | None]) -> str:
-    digest = hashlib.sha256()
+def digest_of(*files: Path | None, start: bytes = b'') -> str:
+    """Returns a key that changes with the contents of the files."""
+    digest = hashlib.sha256(start)
     for file in files:
-        if file is not None:
-            digest.update(file.read_bytes())
+        digest.update(b'' if file is None else file.read_bytes())
     return digest.hexdigest()[:16]

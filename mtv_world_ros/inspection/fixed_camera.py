@@ -1,4 +1,4 @@
-"""Pose of a camera that stands still, from how the robot moves through its pictures.
+"""Estimates the pose of a fixed camera from the motion of the robot in its images.
 
 Between two frames the picture changes where the robot was and where it is. The robot's
 silhouettes, drawn by joint states and a pose, say where that should be; the pose is the one at
@@ -299,7 +299,7 @@ class FixedCamera:
 def _looking(
     centre: FloatArray, away: float, reach: float, generator: np.random.Generator
 ) -> FloatArray:
-    """A camera somewhere around a point, not below it, that looks near it, upright."""
+    """A random upright camera around and above a point that looks near it."""
     turn, up = generator.uniform(0, 2 * np.pi), np.arcsin(generator.uniform(-0.15, 0.98))
     ahead = -np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     T = np.eye(4)
@@ -310,7 +310,7 @@ def _looking(
 
 
 def _sample(points: FloatArray, count: int = 12) -> FloatArray:
-    """(count, 3) points in a convex part: some of its corners, drawn towards the middle."""
+    """(count, 3) points inside a convex part: some of its corners, moved towards its centre."""
     chosen = points[np.linspace(0, len(points) - 1, count).astype(int)]
     shares = np.linspace(0.2, 0.9, count)[:, None]
     return points.mean(axis=0) + shares * (chosen - points.mean(axis=0))

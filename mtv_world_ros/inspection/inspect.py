@@ -278,7 +278,7 @@ def tool_visibility(
 def check_visibility(
     camera: CameraModel, robot: RobotModel, positions: FloatArray
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Shares of tool points behind the camera and off the image, and what they mean."""
+    """Shares of tool points behind the camera and outside the image, and findings from them."""
     seen = tool_visibility(camera, robot, positions)
     measures = {
         f"tool '{tool.arm}'": f'{seen.behind[i]:.0%} behind the camera, '
@@ -338,7 +338,7 @@ def overlay_picture(
     shapes: Sequence[LinkShape],
     joints: JointTrack,
 ) -> ByteArray:
-    """Returns (H, W, 3) RGB: frames of a view with what the calibration draws into them.
+    """Returns (H, W, 3) RGB: frames of a view with the projected robot drawn over them.
 
     Per arm the fading trail of the last seconds and a cross at the tool point; white the outline
     of the robot. Frames without joint states are drawn as they are.

@@ -1,4 +1,4 @@
-"""What an inspection found: findings, verdicts, the report of a recording and its Markdown."""
+"""Findings and verdicts of an inspection, and its report as Markdown and text."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """All of a recording.
+    """The inspection of a whole recording.
 
     Attributes:
         episode: its path.

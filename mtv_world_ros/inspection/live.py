@@ -1,4 +1,4 @@
-"""Records running topics for a while, with the ROS recorder as a process of its own."""
+"""Records running topics for some seconds, with the ROS recorder in a separate process."""
 
 from __future__ import annotations
 

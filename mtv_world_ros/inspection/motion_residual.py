@@ -1,4 +1,4 @@
-"""How far the drawn robot is from the pixels that move: a calibration check without markers.
+"""Calibration check without markers: offset between the projected robot and the moving pixels.
 
 P pairs of frames, J joints, H W pixels of the shrunk images, R the search radius.
 """
@@ -40,7 +40,7 @@ _SATURATION = 25.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualSearch:
-    """What is tried to measure the residual.
+    """Search space of the residual's measurement.
 
     Attributes:
         max_pairs: pairs of frames, spread over the recording.
@@ -60,7 +60,7 @@ WHOLE_SEARCH = ResidualSearch()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionResidual:
-    """Where the moving pixels are, seen from the drawn robot.
+    """Offset of the moving pixels from the projected robot.
 
     Attributes:
         shift_px: (x, y) from the drawn robot to the moving pixels, in pixels of the recorded
@@ -280,7 +280,7 @@ def _peak(surface: FloatArray) -> FloatArray:
 
 
 def _refined(line: FloatArray, at: int) -> float:
-    """Where a parabola through the maximum and its neighbours has its top."""
+    """Vertex of the parabola through the maximum and its neighbours."""
     if not 0 < at < len(line) - 1:
         return float(at)
     before, top, after = line[at - 1 : at + 2]

@@ -1,4 +1,4 @@
-"""A picture of a robot: its shapes from two sides, grippers shut and open, and the tool frames."""
+"""A picture of a robot: its shapes from two sides, grippers closed and open, and tool frames."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _tile(
 
 
 def _camera(cloud: FloatArray, angle: float) -> CameraModel:
-    """A camera that sees all points, from a direction and a little from above."""
+    """A camera that sees all points, from a direction and slightly above."""
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.05)
     ahead = -np.array([np.cos(angle), np.sin(angle), 0.45])

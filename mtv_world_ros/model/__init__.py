@@ -1,1 +1,1 @@
-"""The multi-view video diffusion transformer and what surrounds it."""
+"""The multi-view video diffusion transformer: its encoders, sampling, checkpoints, serving."""

@@ -1,4 +1,4 @@
-"""Autoencoders: Wan's own, a tiny one of its latent space, and pixels rearranged.
+"""Autoencoders: Wan's, a small one with the same latent space, and space-to-depth.
 
 Shapes: B batch, N = 1 + 4 k frames, F = 1 + k latent frames, H W pixels, h w = H / 8, W / 8.
 """
@@ -30,7 +30,7 @@ def _conv(inputs: int, outputs: int, **options: Any) -> nn.Conv2d:
 
 
 class _Bound(nn.Module):
-    """Latents beyond 3 are drawn in."""
+    """Soft-clips latents to [-3, 3] (tanh)."""
 
     def forward(self, x: Tensor) -> Tensor:
         return 3 * torch.tanh(x / 3)
@@ -72,7 +72,7 @@ class _GrowFrames(nn.Module):
 
 
 class TinyAutoencoder(nn.Module):
-    """Maps RGB video in [-1, 1] to Wan's normalised latents and back, nearly as Wan's own does.
+    """Maps RGB video in [-1, 1] to Wan's normalised latents and back; approximates Wan's own.
 
     It takes the place of a `WanAutoencoder`; at 288x384, 81 frames it costs about a twentieth.
     Layout and weight files are TAEHV's (madebyollin/taehv, `taew2_1`): frames pass convolutions
@@ -146,7 +146,7 @@ class TinyAutoencoder(nn.Module):
 
 
 def _run(layers: nn.ModuleList, frames: Tensor, together: int) -> Tensor:
-    """Frames (B, T, C, H, W) through layers, some at a time."""
+    """Runs frames (B, T, C, H, W) through layers, a few frames at a time to save memory."""
     memory: dict[int, Tensor] = {}
     parts = [_run_part(layers, part, memory) for part in frames.split(together, dim=1)]
     return torch.cat(parts, dim=1)
@@ -169,7 +169,7 @@ def _run_part(layers: nn.ModuleList, frames: Tensor, memory: dict[int, Tensor]) 
 
 
 def _fitting(file: Path, name: str, value: Tensor, shape: torch.Size) -> Tensor:
-    """The tensor; of a layer that grew more frames when it was trained, what gives the last."""
+    """Returns the weight; if the stored layer upsamples time by more, its last frames' part."""
     surplus = '.conv.weight' in name and value.shape[0] % shape[0] == 0
     if surplus and value.shape[1:] == shape[1:]:
         return value[-shape[0] :]

@@ -20,7 +20,7 @@ ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
 
 
 class HistorySettings(Schema):
-    """Whether and how a model takes up what a rollout showed before; the default is not at all."""
+    """How a model is conditioned on earlier frames of a rollout; default: not at all."""
 
     section: ClassVar = 'history'
 
@@ -42,7 +42,7 @@ class HistorySettings(Schema):
 
     @property
     def on(self) -> bool:
-        """Whether the model takes up anything."""
+        """Whether the model is conditioned on earlier frames."""
         return self.num_frames > 0 or self.anchored
 
     @property

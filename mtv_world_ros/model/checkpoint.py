@@ -82,7 +82,7 @@ def save_checkpoint(
 
 
 def _folders(checkpoint: Checkpoint) -> dict[str, Path]:
-    """Parts that are copied as they are."""
+    """Folders of parts that are copied unchanged."""
     parts = {
         ADAPTER_FOLDER: checkpoint.adapter,
         OBJECT_MOTION_FOLDER: checkpoint.object_motion,
@@ -158,7 +158,7 @@ def _load_autoencoder(folder: Path, dtype: torch.dtype) -> Autoencoder:
 
 
 def _fill(module: Any, folder: Path) -> None:
-    """Puts the stored tensors in the place of a module's, which take no memory before."""
+    """Replaces the module's meta tensors, which use no memory, by the stored ones."""
     tensors = {name: stored.read() for name, stored in open_tensors(folder, WEIGHTS).items()}
     try:
         module.load_state_dict(tensors, assign=True)

@@ -1,4 +1,4 @@
-"""What a chunk's model takes up of what a rollout showed before it, and how.
+"""Conditioning on the frames of a rollout before the chunk: history tokens and anchor.
 
 Shape letters: B batch, V views, N frames, H W pixels, C latent channels, P latent frames, h w =
 latent size.
@@ -74,7 +74,7 @@ def with_history(
 def without_history(
     autoencoder: Autoencoder, conditioning: Conditioning, num_frames: int
 ) -> Conditioning:
-    """Returns the conditioning of a chunk before which nothing is known: at noise level 1."""
+    """Returns the conditioning of a chunk without history: noise level 1."""
     count = autoencoder.num_latent_frames(num_frames - int(autoencoder.includes_start))
     start = conditioning.reference.unsqueeze(3)
     return replace(

@@ -1,4 +1,4 @@
-"""Which tensor of a public Wan 2.1 checkpoint is which of ours.
+"""Maps tensor names of public Wan 2.1 checkpoints to this package's.
 
 Names of the original layout (Wan, VideoX-Fun, DiffSynth) and of diffusers and transformers are
 both read; the maps of transformer and autoencoder are diffusers' own.

@@ -108,7 +108,7 @@ class DiffusionWorldModel:
             self._warm_up()
 
     def _warm_up(self) -> None:
-        """A prediction that nobody sees, so that the first one of use need not wait."""
+        """Runs one prediction and discards it, so that the first real one does not wait."""
         spec = self.spec
         shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
         num_joints = 0 if self.robot is None else len(self.robot.joint_names)
@@ -156,7 +156,7 @@ class DiffusionWorldModel:
             self._followers.send_weights()
 
     def close(self) -> None:
-        """Ends the processes that it started, if any; it is not to be used any more."""
+        """Ends the processes that it started, if any; the model cannot be used afterwards."""
         if self._followers is not None:
             self._followers.close()
 
@@ -245,7 +245,7 @@ class DiffusionWorldModel:
         return self._with_context(latents, start)
 
     def _with_history(self, latents: Conditioning, history: History) -> Conditioning:
-        """Adds what of the rollout comes before the chunk, in models that take it."""
+        """Adds the history frames, in models that are conditioned on them."""
         count, level = self.history.num_frames, self.history.noise_level
         if self.history.anchored:
             latents = with_anchor(self.autoencoder, latents, self._tensor(history.anchor))

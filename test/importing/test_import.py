@@ -173,7 +173,7 @@ def test_a_video_with_a_hole_or_too_short_fails_the_episode(
 def test_joints_in_another_unit_fail_with_advice(datasets, make_mapping, tmp_path):
     mapping = make_mapping(('{column: shoulder.pos, unit: deg}', 'shoulder.pos'))
     summary = import_dataset(datasets('v2.1'), mapping, tmp_path / 'out')
-    assert summary.made == ()
+    assert summary.made == []
     assert "joint 'shoulder' is 3 at point 1" in summary.failed[0]
     assert 'are unit, sign, offset' in summary.failed[0]
 

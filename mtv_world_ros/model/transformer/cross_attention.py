@@ -1,4 +1,4 @@
-"""What the cross-attention of the blocks looks at: tokens for all, or for each time slot its own.
+"""Context of the blocks' cross-attention: tokens shared by all time slots, or one set per slot.
 
 Shape letters: B batch, V views, S time slots (the reference image and f token frames), n tokens
 of a view and slot, N context tokens, G of them a slot, M image tokens, D width.
@@ -16,7 +16,7 @@ from mtv_world_ros.errors import CheckpointError
 
 
 class Context(NamedTuple):
-    """What the cross-attention of a block looks at.
+    """Context tokens of a block's cross-attention.
 
     Attributes:
         tokens: (B, N, D) for all tokens alike, or (B, S, G, D): each time slot has its own.
@@ -106,7 +106,7 @@ def check_tokens(
 
 
 class _NoContext(nn.Module):
-    """Stands where cross-attention would, where there is nothing to look at."""
+    """Replaces cross-attention in models without context tokens."""
 
     def forward(self, hidden_states: Tensor, *_: Any) -> Tensor:
         return torch.zeros_like(hidden_states)

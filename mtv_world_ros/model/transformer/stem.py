@@ -1,4 +1,4 @@
-"""The small preset's way into and out of the transformer: convolutions instead of bare patches.
+"""Convolutional stem and decoder of the small preset, in place of linear patch embeddings.
 
 At small scale a convolutional stem learns several times faster than patches, and a decoder that
 may hold or copy the reference image instead of redrawing it keeps objects sharp.
@@ -84,7 +84,7 @@ class ConvStem(nn.Module):
 
 
 class ReferenceStem(nn.Module):
-    """phi of the paper: reference latents to tokens, and to keys for copying."""
+    """Encodes reference latents (phi of the paper) as tokens, and as keys for copying."""
 
     def __init__(self, in_channels: int, widths: tuple[int, int, int], dim: int) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class ReferenceStem(nn.Module):
 
 
 class CopyAttention(nn.Module):
-    """Lets every output patch point into its own view's reference image and copy from there."""
+    """Attention by which each output patch copies pixels of its view's reference image."""
 
     def __init__(self, channels: int, reference_channels: int, head_dim: int = 32) -> None:
         super().__init__()

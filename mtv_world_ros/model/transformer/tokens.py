@@ -86,7 +86,7 @@ def embed_reference(
 def _tokens_and_keys(
     transformer: Any, image: Tensor, control: Tensor | None, temb: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What phi makes of (B, V, C, H, W) latents."""
+    """Tokens and keys that phi gives for (B, V, C, H, W) latents."""
     flat = image.flatten(0, 1)
     if transformer.stem == 'conv':
         assert control is not None

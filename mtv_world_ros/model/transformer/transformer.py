@@ -286,7 +286,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         kept: Tensor | None,
         grid: TokenGrid,
     ) -> Any:
-        """What the blocks' cross-attention looks at."""
+        """Context tokens of the blocks' cross-attention."""
         if self.action_control is None:
             return text if image is None else torch.cat([image, text], dim=1)
         if actions is None:

@@ -1,1 +1,1 @@
-"""Public Wan weights become checkpoints."""
+"""Conversion of public Wan weights into checkpoints."""

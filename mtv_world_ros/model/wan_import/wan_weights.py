@@ -37,7 +37,7 @@ NEW = ('view_embedding',)
 
 @dataclass(frozen=True, slots=True)
 class PartReport:
-    """What became of a part's tensors.
+    """Result of importing one part: tensors written, new and left out.
 
     Attributes:
         part: e.g. `transformer`.
@@ -140,7 +140,7 @@ def _check_architecture(
     keys: wan_keys.KeyMap,
     model: MultiViewWanTransformer,
 ) -> None:
-    """Says in words what the commonest wrong checkpoints are."""
+    """Names the most common wrong checkpoints in the error."""
     config: Any = model.config
     patch = keys.takes.get('patch_embedding.weight')
     if patch is None or len(tensors[patch.source].shape) != 5:
@@ -170,7 +170,7 @@ def _check_architecture(
 
 
 def _check_heads(source: Path, expected: int) -> None:
-    """The number of heads shows in no tensor: the file beside them says it."""
+    """Checks the number of heads, which only the configuration file states, not a tensor shape."""
     file = (source if source.is_dir() else source.parent) / 'config.json'
     if not file.is_file():
         return
@@ -222,7 +222,7 @@ def _write(
     shard_bytes: int,
     stem: str = 'diffusion_pytorch_model',
 ) -> PartReport:
-    """Writes a part's tensors under our names; every one of the source and of ours is settled."""
+    """Writes a part's tensors under our names; no tensor of source or target is left over."""
     unknown = sorted(set(keys.takes) - set(shapes))
     if unknown:
         names = [keys.takes[name].source for name in unknown]
@@ -281,7 +281,7 @@ def _zeros(shape: tuple[int, ...]) -> StoredTensor:
 
 
 def _some(names: list[str]) -> str:
-    """The first names; all of them would fill the screen."""
+    """The first few names."""
     return ', '.join(names[:8]) + (', ...' if len(names) > 8 else '')
 
 

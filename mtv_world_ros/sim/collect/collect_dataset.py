@@ -171,7 +171,7 @@ def locked(out: Path) -> Iterator[None]:
 
 
 class _DataSet:
-    """What is in the folder of a data set, and its card."""
+    """A data set's folder: its episodes, card and contact sheets."""
 
     def __init__(
         self, out: Path, kind: str, seed: int, config: CollectConfig, jobs: Sequence[Job]
@@ -186,7 +186,7 @@ class _DataSet:
     def make(
         self, jobs: Sequence[Job], workers: int, config: CollectConfig, *, progress: bool
     ) -> None:
-        """Makes those that are missing."""
+        """Makes the missing episodes."""
         missing = [job for job in jobs if job.path.name not in self.entries]
         done = len(jobs) - len(missing)
         try:

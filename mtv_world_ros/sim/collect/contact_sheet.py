@@ -1,4 +1,4 @@
-"""Contact sheets of a data set: of every task a success and a failure over time, in all views."""
+"""Contact sheets of a data set: frames of a success and a failure of every task, all views."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def titled(text: str, picture: ByteArray) -> ByteArray:
 
 
 def _row(out: Path, pair: Sequence[EpisodeEntry | None], num_frames: int, width: int) -> ByteArray:
-    """A success and a failure of one task side by side; what there is none of stays empty."""
+    """A success and a failure of one task side by side; a missing one leaves its place empty."""
     strips = [entry and film_strip(out / entry.name, num_frames, width) for entry in pair]
     shape = next(strip.shape for strip in strips if strip is not None)
     blocks = [

@@ -1,6 +1,6 @@
-"""Scenes of the benchmark's tasks: what lies on the table, and what the expert does.
+"""Scenes of the benchmark's tasks: objects on the table, and the expert's moves.
 
-What is said and what succeeds stands in `config/tasks/<name>.yaml`; of tasks whose goal only the
+Instruction and success relations are in `config/tasks/<name>.yaml`; of tasks whose goal only the
 simulator knows, in `config/tasks/zero_shot`.
 """
 
@@ -111,7 +111,7 @@ class Task:
 
     @property
     def definition(self) -> TaskSpec:
-        """What is said, and the relations that must hold at the end."""
+        """Instruction, and the relations that must hold at the end."""
         folder = ('config', 'tasks', *(['zero_shot'] if self.zero_shot else []))
         return _read(share_path(*folder, f'{self.name}.yaml'))
 
@@ -144,7 +144,7 @@ _SMALL = (0.0, 0.3)
 
 
 def _collect(name: str, shapes: tuple[str, ...], container: str) -> Task:
-    """Two things from either side go into a container in the middle."""
+    """Two objects, one from either side, go into a container in the middle."""
     roles = (
         ObjectRole(role='a', shapes=shapes, x_range=_LEFT, y_range=(0.2, 0.31)),
         ObjectRole(role='b', shapes=shapes, x_range=_RIGHT, y_range=(0.2, 0.31)),

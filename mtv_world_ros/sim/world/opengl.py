@@ -1,4 +1,4 @@
-"""Imports MuJoCo with an OpenGL library that is there, or says which package is missing."""
+"""Imports MuJoCo with an available OpenGL library, or names the missing package."""
 
 from __future__ import annotations
 

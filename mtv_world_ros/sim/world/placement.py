@@ -1,4 +1,4 @@
-"""Where objects and goals may lie: apart from each other and in the arms' reach."""
+"""Feasible placements: objects and goals apart from each other and within the arms' reach."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _is_free(
     now: dict[str, SceneObject],
     config: PlacementConfig,
 ) -> bool:
-    """Nothing is in the way at the goal but what the object is put on, in or with."""
+    """Whether the goal is free of objects other than those it is put on, in or beside."""
     move = task.moves[number]
     if not isinstance(move, PickPlace):
         return True

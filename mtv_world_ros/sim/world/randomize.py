@@ -1,4 +1,4 @@
-"""Draws an episode's scene: which colours and sizes, where, under which light and cameras."""
+"""Draws a random scene: objects, colours, sizes, places, light and cameras."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class SimEpisode:
 
     @property
     def instruction(self) -> str:
-        """What the episode's robot is told to do."""
+        """The instruction of the episode."""
         return instruction_of(self.task, self.scene)
 
     @property
@@ -137,7 +137,7 @@ class SimEpisode:
         return self.observe()
 
     def advance(self, targets: FloatArray) -> None:
-        """Runs one control period towards joint `targets` (J,), without looking.
+        """Runs one control period towards joint `targets` (J,), without rendering.
 
         Raises:
             TrajectoryError: wrong number of joints, or not finite.
@@ -177,7 +177,7 @@ class SimEpisode:
         return np.array([poses for poses, _ in self._seen])
 
     def situation(self) -> TruePoses:
-        """Returns what the task's relations are evaluated on, at every observation since reset."""
+        """Returns the true poses since reset, on which the task's relations are evaluated."""
         poses, scene = self.seen_poses(), self.scene
         return TruePoses(
             positions={item.role: poses[:, i, :3, 3] for i, item in enumerate(scene.objects)},
@@ -188,7 +188,7 @@ class SimEpisode:
         )
 
     def observe(self, *, rendering: bool = True) -> SimObservation:
-        """Renders all views, unless told not to, and says whether the task is done now."""
+        """Renders all views (unless disabled) and evaluates whether the task is done."""
         positions = self.positions()
         self._seen.append((self.object_poses(), positions))
         images, masks = self._render() if self._rendering and rendering else ({}, {})
@@ -236,7 +236,7 @@ class SimEpisode:
         return instances
 
     def _index_model(self) -> None:
-        """Finds where the joints stand in qpos; which geom is whose is asked when it is drawn."""
+        """Looks up the joints' indices in qpos."""
         joints = [actuator.joint for actuator in actuators_of(self.robot)]
         self._arm_qpos = np.array([self._model.joint(name).qposadr[0] for name in joints])
         self._instance_of = np.zeros(0, dtype=np.uint8)

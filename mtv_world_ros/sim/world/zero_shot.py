@@ -89,7 +89,7 @@ def with_moved_cameras(
 
 
 def _movable(task: Task) -> tuple[ObjectRole, ...]:
-    """Roles that are always there and can be grasped: trays and baskets are not counted."""
+    """Roles that are always present and can be grasped, so not trays and baskets."""
     return tuple(
         role
         for role in task.roles
@@ -98,7 +98,7 @@ def _movable(task: Task) -> tuple[ObjectRole, ...]:
 
 
 def _exchangeable(task: Task) -> tuple[str, ...]:
-    """Roles that any graspable thing can play.
+    """Roles that any graspable object can have.
 
     Not what carries something, is shaken or is a plate, nor what has to be of a certain size.
     """
@@ -118,7 +118,7 @@ def _exchangeable(task: Task) -> tuple[str, ...]:
 
 
 def _with_unseen_objects(task: Task, rng: np.random.Generator) -> Task:
-    """Half of the movable objects, rounded by a coin, are of shapes that training never shows."""
+    """Gives half of the movable objects (rounded at random) shapes that training never shows."""
     roles, usable = _movable(task), _exchangeable(task)
     half = (len(roles) + int(rng.integers(2)) * (len(roles) % 2)) // 2
     chosen = set(rng.permutation(usable)[:half].tolist())
