@@ -13,8 +13,8 @@ from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import share_path
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun

@@ -21,7 +21,7 @@ from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import commanded, load_recording, Recording
 from mtv_world_ros.data_types import BoolArray, JointTrajectory, Observation
-from mtv_world_ros.evaluation.rollouts import predicted_frames, stretches
+from mtv_world_ros.evaluation.imagined_stretches import predicted_frames, stretches
 from mtv_world_ros.geometry.mask_geometry import centroids
 from mtv_world_ros.pipeline import Pipeline
 

@@ -58,7 +58,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.training.object_motion.train import (
+    from mtv_world_ros.training.object_motion.motion_training import (
         end_errors,
         MotionTraining,
         read_tracks,

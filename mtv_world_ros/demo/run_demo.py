@@ -18,6 +18,7 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.demo.node_processes import DemoOptions, NODE, record_through_node
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.evaluation.metrics.scores import (
     episode_means,
     score_frames,
@@ -25,7 +26,6 @@ from mtv_world_ros.evaluation.metrics.scores import (
     ScoreRow,
     true_masks,
 )
-from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video import (
     Comparison,
     contact_sheet,

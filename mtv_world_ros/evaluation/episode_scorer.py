@@ -14,6 +14,12 @@ import numpy as np
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.evaluation.imagined_stretches import (
+    imagine_stretch,
+    predicted_frames,
+    Stretch,
+    stretches,
+)
 from mtv_world_ros.evaluation.metrics.frechet.feature_store import feature_path, FeatureTaker
 from mtv_world_ros.evaluation.metrics.image_quality import ImageQuality
 from mtv_world_ros.evaluation.metrics.scores import (
@@ -32,12 +38,6 @@ from mtv_world_ros.evaluation.results import (
     save_rollout,
     stored_stretch,
     StoredRollout,
-)
-from mtv_world_ros.evaluation.rollouts import (
-    imagine_stretch,
-    predicted_frames,
-    Stretch,
-    stretches,
 )
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.pipeline import Pipeline

@@ -17,7 +17,7 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.evaluation.rollouts import Stretch
+from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.geometry.mirror import mirrored
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.pipeline import WorldModel

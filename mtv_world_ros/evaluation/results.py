@@ -18,8 +18,8 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.evaluation.metrics.scores import episode_means, QUALITY, ScoreRow
-from mtv_world_ros.evaluation.rollouts import Stretch
 from mtv_world_ros.evaluation.video import compare, decode_video, encode_video
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.prediction import Prediction

@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 from mtv_world_ros.config import Count, ListOf, Schema
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.recording import DEFAULT
+from mtv_world_ros.evaluation.imagined_stretches import check_mode
 from mtv_world_ros.evaluation.references import check_actions
-from mtv_world_ros.evaluation.rollouts import check_mode
 
 
 class EvaluationConfig(Schema):

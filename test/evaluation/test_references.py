@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.evaluation.references import check_actions, with_actions
-from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
 
 
 @pytest.fixture

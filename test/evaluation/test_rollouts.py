@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.evaluation.rollouts import imagine_stretch, predicted_frames, stretches
+from mtv_world_ros.evaluation.imagined_stretches import (
+    imagine_stretch,
+    predicted_frames,
+    stretches,
+)
 
 
 def test_observed_stretches_are_chunks_from_real_frames(recordings, make_pipeline):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.evaluation.rollouts import imagine_stretch, stretches
+from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.evaluation.video import (
     compare,
     Comparison,

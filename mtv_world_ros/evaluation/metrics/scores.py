@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, ObjectMasks
-from mtv_world_ros.evaluation.rollouts import Stretch
+from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.vision.jaccard import (
     moves,
     object_scores,

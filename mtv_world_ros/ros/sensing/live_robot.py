@@ -12,7 +12,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.extrinsics import Extrinsics
 from mtv_world_ros.ros.sensing.observations import Scene
-from mtv_world_ros.ros.sensing.robot_description import Handler, RobotDescription
+from mtv_world_ros.ros.sensing.robot_description_topic import Handler, RobotDescription
 
 
 class LiveRobot:

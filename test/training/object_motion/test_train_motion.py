@@ -20,14 +20,14 @@ from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
 from mtv_world_ros.sim.expert.faults import kinds_of
 from mtv_world_ros.sim.world.opengl import missing_opengl
-from mtv_world_ros.training.object_motion import train
-from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
-from mtv_world_ros.training.object_motion.train import (
+from mtv_world_ros.training.object_motion import motion_training as train
+from mtv_world_ros.training.object_motion.motion_training import (
     end_errors,
     MotionTraining,
     read_tracks,
     train_motion,
 )
+from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 
 VIEWS = ('low', 'high')
 
