@@ -32,6 +32,9 @@ def generate_launch_description():
         DeclareLaunchArgument('compressed_input', default_value='true', description='JPEG images'),
         DeclareLaunchArgument('rate', default_value='1.0', description='of playing'),
         DeclareLaunchArgument('pace', default_value='realtime', description='or burst'),
+        DeclareLaunchArgument(
+            'wait_timeout', default_value='600', description='for the node to be loaded [s]'
+        ),
         DeclareLaunchArgument('namespace', default_value='', description='of node and player'),
         DeclareLaunchArgument('checkpoint', default_value='', description='empty = bundled'),
         DeclareLaunchArgument(
@@ -60,7 +63,8 @@ def generate_launch_description():
         name='player',
         namespace=LaunchConfiguration('namespace'),
         arguments=['replay', episode, '--', '--clock', '--lock-step',
-                   '--rate', LaunchConfiguration('rate')],
+                   '--rate', LaunchConfiguration('rate'),
+                   '--wait-timeout', LaunchConfiguration('wait_timeout')],
         output='screen',
         on_exit=Shutdown(reason='the episode is over'),
     )  # fmt: skip

@@ -1,5 +1,6 @@
 """The launch files, read by the real `ros2 launch`."""
 
+import json
 import os
 import signal
 import subprocess
@@ -27,7 +28,7 @@ def test_launch_file_shows_its_arguments(name, arguments):
 
 @pytest.fixture
 def launch(tmp_path):
-    """Runs `ros2 launch` on the package as colcon installed it; returns all that was said."""
+    """Starts `ros2 launch` on the package as colcon installed it."""
     found = subprocess.run(['ros2', 'pkg', 'prefix', 'mtv_world_ros'], capture_output=True)
     if found.returncode != 0:
         pytest.skip('mtv_world_ros is not built by colcon and sourced')
@@ -43,7 +44,21 @@ def launch(tmp_path):
             env=environment,
         )  # fmt: skip
 
+    launch.environment = environment
     return launch
+
+
+@pytest.fixture
+def ros2(launch):
+    """Runs the command line beside a launch; returns what it said."""
+
+    def ros2(*arguments):
+        return subprocess.run(
+            ['ros2', *arguments], env=launch.environment, capture_output=True, text=True,
+            timeout=180, check=True,
+        ).stdout  # fmt: skip
+
+    return ros2
 
 
 def check_end(process):
@@ -62,3 +77,40 @@ def test_node_starts_and_ends_on_ctrl_c(launch):
             break
     process.send_signal(signal.SIGINT)
     check_end(process)
+
+
+@pytest.mark.native_ros
+def test_lifecycle_node_answers_the_command_line(launch, ros2):
+    process = launch('world_model.launch.py', 'autostart:=false')
+    for line in process.stdout:
+        if 'waits for a lifecycle manager' in line:
+            break
+    assert 'unconfigured' in ros2('lifecycle', 'get', '/world_model')
+    for transition, state in (('configure', 'inactive'), ('activate', 'active')):
+        assert 'successful' in ros2('lifecycle', 'set', '/world_model', transition)
+        assert state in ros2('lifecycle', 'get', '/world_model')
+    process.send_signal(signal.SIGINT)
+    check_end(process)
+
+
+@pytest.mark.native_ros
+def test_replays_in_two_namespaces_at_once(launch):
+    processes = [
+        launch('replay.launch.py', f'namespace:={name}', 'rate:=4.0', 'pace:=burst')
+        for name in ('one', 'two')
+    ]
+    for process in processes:
+        said = check_end(process)
+        assert 'ready: low, high' in said
+        assert '3 trajectories, 3 done' in said, said  # six, were they to hear each other
+
+
+@pytest.mark.native_ros
+def test_policy_lives_an_episode_and_the_launch_ends(launch, tmp_path):
+    episode = share_path('resource', 'demo_episode')
+    process = launch(
+        'policy_in_the_loop.launch.py', 'policy:=scripted', f'episodes:={episode}', 'count:=1',
+        'max_chunks:=1', f'out:={tmp_path / "out"}',
+    )  # fmt: skip
+    check_end(process)
+    assert len(json.loads((tmp_path / 'out' / 'episodes.json').read_text())) == 1
