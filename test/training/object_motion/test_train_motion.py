@@ -20,7 +20,7 @@ from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
 from mtv_world_ros.sim.expert.faults import kinds_of
 from mtv_world_ros.sim.world.opengl import missing_opengl
-from mtv_world_ros.training.object_motion import motion_training as train
+from mtv_world_ros.training.object_motion import motion_training
 from mtv_world_ros.training.object_motion.motion_training import (
     end_errors,
     MotionTraining,
@@ -74,7 +74,7 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
     """Mean error [m] after one step of 0.1 s from where the moving objects really were."""
     errors = []
     for track in tracks:
-        batch = train._whole(track)
+        batch = motion_training._whole(track)
         forced = torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1]
         with torch.inference_mode():
             motion = network(batch.scene, (batch.points, batch.rotations), forced)
@@ -108,7 +108,7 @@ def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
 
 def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, robot):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
-    stays = train._whole(track)
+    stays = motion_training._whole(track)
     still = stays.points[:, :1].expand_as(stays.points)
     carried = still + torch.linspace(0, 0.1, still.shape[1])[None, :, None, None]
     turns = torch.eye(3).expand_as(stays.rotations)
@@ -117,7 +117,7 @@ def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, ro
         spread = torch.full(real.shape[:3], 0.01)
         held = torch.zeros(*real.shape[:3], 2)
         motion = Motion(points=imagined, rotations=turns, held=held, spread=spread)
-        return train._loss(motion, replace(stays, points=real, rotations=turns)).item()
+        return motion_training._loss(motion, replace(stays, points=real, rotations=turns)).item()
 
     assert cost(carried, still) == pytest.approx(cost(still, carried), rel=1e-5)
     assert cost(carried, carried) < cost(still, carried)
