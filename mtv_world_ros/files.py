@@ -13,6 +13,7 @@ import shutil
 import sys
 from typing import Any
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
@@ -115,7 +116,7 @@ def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: b
     wanted = plain(settings)
     for file in () if overwrite else sorted(results.glob('*.json')):
         try:
-            stored = json.loads(file.read_text(encoding='utf-8'))['settings']
+            stored = read_json(file)['settings']
             other = [key for key in wanted if stored[key] != wanted[key]]
         except (OSError, ValueError):
             continue  # not readable, thus nothing is lost

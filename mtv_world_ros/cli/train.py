@@ -227,6 +227,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
     """
     import yaml
 
+    from mtv_world_ros.bounded_input import parse_yaml
     from mtv_world_ros.errors import ConfigError
 
     overrides: dict[str, Any] = {}
@@ -235,7 +236,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
         if not equals:
             raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
         try:
-            overrides[key] = yaml.safe_load(value)
+            overrides[key] = parse_yaml(value)
         except yaml.YAMLError:
             raise ConfigError(f"--set '{item}': {value!r} is not a YAML value") from None
     return overrides

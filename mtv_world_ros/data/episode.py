@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, nearest
 
@@ -115,7 +116,9 @@ def parse_info(
             task=rest.pop('task', ''),
             outcome=check_outcome(rest.pop('outcome', 'unknown')),
             seed=int(seed) if seed else None,
-            objects=tuple(str(name) for name in json.loads(rest.pop('objects', '[]'))),
+            objects=tuple(
+                str(name) for name in parse_json(rest.pop('objects', '[]'), "'objects'")
+            ),
             instruction=rest.pop('instruction', '') or default_instruction,
             robot=rest.pop('robot', ''),
             metadata=rest,

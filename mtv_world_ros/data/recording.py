@@ -6,13 +6,16 @@ V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import hashlib
 import json
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
+from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
@@ -362,7 +365,8 @@ def cached_recording(
     """
     stored = cache / f'{_key(path, spec, robot, source)}.npz'
     if stored.is_file():
-        return _load(stored, path)
+        with suppress(OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile):
+            return _load(stored, path)  # where it is damaged it is made anew
     recording = load_recording(path, spec, robot, source=source)
     cache.mkdir(parents=True, exist_ok=True)
     partial = stored.with_suffix('.partial.npz')
@@ -426,7 +430,7 @@ def _save(file: Path, recording: Recording) -> None:
 
 def _load(file: Path, path: Path) -> Recording:
     with np.load(file, allow_pickle=False) as stored:
-        text = json.loads(str(stored['text']))
+        text = parse_json(str(stored['text']), f"'{file}'")
         cameras = tuple(
             CameraModel(
                 K=stored[f'K_{i}'],

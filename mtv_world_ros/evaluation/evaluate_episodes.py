@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-import json
 import os
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import DescriptionError, EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
@@ -291,7 +291,7 @@ class _Run:
         if not self.name or (features and not feature_path(self.out, job.name).is_file()):
             return None
         try:
-            stored = json.loads(self._file(job).read_text(encoding='utf-8'))
+            stored = read_json(self._file(job))
             if stored['settings'] == plain(self._settings_of(job)):
                 return EpisodeResult.from_json(stored['result'])
         except (OSError, ValueError, KeyError, TypeError):

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 import pinocchio as pin
-import yaml
 
+from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.camera import camera_poses, project
@@ -74,7 +74,7 @@ def load_shape(robot: RobotModel) -> RobotShape:
     """
     if robot.file is None:
         return rods(robot, 'the robot has no file')
-    urdf = yaml.safe_load(robot.file.read_text(encoding='utf-8')).get('urdf')
+    urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
     if urdf is None:
         return rods(robot, 'the robot is given by a table')
     path = robot.file.parent / str(urdf)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from av.container import InputContainer
 import cv2
 import numpy as np
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import parse_json, read_json, read_text
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 
@@ -226,10 +225,10 @@ class LeRobotDataset:
     def _lines(self, name: str) -> Iterator[dict[str, Any]]:
         file = self.root / name
         try:
-            lines = file.read_text(encoding='utf-8').splitlines()
-        except OSError as error:
+            lines = read_text(file, 'json_bytes').splitlines()
+            return iter([parse_json(line, f"'{file}'") for line in lines if line.strip()])
+        except (OSError, ValueError) as error:
             raise EpisodeError(f"cannot read '{file}': {error}") from error
-        return (json.loads(line) for line in lines if line.strip())
 
     def _file(self, template: str, place: Mapping[str, Any]) -> Path:
         relative = Path(template.format(**place))

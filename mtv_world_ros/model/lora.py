@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import nn, Tensor
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.card import CARD
@@ -369,8 +369,11 @@ def _module(name: str, names: Mapping[str, str], file: Path) -> str:
 
 def _whole_scale(metadata: Mapping[str, str]) -> float:
     """Alpha / r as peft's configuration in the file says; files of others have none."""
-    config = json.loads(metadata.get(METADATA, '{}'))
-    return config.get('lora_alpha', 1) / config.get('r', 1)
+    try:
+        config = parse_json(metadata.get(METADATA, '{}'), METADATA)
+        return float(config.get('lora_alpha', 1) / config.get('r', 1))
+    except (ValueError, AttributeError, TypeError, ArithmeticError) as error:
+        raise CheckpointError(f'{METADATA} in the file cannot be used: {error}') from error
 
 
 def _factors(

@@ -6,13 +6,13 @@ import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-import json
 import os
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
 from mtv_world_ros.parallel import Outcome, score_all
@@ -139,7 +139,7 @@ def _path(out: Path, job: Job) -> Path:
 def _stored(out: Path, job: Job, settings: Mapping[str, Any]) -> Result | None:
     """A result of an earlier run, if it is of the same job and settings."""
     try:
-        values = json.loads(_path(out, job).read_text(encoding='utf-8'))
+        values = read_json(_path(out, job))
         result = Result.from_json(values['result'])
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -168,7 +168,7 @@ def read_results(out: Path) -> list[Result]:
 def _check_same_policy(path: Path, job: Job) -> None:
     """Refuses a result of another policy that had this name."""
     try:
-        definition = json.loads(path.read_text(encoding='utf-8')).get('definition', '')
+        definition = read_json(path).get('definition', '')
     except (OSError, ValueError, AttributeError):
         return  # not readable, thus nothing is lost
     if definition != job.definition:

@@ -35,6 +35,7 @@ from pydantic import Field, model_validator
 import torch
 from torch import Tensor
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import Schema
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
@@ -282,7 +283,10 @@ def _check_same(out: Path, settings: Mapping[str, Any]) -> None:
     file = out / _SETTINGS
     wanted = json.loads(json.dumps(settings))
     if file.is_file():
-        found = json.loads(file.read_text())
+        try:
+            found = dict(read_json(file))
+        except (OSError, ValueError, TypeError) as error:
+            raise TrainingError(f"'{file}' cannot be read: {error}; give another --out") from error
         different = [key for key in wanted if found.get(key) != wanted[key]]
         if different:
             raise TrainingError(

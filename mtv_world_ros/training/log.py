@@ -10,6 +10,7 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.training.trainer import StepReport
 
 #: steps per row of the log
@@ -100,12 +101,11 @@ def _cut(file: Path, step: int) -> Path:
     """Drops the rows after a step, and one that was cut off in the middle."""
     if file.is_file():
         kept = []
-        for line in file.read_text().splitlines(keepends=True):
+        for line in file.read_text(errors='replace').splitlines(keepends=True):
             try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if row['step'] > step:
+                if parse_json(line, 'the row')['step'] > step:
+                    break
+            except (ValueError, LookupError, TypeError):
                 break
             kept.append(line)
         file.write_text(''.join(kept))

@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import Weights
@@ -63,10 +64,19 @@ def save_state(
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
-    """Returns the metadata of the saved state; None if there is none."""
+    """Returns the metadata of the saved state; None if there is none.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
     recover_folder(folder / STATE)
     file = folder / STATE / _CARD
-    return json.loads(file.read_text()) if file.is_file() else None
+    try:
+        return dict(read_json(file)) if file.is_file() else None
+    except (OSError, ValueError, TypeError) as error:
+        raise TrainingError(
+            f"'{file}' is damaged: {error}; remove '{file.parent}' to begin anew"
+        ) from error
 
 
 def architecture(config: TrainingConfig) -> dict[str, Any]:

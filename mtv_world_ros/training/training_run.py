@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import cached_recording, clip_starts, DEFAULT, Recording
@@ -30,7 +31,7 @@ from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import save_robot
-from mtv_world_ros.model.card import CAMERAS, CARD, ROBOT_FOLDER
+from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.runtime import check_device, choose_dtype
 from mtv_world_ros.training.base import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
@@ -240,10 +241,18 @@ def _camera_key(camera: CameraModel) -> tuple[object, ...]:
     return (*model, *numbers.round(6).tolist())
 
 
+def _best_score(file: Path) -> float:
+    """Score of the best checkpoint so far; the lowest where none is known."""
+    try:
+        return float(read_json(file)['score'])
+    except (OSError, ValueError, LookupError, TypeError):
+        return -math.inf
+
+
 def _steps_of(result: Path) -> int | None:
     """Steps that a checkpoint or adapter was trained for; None if there is none."""
     card = result / CARD
-    return json.loads(card.read_text())['trained_on']['steps'] if card.is_file() else None
+    return read_card(result)['trained_on']['steps'] if card.is_file() else None
 
 
 def _loop(
@@ -401,7 +410,6 @@ class HeldOut:
         judged = self._judge(trainer.result, step)
         log.write(step, dict(judged.numbers))
         best = folder / _BEST
-        known = json.loads(best.read_text())['score'] if best.is_file() else -math.inf
-        if judged.score > known:
+        if judged.score > _best_score(best):
             trainer.export(folder / f'{trainer.result.name}-best')
             write_whole(best, json.dumps({'step': step, 'score': judged.score}))

@@ -85,6 +85,7 @@ class Soak:
         self._client.spin_for(float(self._rng.uniform(0, 0.3)))
         self._node.process.kill()
         self._node.process.wait()
+        self._client.forget_node()
         self.kills += 1
         self._start()
 
@@ -122,21 +123,6 @@ class Soak:
             'latency_s': self.latency_s,
             'kills': self.kills,
         }
-
-    def ask_for_reset(self) -> None:
-        """The service of a node that was killed may still be in the graph, and answers nothing."""
-        for _ in range(3):
-            client = self._client.node.create_client(self._ros.TRIGGER, '/world_model/reset')
-            try:
-                self._client.wait(client.service_is_ready, '~/reset', 20)
-                future = client.call_async(self._ros.TRIGGER.Request())
-                self._client.wait(future.done, 'an answer of ~/reset', 20)
-                return
-            except AssertionError:
-                continue
-            finally:
-                self._client.node.destroy_client(client)
-        self.problems.append('~/reset did not answer')
 
     def come_and_go(self) -> None:
         """A subscriber of images comes, or the oldest goes."""
@@ -214,7 +200,7 @@ def subscriber(soak: Soak, ros: Any, client: Any) -> int:
 def reset(soak: Soak, ros: Any, client: Any) -> int:
     """`~/reset` in a rollout."""
     sent = plain(soak, ros, client)
-    soak.ask_for_reset()
+    client.reset()
     return sent
 
 

@@ -49,6 +49,7 @@ SIZE = (96, 72)
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 NUM_FRAMES = 4
 CHUNK_S = 0.8
+ASK_AGAIN_S = 3.0
 TIMEOUT_S = 60.0  # a busy machine takes long to start a node
 
 
@@ -92,6 +93,7 @@ class Client:
         self.executor.add_node(self.node)
         self.received, self.totals = defaultdict(list), Counter()
         self.publishers, self.services = {}, {}
+        self.gone = set()
         self.subscribe(DiagnosticArray, '/world_model/report', 100)
         self.subscribe(DiagnosticArray, '/diagnostics', 10)
 
@@ -99,6 +101,17 @@ class Client:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+
+    def forget_node(self):
+        """The node was killed: the graph shows it for 20 s more, and it answers nothing."""
+        for publisher in self.publishers.values():
+            infos = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
+            self.gone |= {bytes(info.endpoint_gid) for info in infos}
+            self.node.destroy_publisher(publisher)
+        for service in self.services.values():
+            self.node.destroy_client(service)
+        for kept in (self.publishers, self.services, self.received):
+            kept.clear()
 
     def subscribe(self, kind, topic, depth=NUM_FRAMES, reliability=ReliabilityPolicy.RELIABLE):
         def keep(message):
@@ -136,7 +149,9 @@ class Client:
         infos = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
         reliable = [i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos]
         is_known = self.diagnostic_values().get(f'publishers.{topic}', '1') != '0'
-        return all(reliable) and is_known and publisher.get_subscription_count() == len(infos) > 0
+        is_there = any(bytes(info.endpoint_gid) not in self.gone for info in infos)
+        are_matched = publisher.get_subscription_count() == len(infos)
+        return all(reliable) and is_known and is_there and are_matched
 
     def wait(self, condition, what='it', timeout_s=TIMEOUT_S):
         """Spins until the condition holds."""
@@ -169,9 +184,16 @@ class Client:
             self.services[name] = self.node.create_client(kind, name)
         client = self.services[name]
         self.wait(client.service_is_ready, f'service {name}')
-        future = client.call_async(request)
-        self.wait(future.done, f'an answer of {name}')
-        return future.result()
+        asked = []
+
+        def is_answered():
+            # a request may have gone to a node that was killed
+            if not asked or (self.gone and time.monotonic() > asked[-1][0] + ASK_AGAIN_S):
+                asked.append((time.monotonic(), client.call_async(request)))
+            return any(future.done() for _, future in asked)
+
+        self.wait(is_answered, f'an answer of {name}')
+        return next(future.result() for _, future in asked if future.done())
 
     def reset(self):
         return self.call(Trigger, '/world_model/reset', Trigger.Request())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.metrics.scores import episode_means
 from mtv_world_ros.evaluation.results import (
@@ -67,7 +67,7 @@ def read_evaluations(folder: Path) -> list[Evaluated]:
     folder = Path(folder)
     hint = check_evaluation(folder)
     try:
-        metrics = json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
+        metrics = read_json(folder / 'metrics.json')
         if 'methods' not in metrics:
             return [_read(folder, metrics)]
         parts = [read_evaluations(file.parent)[0] for file in folder.glob('*/metrics.json')]
@@ -111,7 +111,7 @@ def _read(folder: Path, metrics: dict[str, Any]) -> Evaluated:
 
 def _result(folder: Path, episode: str) -> EpisodeResult:
     file = folder / 'episodes' / f'{episode}.json'
-    return EpisodeResult.from_json(json.loads(file.read_text(encoding='utf-8'))['result'])
+    return EpisodeResult.from_json(read_json(file)['result'])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

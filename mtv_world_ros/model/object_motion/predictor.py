@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import write_json
@@ -181,7 +181,7 @@ def load_network(folder: Path) -> ObjectMotionNetwork:
         CheckpointError: the folder is not there, or what it holds is not whole.
     """
     try:
-        network = ObjectMotionNetwork(**json.loads((folder / _CONFIG).read_text()))
+        network = ObjectMotionNetwork(**read_json(folder / _CONFIG))
         network.load_state_dict(load_file(folder / _WEIGHTS))
     except (OSError, ValueError, TypeError, RuntimeError, SafetensorError) as error:
         raise CheckpointError(f"'{folder}' cannot be used: {error}; train it anew") from error

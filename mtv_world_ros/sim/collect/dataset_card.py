@@ -13,6 +13,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 
+from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.data.episode import METADATA_NAME
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.files import write_whole
@@ -88,7 +89,7 @@ def read_entry(path: Path) -> EpisodeEntry:
             num_frames=max(counts[channel] for channel in images),
             duration_s=round((spans[1] - spans[0]) * 1e-9, 3),
             instruction=described['instruction'],
-            objects=tuple(json.loads(described['objects'])),
+            objects=tuple(parse_json(described['objects'], "'objects'")),
             scene=described.get('scene', ''),
         )
     except (OSError, KeyError, ValueError, McapError) as error:
@@ -126,7 +127,7 @@ def check_same_set(out: Path, kind: str, seed: int, config: dict[str, Any]) -> N
     if not card.is_file():
         return
     try:
-        there = json.loads(card.read_text())
+        there = read_json(card)
         seed_there, config_there = there['seed'], there['config']
         kind_there = there.get('kind', TASKS_SET)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-import json
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.files import write_json
 from mtv_world_ros.parallel import run_all
@@ -254,7 +254,7 @@ def _read(path: Path) -> dict[str, SearchedScene]:
     if not path.is_file():
         return {}
     try:
-        stored = json.loads(path.read_text(encoding='utf-8'))
+        stored = read_json(path)
         return {
             name: SearchedScene(
                 siblings=tuple(Sibling(**one) for one in values['siblings']),
@@ -262,7 +262,7 @@ def _read(path: Path) -> dict[str, SearchedScene]:
             )
             for name, values in stored.items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SimulatorError(
             f"'{path}' is not what 'collect --siblings' writes ({error!r}); move it away"
         ) from error

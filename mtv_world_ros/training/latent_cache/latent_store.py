@@ -12,6 +12,7 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
+from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import write_whole
 
@@ -129,8 +130,10 @@ class LatentCache:
     def _open(self, file: Path) -> None:
         try:
             shard: Any = safe_open(file, framework='pt')
-            labels = json.loads((shard.metadata() or {})[_LABELS])
-        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            labels = dict(
+                parse_json((shard.metadata() or {})[_LABELS], 'what it says of its clips')
+            )
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
             self.notes.append(
                 f"'{file}' is damaged ({error}): its clips are encoded again; remove it"
             )
@@ -144,8 +147,8 @@ def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
     notes = []
     for file in sorted(root.glob(f'*/{SETTINGS}')):
         try:
-            theirs = json.loads(file.read_text())
-        except (OSError, ValueError):
+            theirs = dict(read_json(file))
+        except (OSError, TypeError, ValueError):
             continue
         names = sorted(set(mine) | set(theirs))
         differing = [name for name in names if mine.get(name) != theirs.get(name)]
