@@ -99,7 +99,7 @@ setup(
     entry_points={
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
-            'world_model = mtv_world_ros.ros.world_model.node:main',
+            'world_model = mtv_world_ros.ros:run_world_model',
         ],
     },
     zip_safe=True,

@@ -24,7 +24,7 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ObservationError, RolloutPreempted
-from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.camera import camera_poses, scaled, tools_in_view
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
@@ -47,6 +47,8 @@ SEED_STEP = 1_000_003
 _SEEN_SHARE = 0.9
 #: chunks of real frames that may wait to be looked at; then every second frame is dropped
 _MOST_WAITING_CHUNKS = 8
+#: of an estimate for which the model was shown no motion
+_UNSEEN = 'no view shows a tool at any time'
 
 
 class WorldModel(Protocol):
@@ -243,6 +245,7 @@ class ImaginedEpisode:
 
         Raises:
             TrajectoryError: the trajectory does not fit the robot.
+            CalibrationError: a lens' distortion moves a tool out of the middle of the image.
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
@@ -320,6 +323,7 @@ class ImaginedEpisode:
         """One chunk of one rollout, stage by stage, and where the rollout stands then."""
         pipeline, start, clock = self.pipeline, state.observation, StageClock()
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
+        shown = [tools_in_view(c, pipeline.robot, plan.positions) for c in start.cameras]
         start_masks = self._find_start_masks(state)
         clock.lap('start masks')
         pictures, objects = self._move_objects(state, plan, start_masks)
@@ -340,6 +344,8 @@ class ImaginedEpisode:
         clock.lap('masks')
         positions = plan.positions[: plan.num_frames + 1]
         success, memory = self._judge(state, positions, start_masks, masks, objects)
+        if not any(shown):
+            success = replace(success, reasons=(*success.reasons, _UNSEEN))
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -362,6 +368,7 @@ class ImaginedEpisode:
             horizon=pipeline.horizon,
             segmenter=pipeline.segmenter.name,
             num_inference_steps=num_steps,
+            in_view=np.array(shown),
             seconds=MappingProxyType(clock.seconds),
         )
         return prediction, state

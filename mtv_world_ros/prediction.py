@@ -58,6 +58,7 @@ class Prediction:
         horizon: how J falls with the horizon, where that was measured.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
+        in_view: (V,) share of the states in which the view shows a tool.
         seconds: time spent by stage [s].
     """
 
@@ -76,6 +77,7 @@ class Prediction:
     horizon: HorizonCurve | None = None
     segmenter: str = ''
     num_inference_steps: int = 0
+    in_view: FloatArray
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     def trusted_seconds(self, level: float) -> float:

@@ -11,6 +11,7 @@ from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import History, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.errors import (
+    CalibrationError,
     ObservationError,
     RolloutPreempted,
     TrajectoryError,
@@ -563,3 +564,33 @@ def test_frames_between_those_of_the_model_and_before_the_first_plan_are_not_kep
     observed.catch_up()
     assert not observed.is_behind
     assert not observed.is_due(start_ns + LARGE.num_frames * 200_000_000 + 100_000_000)
+
+
+def test_a_motion_that_no_view_shows_is_said_and_counted(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    (seen,) = imagine(pipeline, recording, 1.6)
+    assert (seen.in_view > 0.5).all()
+    assert not any('no view' in reason for reason in seen.success.reasons)
+    away = observe(recording)
+    cameras = []
+    for camera in away.cameras:
+        T = camera.T_mount_camera.copy()
+        T[:3, 3] += 5 * T[:3, 2]  # looks past the robot from behind it
+        cameras.append(replace(camera, T_mount_camera=T))
+    episode = pipeline.begin(replace(away, cameras=tuple(cameras)))
+    (unseen,) = episode.extend(commands(recording, 1.6))
+    assert (unseen.in_view == 0).all()
+    assert unseen.success.reasons[-1] == 'no view shows a tool at any time'
+
+
+def test_a_lens_that_moves_the_tools_out_of_the_image_is_refused(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    start = observe(recording)
+    wrong = replace(
+        start.cameras[0], distortion_model='plumb_bob', distortion=np.array([300.0, 0, 0, 0])
+    )
+    episode = pipeline.begin(replace(start, cameras=(wrong, start.cameras[1])))
+    with pytest.raises(CalibrationError, match="in the middle of view 'low', but its distortion"):
+        list(episode.extend(commands(recording, 1.6)))

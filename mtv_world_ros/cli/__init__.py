@@ -4,43 +4,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import errno
+import os
 import shlex
+import signal
 import sys
+from types import ModuleType
 
-from mtv_world_ros.cli import (
-    calibrate,
-    collect,
-    datasets,
-    demo,
-    distill,
-    evaluate,
-    imagine,
-    import_weights,
-    own_robot,
-    rank,
-    train,
-    train_motion,
-    view,
-)
 from mtv_world_ros.errors import MtvWorldError, nearest, TrainingInterrupted
+from mtv_world_ros.signals import ended_by_signals, stopped_by_sigterm
 
-COMMANDS = (
-    demo,
-    imagine,
-    collect,
-    train,
-    train_motion,
-    distill,
-    evaluate,
-    rank,
-    calibrate,
-    view,
-    own_robot,
-    datasets,
-    import_weights,
-)
 #: of the extra `evaluate`, which several commands need
 _EVALUATE_PACKAGES = ('matplotlib', 'scipy')
+_FULL = '; make room and run the command again'
+_READ_ONLY = '; choose another folder'
+_ADVICE = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EFBIG: _FULL,
+    errno.EROFS: _READ_ONLY,
+    errno.EACCES: _READ_ONLY,
+}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -50,9 +34,44 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
-    for command in COMMANDS:
+    for command in _commands():
         command.add(commands)
     return parser
+
+
+def _commands() -> tuple[ModuleType, ...]:
+    """The modules of the commands, in the order of `--help`; their imports take a moment."""
+    from mtv_world_ros.cli import (
+        calibrate,
+        collect,
+        datasets,
+        demo,
+        distill,
+        evaluate,
+        imagine,
+        import_weights,
+        own_robot,
+        rank,
+        train,
+        train_motion,
+        view,
+    )
+
+    return (
+        demo,
+        imagine,
+        collect,
+        train,
+        train_motion,
+        distill,
+        evaluate,
+        rank,
+        calibrate,
+        view,
+        own_robot,
+        datasets,
+        import_weights,
+    )
 
 
 class _Version(argparse.Action):
@@ -82,28 +101,38 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; returns the exit status (1 for an error of the user's)."""
-    arguments = _parsed(sys.argv[1:] if argv is None else argv)
+    """Runs a command; returns the exit status.
+
+    That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
+    """
+    with ended_by_signals('mtv-world'):
+        arguments = _parsed(sys.argv[1:] if argv is None else argv)
     try:
-        return arguments.handler(arguments)
+        with stopped_by_sigterm():
+            return arguments.handler(arguments)
     except TrainingInterrupted as stopped:
-        print(
-            f'mtv-world: {stopped}; go on with: '
-            f'{shlex.join(["mtv-world", *arguments.command_line])}',
-            file=sys.stderr,
-        )
-        return 128 + stopped.signum
-    except MtvWorldError as error:
-        print(f'mtv-world: {error}', file=sys.stderr)
-        return 1
+        again = shlex.join(['mtv-world', *arguments.command_line])
+        return _said(f'{stopped}; go on with: {again}', 128 + stopped.signum)
+    except BrokenPipeError:  # `mtv-world ... | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except (MtvWorldError, OSError) as error:
+        return _said(f'{error}{_advice(error)}', 1)
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
         if package not in _EVALUATE_PACKAGES:
             raise
-        print(
-            f"mtv-world: {package} is not installed: pip install 'mtv_world_ros[evaluate]'",
-            file=sys.stderr,
-        )
-        return 1
-    except KeyboardInterrupt:
-        return 130
+        return _said(f"{package} is not installed: pip install 'mtv_world_ros[evaluate]'", 1)
+    except KeyboardInterrupt as stopped:
+        number = getattr(stopped, 'signum', signal.SIGINT)
+        return _said(f'stopped ({signal.Signals(number).name})', 128 + number)
+
+
+def _advice(error: Exception) -> str:
+    return _ADVICE.get(error.errno or 0, '') if isinstance(error, OSError) else ''
+
+
+def _said(text: str, status: int) -> int:
+    """The status, once the one line is on stderr."""
+    print(f'mtv-world: {text}', file=sys.stderr)
+    return status

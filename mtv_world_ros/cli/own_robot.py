@@ -200,14 +200,14 @@ def _write_inspection(
     inspector: Inspector, episode: Episode, inspection: Inspection, out: Path
 ) -> None:
     from mtv_world_ros.data.bag.messages import encode_png
+    from mtv_world_ros.files import write_whole
     from mtv_world_ros.inspection.inspection_report import to_markdown
 
-    out.mkdir(parents=True, exist_ok=True)
     pictures = {}
     for view in episode.views:
         pictures[view] = f'{view}.png'
-        (out / pictures[view]).write_bytes(encode_png(inspector.picture(episode, view)))
-    (out / 'report.md').write_text(to_markdown(inspection, pictures), encoding='utf-8')
+        write_whole(out / pictures[view], encode_png(inspector.picture(episode, view)))
+    write_whole(out / 'report.md', to_markdown(inspection, pictures))
 
 
 def _views(arguments: argparse.Namespace) -> list[str] | None:

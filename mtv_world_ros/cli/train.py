@@ -397,9 +397,10 @@ def show(rollout: StoredRollout, path: Path) -> None:
     import numpy as np
 
     from mtv_world_ros.evaluation.video import encode_video
+    from mtv_world_ros.files import write_whole
 
     columns = [rollout.real, rollout.trajectory, rollout.imagined]
     rows = np.concatenate(columns, axis=3)  # (V, T, H, 3 * W, 3)
     frames = np.concatenate(list(rows), axis=1)
     even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
-    path.with_name(f'{path.name}.mp4').write_bytes(encode_video(even, rollout.fps))
+    write_whole(path.with_name(f'{path.name}.mp4'), encode_video(even, rollout.fps))

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import hashlib
+from io import BytesIO
 import json
 from pathlib import Path
 from zipfile import BadZipFile
@@ -27,6 +28,7 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
@@ -368,10 +370,9 @@ def cached_recording(
         with suppress(OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile):
             return _load(stored, path)  # where it is damaged it is made anew
     recording = load_recording(path, spec, robot, source=source)
-    cache.mkdir(parents=True, exist_ok=True)
-    partial = stored.with_suffix('.partial.npz')
-    _save(partial, recording)
-    partial.rename(stored)
+    archive = BytesIO()
+    _save(archive, recording)
+    write_whole(stored, archive.getvalue())
     return recording
 
 
@@ -388,7 +389,7 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
-def _save(file: Path, recording: Recording) -> None:
+def _save(file: BytesIO, recording: Recording) -> None:
     commands = recording.commands
     text = {
         'task': recording.task,

@@ -33,6 +33,7 @@ from mtv_world_ros.evaluation.video import (
     write_png,
     write_video,
 )
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.model.card import read_card, spec_of
 
 
@@ -83,7 +84,7 @@ def run_demo(
     predictions = read_predictions(out / 'predictions', spec.views)
     scored = _score(recording, predictions.chunks, spec.views)
     report = _report(recording, predictions, scored, spec.views)
-    (out / 'report.json').write_text(json.dumps(report, indent=2) + '\n')
+    write_whole(out / 'report.json', json.dumps(report, indent=2) + '\n')
     text = _table(report, spec.views)
     notes = text.split('\n')[-len(spec.views) - 2 :]
     sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=notes)

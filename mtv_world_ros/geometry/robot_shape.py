@@ -18,6 +18,7 @@ import pinocchio as pin
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot import RobotModel
 
@@ -236,7 +237,7 @@ def write_convex_hull(mesh: Path, out: Path) -> None:
     corners = np.array(hull.convex.points())[[[face[k] for k in range(3)] for face in faces]]
     rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in corners]
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+    write_whole(out, bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
 
 
 def _load_mesh(path: Path) -> Any:

@@ -19,7 +19,7 @@ from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.tensor_files import open_tensors, PICKLES
+from mtv_world_ros.model.tensor_files import disk_errors, open_tensors, PICKLES
 from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
 
 WEIGHTS = 'diffusion_pytorch_model'
@@ -63,7 +63,7 @@ def save_checkpoint(
     checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype = torch.float32
 ) -> None:
     """Writes a checkpoint folder; it appears under its name only when it is whole."""
-    with whole_folder(folder) as partial:
+    with disk_errors(), whole_folder(folder) as partial:
         check_card(checkpoint.card, partial)
         stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
         stored.save_pretrained(partial / 'transformer', safe_serialization=True)

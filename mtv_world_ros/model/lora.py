@@ -20,7 +20,7 @@ from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.card import CARD
-from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
+from mtv_world_ros.model.tensor_files import disk_errors, pickle_error, PICKLES
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.wan_keys import transformer_keys
 
@@ -98,7 +98,8 @@ def save_adapter(
 
 def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:
     metadata = {'format': 'pt', **({METADATA: config} if config else {})}
-    save_file({n: t.detach().contiguous() for n, t in tensors.items()}, file, metadata)
+    with disk_errors():
+        save_file({n: t.detach().contiguous() for n, t in tensors.items()}, file, metadata)
 
 
 @dataclass(frozen=True, slots=True)

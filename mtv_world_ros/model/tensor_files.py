@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 import json
 from math import prod
@@ -147,6 +148,15 @@ def _stored(handle: Any, name: str) -> StoredTensor:
     return StoredTensor(tuple(part.get_shape()), part.get_dtype(), lambda: handle.get_tensor(name))
 
 
+@contextmanager
+def disk_errors() -> Iterator[None]:
+    """Turns what safetensors raises on a full disk into OSError."""
+    try:
+        yield
+    except SafetensorError as error:
+        raise OSError(f'tensors cannot be written: {error}') from error
+
+
 def write_tensors(
     tensors: dict[str, StoredTensor], folder: Path, stem: str, *, shard_bytes: int = SHARD_BYTES
 ) -> None:
@@ -161,7 +171,8 @@ def write_tensors(
         many = f'-{number:05d}-of-{len(shards):05d}' if len(shards) > 1 else ''
         file = f'{stem}{many}.safetensors'
         values = {name: tensors[name].read().contiguous() for name in names}
-        save_file(values, folder / file, metadata={'format': 'pt'})
+        with disk_errors():
+            save_file(values, folder / file, metadata={'format': 'pt'})
         places |= dict.fromkeys(names, file)
     if len(shards) > 1:
         total = sum(tensor.num_bytes for tensor in tensors.values())

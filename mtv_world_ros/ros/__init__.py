@@ -1,1 +1,16 @@
 """The ROS 2 shell: the only part that imports rclpy and messages."""
+
+import sys
+
+from mtv_world_ros.signals import end_on_signals
+
+if sys.argv[:1] == ['-m']:  # `python -m` is about to run a node, whose imports take seconds
+    end_on_signals('mtv_world_ros')
+
+
+def run_world_model() -> int:
+    """The command `world_model`."""
+    end_on_signals('world_model')
+    from mtv_world_ros.ros.world_model.node import main
+
+    return main()

@@ -18,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.processes import PARENT_VARIABLE
+from mtv_world_ros.signals import end_on_signals
 
 _PR_SET_PDEATHSIG = 1
 AnyNode = TypeVar('AnyNode', bound=Node)
@@ -34,21 +35,6 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
     if os.getppid() != int(parent):  # gone before that was said
         sys.exit(1)
-
-
-class _Interrupt:
-    """What Python does on SIGINT, beside rclpy's own handler, which shuts ROS down.
-
-    It raises only while a node is made: that can take long, and asks nobody whether ROS is still
-    up. Afterwards the executor ends by itself, and an exception between any two lines of it
-    would leave objects half made, whose ends print tracebacks.
-    """
-
-    raises = True
-
-    def __call__(self, *_: object) -> None:
-        if self.raises:
-            raise KeyboardInterrupt
 
 
 def spin_forever(node: Node) -> None:
@@ -76,40 +62,33 @@ def run(
         help_text: printed instead if the command line has `--help`.
 
     Returns:
-        The exit status: 1 after a user error, whose text goes to stderr, else 0.
+        The exit status: 1 after an error of the user's or of the disk, whose text goes to stderr,
+        else 0. A signal n that comes while the node is made ends the process with 128 + n.
     """
     if help_text and '--help' in (sys.argv if args is None else args):
         sys.stdout.write(f'{help_text}\n')
         return 0
     end_with_parent()
-    interrupt = _Interrupt()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interrupt)
+    starting = end_on_signals('mtv_world_ros')
     _find_log_folder()
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
     try:
         node = make()
-        interrupt.raises = False
+        starting.is_over = True  # from now on rclpy's handler, or the node's own, ends it
         spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        _say_stopped(node)
+    except ExternalShutdownException:
+        pass
     except Exception as error:
         if not rclpy.ok():  # the shutdown came first: what failed after it says nothing
-            _say_stopped(node)
-        elif isinstance(error, MtvWorldError):
-            sys.stderr.write(f'{type(error).__name__}: {error}\n')
-            return 1
-        else:
+            return 0
+        if not isinstance(error, (MtvWorldError, OSError)):
             raise
+        sys.stderr.write(f'{type(error).__name__}: {error}\n')
+        return 1
     finally:
         _shut_down(node)
     return 0
-
-
-def _say_stopped(node: Node | None) -> None:
-    if node is None:
-        sys.stderr.write('stopped while starting\n')
 
 
 def _find_log_folder() -> None:

@@ -38,6 +38,7 @@ from torch import Tensor
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import Schema
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -293,8 +294,7 @@ def _check_same(out: Path, settings: Mapping[str, Any]) -> None:
                 f"'{out}' holds another distillation: its {', '.join(different)} differ; give "
                 'the same teacher and steps, or another --out'
             )
-    out.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(wanted, indent=2) + '\n')
+    write_whole(file, json.dumps(wanted, indent=2) + '\n')
 
 
 #: (B, ...) noisy latents and their noise level -> the flow (noise - clean)

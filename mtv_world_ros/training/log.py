@@ -11,6 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import parse_json
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.training.trainer import StepReport
 
 #: steps per row of the log
@@ -108,5 +109,5 @@ def _cut(file: Path, step: int) -> Path:
             except (ValueError, LookupError, TypeError):
                 break
             kept.append(line)
-        file.write_text(''.join(kept))
+        write_whole(file, ''.join(kept))
     return file

@@ -194,7 +194,7 @@ def train(
     if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
         trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
-        (out / 'skipped.json').write_text(json.dumps(skipped, indent=2))
+        write_whole(out / 'skipped.json', json.dumps(skipped, indent=2))
         tqdm.write(
             f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
             f'{source.num_clips} clips, {num_dropped(recordings, config.spec)} dropped for '

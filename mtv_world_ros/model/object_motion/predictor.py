@@ -27,6 +27,7 @@ from mtv_world_ros.model.object_motion.network import (
     Scene,
     STEP_S,
 )
+from mtv_world_ros.model.tensor_files import disk_errors
 
 #: standard deviations of where masks have an object, and of how large (relative)
 _PLACE_ERROR_M, _SIZE_ERROR = 0.003, 0.04
@@ -170,7 +171,8 @@ def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
     """Writes a network into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-    save_file(tensors, folder / _WEIGHTS)
+    with disk_errors():
+        save_file(tensors, folder / _WEIGHTS)
     write_json(folder / _CONFIG, network.config)
 
 

@@ -72,9 +72,9 @@ class Recorder(Node):
         self._stopping = False
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._writer = self._open()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._on_signal)
+        self._writer = self._open()
 
     def record(self) -> None:
         """Records for the wanted time, or until a signal comes and what was sent has arrived.

@@ -20,6 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import write_whole
 from mtv_world_ros.ros.episodes.recorder_process import predicted_topics, Recording
 from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded_start
 from mtv_world_ros.ros.messages.conversions import values_of
@@ -87,7 +88,7 @@ class EpisodeRunner(Node):
             result = self._run_one(number, start)
             self._results.append(result)
             text = json.dumps(self._results, indent=2)
-            (options.out / 'episodes.json').write_text(text + '\n', encoding='utf-8')
+            write_whole(options.out / 'episodes.json', text + '\n')
             said = f': {result["text"]}' if result['text'] else ''
             self.get_logger().info(f'episode {number}: {result["how"]}{said}')
             if result['how'].endswith('_died'):

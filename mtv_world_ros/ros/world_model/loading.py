@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
@@ -16,6 +18,10 @@ from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 from mtv_world_ros.ros.parameters import NodeSettings, Settings
+
+Cameras = tuple[CameraModel, ...]
+#: a calibration file that takes longer is given up [s]
+_READ_S = 1.0
 
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
@@ -52,10 +58,36 @@ def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[Camera
     """The same while the node runs.
 
     Raises:
-        Rejection: the file is wrong or lacks a view.
+        Rejection: the file is wrong, lacks a view, or cannot be read in time.
     """
     with rejected_as(Reason.CAMERA_INFO_INVALID):
-        return load_cameras(settings, spec)
+        return _in_time(lambda: load_cameras(settings, spec), settings.calibration_file)
+
+
+def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
+    """Reads in a thread, so that a disk or network that hangs does not hang the node.
+
+    Raises:
+        CalibrationError: it takes too long.
+    """
+    answers: SimpleQueue[Cameras | Exception] = SimpleQueue()
+
+    def run() -> None:
+        try:
+            answers.put(read())
+        except Exception as error:
+            answers.put(error)
+
+    Thread(target=run, name='files', daemon=True).start()
+    try:
+        answer = answers.get(timeout=_READ_S)
+    except Empty:
+        raise CalibrationError(
+            f"'{path}' was not read within {_READ_S:g} s; is its disk or network there?"
+        ) from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def check_calibration(
@@ -66,7 +98,7 @@ def check_calibration(
         if parameter.name != 'calibration_file':
             continue
         try:
-            load_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
+            reload_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
         except MtvWorldError as error:
             return SetParametersResult(successful=False, reason=str(error))
     return SetParametersResult(successful=True)

@@ -127,7 +127,8 @@ class Reporter:
         values = _chunk_values(chunk, self._settings())
         self._tally.counts['chunks'] += 1
         self._add_seconds(values)
-        self._publish_report('chunk', values)
+        is_seen = chunk.prediction.in_view.any()
+        self._publish_report('chunk', values, *(() if is_seen else (DiagnosticStatus.WARN,)))
 
     def sent(self, chunk: Chunk, sent: Sent) -> None:
         """Counts and reports a chunk whose frames are out, or whose rest was dropped."""
@@ -176,8 +177,10 @@ class Reporter:
         }
         self._tally.add_seconds(kept)
 
-    def _publish_report(self, state: str, values: Mapping[str, object]) -> None:
-        level = _LEVELS.get(state, DiagnosticStatus.OK)
+    def _publish_report(
+        self, state: str, values: Mapping[str, object], level: bytes | None = None
+    ) -> None:
+        level = level or _LEVELS.get(state, DiagnosticStatus.OK)
         self._publish(self._report, ': rollout', level, state, {'state': state, **values})
 
     def _publish(
@@ -364,6 +367,7 @@ def _estimate_values(chunk: Chunk) -> dict[str, object]:
         'segmenter': prediction.segmenter,
     }
     for row, view in enumerate(prediction.video.views):
+        values[f'in_view.{view}'] = float(prediction.in_view[row])
         for column, name in enumerate(masks.names):
             values[f'jaccard.{view}.{_key(name)}'] = float(success.jaccard[row, column])
             values[f'mask_status.{view}.{_key(name)}'] = masks.status[row][column]
