@@ -2,32 +2,48 @@
 
 from __future__ import annotations
 
+import resource
+
+from accidents import ACCIDENTS
+from file_kinds import INCOMPLETE, Kind, KINDS
 import fuzz
-import numpy as np
 import pytest
 
 SEED = 20261122
-COUNT = 60
+COUNT = 40
+#: more memory than an accident may take [MB]
+MOST_MB = 300
 
 
-@pytest.mark.parametrize('name', fuzz.KINDS)
-def test_mutated_input_is_read_or_refused_with_a_reason(name, tmp_path) -> None:
-    kind = fuzz.KINDS[name]
-    samples = kind.seeds()
+@pytest.mark.parametrize('name', KINDS)
+def test_damaged_input_is_read_or_refused_with_a_reason(name, tmp_path) -> None:
+    kind = KINDS[name]
+    samples = kind.samples()
+    fuzz.warm_up(kind, samples, tmp_path)
     outcomes = [fuzz.attempt(kind, sample, tmp_path)[0] for sample in samples[:3]]
-    assert set(outcomes) == {'survived'}  # what is not mutated is read
-    for case in range(max(COUNT // fuzz.SLOW.get(name, 1), 2)):
-        rng = np.random.default_rng([SEED, case])
-        data = fuzz.mutated(samples[rng.integers(len(samples))], rng)
-        outcome, _ = fuzz.attempt(kind, data, tmp_path)
+    # what is not damaged is read
+    assert set(outcomes) == {'rejected' if name in INCOMPLETE else 'survived'}
+    for case in range(max(round(COUNT * min(kind.share, 2.0)), 2)):
+        outcome, _ = fuzz.attempt(kind, fuzz.make_case(kind, samples, SEED, case), tmp_path)
         assert outcome in ('rejected', 'survived'), f'--seed {SEED} --case {case}: {outcome}'
+
+
+@pytest.mark.parametrize('name', ACCIDENTS)
+def test_what_once_was_an_accident_is_refused_in_time(name, tmp_path) -> None:
+    kind, make = ACCIDENTS[name]
+    data = make()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    outcome, _ = fuzz.attempt(KINDS[kind], data, tmp_path)
+    more_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    assert outcome == 'rejected'
+    assert more_mb < MOST_MB
 
 
 def test_an_error_that_is_not_ours_and_a_slow_case_are_failures(tmp_path) -> None:
     def crash(data, folder):
         raise KeyError('of somebody')
 
-    kind = fuzz.Kind(lambda: [b'x'], crash)
+    kind = Kind(lambda: [b'x'], crash)
     assert 'KeyError' in fuzz.attempt(kind, b'x', tmp_path)[0]
-    slow = fuzz.Kind(lambda: [b'x'], lambda data, folder: sum(range(10**6)), most_s=0.0)
+    slow = Kind(lambda: [b'x'], lambda data, folder: sum(range(10**6)), most_s=0.0)
     assert 'took' in fuzz.attempt(slow, b'x', tmp_path)[0]

@@ -1,0 +1,186 @@
+"""Inputs that once crashed, hung, filled the memory or were believed: kept, and refused now."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+import io
+import pickle
+import struct
+from typing import Any
+
+import cv2
+from file_kinds import KINDS
+from mcap.writer import CompressionType, Writer
+import msgpack
+from node_messages import ros, whole
+import numpy as np
+import zstandard
+
+from mtv_world_ros.files import share_path
+
+
+def calibration(text: str, instead: str) -> bytes:
+    """The bundled cameras with one thing replaced."""
+    whole = share_path('config', 'cameras', 'yam_bimanual.yaml').read_text()
+    assert text in whole
+    return whole.replace(text, instead, 1).encode()
+
+
+def calibrated(**values: Any) -> bytes:
+    """One camera with some values of its own."""
+    import yaml
+
+    view = {
+        'width': 96,
+        'height': 72,
+        'intrinsics': {'fx': 90.0, 'fy': 90.0, 'cx': 47.5, 'cy': 35.5},
+        'mount_link': 'base',
+        'position': [0, 1, 1],
+        'quaternion': [0, 0, 0, 1],
+    }
+    return yaml.safe_dump({'views': {'low': {**view, **values}}}).encode()
+
+
+def alias_bomb() -> bytes:
+    """Nine levels of ten aliases."""
+    lines = ['a0: &a0 [x]'] + [
+        f'a{n}: &a{n} [{", ".join([f"*a{n - 1}"] * 10)}]' for n in range(1, 10)
+    ]
+    return '\n'.join(lines).encode()
+
+
+def merge_bomb() -> bytes:
+    """Maps that merge maps that merge maps."""
+    lines = ['a0: &a0 {x: 1}']
+    for n in range(1, 25):
+        lines.append(f'a{n}: &a{n} {{<<: [*a{n - 1}, *a{n - 1}], k{n}: 1}}')
+    return '\n'.join(lines).encode()
+
+
+def jpeg_of(width: int, height: int) -> bytes:
+    """A small JPEG whose header says another size."""
+    data = bytearray(cv2.imencode('.jpg', np.zeros((16, 16, 3), np.uint8))[1].tobytes())
+    at = data.index(b'\xff\xc0')
+    data[at + 5 : at + 9] = struct.pack('>HH', height, width)
+    return bytes(data)
+
+
+def cut_jpeg() -> bytes:
+    """The first half of one."""
+    whole = KINDS['image'].samples()[0]
+    return whole[: len(whole) // 2]
+
+
+def chunk_bomb() -> bytes:
+    """A bag whose 164 kB chunk inflates to gigabytes."""
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.ZSTD)
+    writer.start(profile='ros2', library='x')
+    data = zstandard.ZstdCompressor().compressobj(size=-1)
+    packed = b''.join(data.compress(bytes(2**24)) for _ in range(320)) + data.flush()
+    body = struct.pack('<QQQI', 0, 1, 100, 0) + struct.pack('<I', 4) + b'zstd'
+    body += struct.pack('<Q', len(packed)) + packed
+    return stream.getvalue() + b'\x06' + struct.pack('<Q', len(body)) + body
+
+
+def nested_answer() -> bytes:
+    """300 bytes of maps in maps."""
+    return b'\x81' * 300 + b'\xc0'
+
+
+def vast_answer() -> bytes:
+    """An array that says it is of 4 GB."""
+    array_of = {b'__ndarray__': True, b'data': b'', b'dtype': '<f4', b'shape': [2**15, 2**15]}
+    return msgpack.packb({'actions': array_of})
+
+
+def stride_zero() -> bytes:
+    """A pickle of a tensor whose elements all are one."""
+    import torch
+
+    (whole,) = KINDS['answer, pickle'].samples()
+    one = pickle.dumps(torch.full((4,), 0.0), protocol=3)[2:-1]
+    vast = pickle.dumps(torch.zeros(1).expand(2**30), protocol=3)[2:-1]
+    assert one in whole
+    return whole.replace(one, vast, 1)
+
+
+def os_system() -> bytes:
+    """A pickle that runs a command."""
+    return b"cos\nsystem\n(S'touch /tmp/owned'\ntR."
+
+
+def joints(**changes: Any) -> Any:
+    """A joint state with some fields of its own."""
+    message = whole('joints')
+    for field, value in changes.items():
+        setattr(message, field, value)
+    return message
+
+
+def plan(names: list[str], rows: int = 4) -> Any:
+    """A plan of these joints, all at 0."""
+    return ros().make_trajectory(
+        names=names, positions=np.zeros((rows, len(names))), times=np.arange(1, rows + 1) * 0.2
+    )
+
+
+def info(**changes: Any) -> Any:
+    """A camera info with some fields of its own."""
+    message = whole('info_low')
+    for field, value in changes.items():
+        setattr(message, field, value)
+    return message
+
+
+def cut_compressed() -> Any:
+    """A message with the first half of a JPEG."""
+    message = whole('compressed_low')
+    data = bytes(message.data)
+    message.data = array('B', data[: len(data) // 2])
+    return message
+
+
+Make = Callable[[], Any]
+#: name -> (kind, what makes it)
+ACCIDENTS: dict[str, tuple[str, Make]] = {
+    'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
+    'width .inf': ('calibration', lambda: calibrated(width=float('inf'))),
+    'nesting': ('calibration', lambda: b'[' * 100_000),
+    'alias bomb': ('calibration', alias_bomb),
+    'merge bomb': ('calibration', merge_bomb),
+    'number of a megabyte': ('calibration', lambda: b'views: ' + b'9' * 10**6),
+    'focal length 1e308': (
+        'calibration',
+        lambda: calibrated(intrinsics={'fx': 1e308, 'fy': 90.0, 'cx': 47.5, 'cy': 35.5}),
+    ),
+    'python object': ('calibration', lambda: b'!!python/object/apply:os.system [ls]'),
+    'JPEG of 20000x20000': ('image', lambda: jpeg_of(20_000, 20_000)),
+    'JPEG of 65500x65500': ('image', lambda: jpeg_of(65_500, 65_500)),
+    'JPEG cut short': ('image', cut_jpeg),
+    'chunk of 5 GB': ('bag', chunk_bomb),
+    'nested answer': ('answer, msgpack', nested_answer),
+    'vast answer': ('answer, msgpack', vast_answer),
+    'tensor of stride 0': ('answer, pickle', stride_zero),
+    'pickle that runs a command': ('answer, pickle', os_system),
+}
+if 'message, plan' in KINDS:
+    ACCIDENTS |= {
+        '20,000 joint names': (
+            'message, plan', lambda: plan([f'joint{n}' for n in range(20_000)], 1)),
+        'joint name twice in a plan': ('message, plan', lambda: plan(['left_joint1'] * 2)),
+        '20,000 measured joints': (
+            'message, joints',
+            lambda: joints(name=[f'j{n}' for n in range(20_000)], position=[0.0] * 20_000)),
+        'measured joints of 1e300': ('message, joints', lambda: joints(position=[1e300] * 14)),
+        'measured joint twice': (
+            'message, joints', lambda: joints(name=['left_joint1'] * 2, position=[0.0, 0.1])),
+        'distortion NaN': ('message, info_low', lambda: info(d=[float('nan')] * 5)),
+        'distortion inf': ('message, info_low', lambda: info(d=[float('inf')] * 5)),
+        'distortion 1e30': ('message, info_low', lambda: info(d=[1e30] * 5)),
+        'focal length 1e308 in a message': (
+            'message, info_low',
+            lambda: info(k=[1e308, 0, 47.5, 0, 1e308, 35.5, 0, 0, 1.0])),
+        'JPEG cut short in a message': ('message, compressed_low', cut_compressed),
+    }  # fmt: skip

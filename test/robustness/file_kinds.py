@@ -1,0 +1,496 @@
+"""Everything that is read from outside, by kind: samples, how they are damaged, what reads them.
+
+Kinds whose name begins with `message` are ROS messages, see `node_messages`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from functools import cache, partial
+import importlib.util
+import json
+import os
+from pathlib import Path
+import pickle
+import shutil
+import sqlite3
+import tempfile
+from typing import Any, NamedTuple
+
+import cv2
+from node_messages import DAMAGE, damaged, send
+import numpy as np
+
+from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
+from mtv_world_ros.data.bag.messages import deserialize, parse_joint_trajectory, typestore
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag.recover import recover
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.success.task import load_task, load_tasks, match_task
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
+
+#: a case that takes longer is a hang [s of the process]
+MOST_S = 2.0
+#: what is put into places of a file: numbers at the ends of formats, and words of YAML and JSON
+WORDS = (
+    b'.inf', b'-.inf', b'.nan', b'NaN', b'1e999', b'-1', b'0', b'null', b'[]', b'{}', b'""',
+    b'[[[[', b'*a', b'&a', b'<<: *a', b'!!python/object:os.system', b'!!timestamp x', b'9' * 400,
+    b'\0', b'\xff\xfe', b'\xff' * 8, b'\x7f\xff\xff\xff', b'\0' * 8, b'true', b'4294967296',
+)  # fmt: skip
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """The data with a few bytes, words or parts changed."""
+    out = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        at = int(rng.integers(0, len(out) + 1))
+        word = WORDS[rng.integers(len(WORDS))]
+        changes = (
+            (at, at + 1, rng.bytes(1)),
+            (at, at, word),
+            (at, at + int(rng.integers(1, 9)), word),
+            (at, at + int(rng.integers(1, 65)), b''),
+            (at, at, bytes(out[at : at + int(rng.integers(1, 4096))])),
+            (at, at + 8, rng.bytes(8)),
+            (at, len(out) if rng.random() < 0.3 else at, b''),
+        )
+        begin, end, new = changes[rng.integers(len(changes))]
+        out[begin:end] = new
+    return bytes(out)
+
+
+def _mutated_sample(samples: list[Any], rng: np.random.Generator) -> bytes:
+    return mutated(samples[rng.integers(len(samples))], rng)
+
+
+class Kind(NamedTuple):
+    """What is read.
+
+    Attributes:
+        samples: undamaged ones.
+        read: reads a case; has a folder for files.
+        most_s: how long that may take [s].
+        damage: makes a case of the samples.
+        share: cases, as a share of those that were asked for.
+    """
+
+    samples: Callable[[], list[Any]]
+    read: Callable[[Any, Path], Any]
+    most_s: float = MOST_S
+    damage: Callable[[list[Any], np.random.Generator], Any] = _mutated_sample
+    share: float = 1.0
+
+
+def _file(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+def _config(folder: str) -> Callable[[], list[bytes]]:
+    return lambda: [file.read_bytes() for file in share_path('config', folder).glob('*.yaml')]
+
+
+def _read_robot(data: bytes, folder: Path) -> Any:
+    """Beside the files that the bundled robots name."""
+    if not (folder / 'robots').exists():
+        shutil.copytree(share_path('config', 'robots'), folder / 'robots')
+    return load_robot(_file(folder / 'robots' / 'mutated.yaml', data))
+
+
+def _images() -> list[bytes]:
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 56, 3), dtype=np.uint8)
+    pixels = cv2.GaussianBlur(pixels, (0, 0), 2)
+    options = ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2])
+    jpegs = [cv2.imencode('.jpg', pixels, option)[1].tobytes() for option in options]
+    return [*jpegs, cv2.imencode('.png', pixels)[1].tobytes()]
+
+
+def _read_image(data: bytes, _: Path) -> Any:
+    return compressed_to_rgb('jpeg', np.frombuffer(data, np.uint8))
+
+
+def _bags() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        with BagWriter(Path(folder) / 'bag') as writer:
+            for index in range(50):
+                data = b'\0\1\0\0\5\0\0\0abcd\0' + bytes(40)
+                writer.write_raw('/a', 'std_msgs/msg/String', index, data)
+        return [(Path(folder) / 'bag' / 'bag_0.mcap').read_bytes()]
+
+
+def _read_bag(data: bytes, folder: Path) -> Any:
+    reader = BagReader(_file(folder / 'bag.mcap', data))
+    for _ in reader.messages():
+        pass
+    if reader.truncated:
+        raise MtvWorldError(reader.truncated)
+
+
+def _recover(data: bytes, folder: Path) -> Any:
+    shutil.rmtree(folder / 'out', ignore_errors=True)
+    bag = recover(_file(folder / 'bag.mcap', data), folder / 'out')
+    assert sum(bag.num_messages.values()) == len(list(BagReader(folder / 'out').messages()))
+
+
+def _metadata() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        BagWriter(Path(folder) / 'bag').close()
+        return [(Path(folder) / 'bag' / 'metadata.yaml').read_bytes()]
+
+
+def _read_metadata(data: bytes, folder: Path) -> Any:
+    (folder / 'x_0.mcap').write_bytes(b'\x89MCAP0\r\n')
+    _file(folder / 'metadata.yaml', data)
+    list(BagReader(folder).messages())
+
+
+def _instructions() -> list[bytes]:
+    return [b'stack the red block on the blue block', b'put the red block ' * 400]
+
+
+def _match(data: bytes, _: Path) -> Any:
+    text = data.decode(errors='replace')[:15_000]
+    objects_from_instruction(text)
+    return match_task(load_tasks(share_path('config', 'tasks')), text)
+
+
+def _messages() -> list[bytes]:
+    """Whole messages of several types, each behind its index."""
+    names, empty = [b'a', b'b'], np.zeros(2)
+    store = typestore().types
+    stamp = store['builtin_interfaces/msg/Time'](sec=1, nanosec=2)
+    header = store['std_msgs/msg/Header'](stamp=stamp, frame_id='base')
+    after = store['builtin_interfaces/msg/Duration'](sec=1, nanosec=2)
+    point = store['trajectory_msgs/msg/JointTrajectoryPoint'](
+        positions=empty, velocities=empty, accelerations=empty, effort=empty, time_from_start=after
+    )
+    plan = store[TYPES[0]](
+        header=header, joint_names=[name.decode() for name in names], points=[point]
+    )
+    state = store[TYPES[1]](
+        header=header, name=['a', 'b'], position=empty, velocity=empty, effort=empty
+    )
+    return [
+        bytes([index]) + bytes(typestore().serialize_cdr(message, TYPES[index]))
+        for index, message in enumerate((plan, state))
+    ]
+
+
+TYPES = ('trajectory_msgs/msg/JointTrajectory', 'sensor_msgs/msg/JointState')
+
+
+def _read_message(data: bytes, _: Path) -> Any:
+    if data:
+        message = deserialize(TYPES[data[0] % len(TYPES)], data[1:])
+        if data[0] % len(TYPES) == 0:
+            parse_joint_trajectory(message)
+
+
+def _answers() -> list[bytes]:
+    """Chunks of actions as the two kinds of servers send them."""
+    from mtv_world_ros.policies.openpi_client import pack
+
+    return [pack({'actions': np.ones((8, 7)), 'state': {'a': 1.5, 'b': ['x', 2]}})]
+
+
+def _read_answer(data: bytes, _: Path) -> Any:
+    from mtv_world_ros.policies.openpi_client import unpack
+
+    return unpack(data)
+
+
+def _pickles() -> list[bytes]:
+    """Lists of timed actions as LeRobot's server sends them, made without LeRobot."""
+    import torch
+
+    out = b'\x80\x03]('
+    for value in range(3):
+        tensor = pickle.dumps(torch.full((4,), float(value)), protocol=3)[2:-1]
+        out += b'clerobot.async_inference.helpers\nTimedAction\n)\x81}X\x06\0\0\0action' + tensor
+        out += b'sb'
+    return [out + b'e.']
+
+
+def _read_pickle(data: bytes, _: Path) -> Any:
+    from mtv_world_ros.policies.timed_actions import read_timed_actions
+
+    return read_timed_actions(data)
+
+
+def _checkpoint_parts() -> list[bytes]:
+    """Every JSON file of the bundled checkpoint, behind its name."""
+    folder = share_path('resource', 'checkpoint')
+    return [
+        f'{file.relative_to(folder)}\n'.encode() + file.read_bytes()
+        for file in sorted(folder.rglob('*.json'))
+    ]
+
+
+def _load_checkpoint(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.checkpoint import load_checkpoint
+
+    name, _, content = data.partition(b'\n')
+    source = share_path('resource', 'checkpoint')
+    path = name.decode(errors='replace')
+    if path not in {str(file.relative_to(source)) for file in source.rglob('*.json')}:
+        raise MtvWorldError('the name of the file was changed')
+    shutil.rmtree(folder / 'copy', ignore_errors=True)
+    shutil.copytree(source, folder / 'copy', copy_function=os.symlink)
+    (folder / 'copy' / path).unlink()
+    (folder / 'copy' / path).write_bytes(content)
+    return load_checkpoint(folder / 'copy')
+
+
+def _recorded_sqlite() -> list[bytes]:
+    """A bag as rosbag2_storage_sqlite3 makes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'bag.db3'
+        with closing(sqlite3.connect(path)) as database:
+            database.execute(
+                'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT '
+                'NULL, serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)'
+            )
+            database.execute(
+                'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, '
+                'timestamp INTEGER NOT NULL, data BLOB NOT NULL)'
+            )
+            row = (1, '/a', 'std_msgs/msg/String', 'cdr', '')
+            database.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?)', row)
+            data = b'\0\1\0\0\5\0\0\0abcd\0'
+            rows = [(None, 1, index, data) for index in range(50)]
+            database.executemany('INSERT INTO messages VALUES (?, ?, ?, ?)', rows)
+            database.commit()
+        return [path.read_bytes()]
+
+
+def _read_sqlite(data: bytes, folder: Path) -> Any:
+    reader = BagReader(_file(folder / 'bag.db3', data))
+    for _ in reader.messages():
+        pass
+    if reader.truncated:
+        raise MtvWorldError(reader.truncated)
+
+
+def _urdfs() -> list[bytes]:
+    return [share_path('config', 'robots', 'yam_bimanual.urdf').read_bytes()]
+
+
+def _read_urdf(data: bytes, folder: Path) -> Any:
+    """By the bundled robot's YAML, which names it."""
+    shutil.copy(share_path('config', 'robots', 'yam_bimanual.yaml'), folder)
+    _file(folder / 'yam_bimanual.urdf', data)
+    return load_robot(folder / 'yam_bimanual.yaml')
+
+
+@cache
+def _yam() -> Any:
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+def _read_policy(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.policies.policy_config import load_policy_config
+
+    return load_policy_config(_file(folder / 'policy.yaml', data), _yam())
+
+
+def _read_policies(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.ranking.policy_list import load_policy_list
+
+    return load_policy_list(_file(folder / 'policies.yaml', data), _yam())
+
+
+def _read_mapping(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.data.bag_mapping import load_bag_mapping
+
+    return load_bag_mapping(_file(folder / 'mapping.yaml', data))
+
+
+def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.importing.mapping import load_mapping
+
+    (folder / 'cameras').mkdir(exist_ok=True)
+    shutil.copy(share_path('config', 'cameras', 'yam_bimanual.yaml'), folder / 'cameras')
+    (folder / 'datasets').mkdir(exist_ok=True)
+    return load_mapping(_file(folder / 'datasets' / 'mapping.yaml', data))
+
+
+def _read_preset(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.training.training_config import load_training_config
+
+    return load_training_config(str(_file(folder / 'preset.yaml', data)))
+
+
+def _read_describer(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.vision.describers.describer_config import load_describer_config
+
+    return load_describer_config(_file(folder / 'describer.yaml', data))
+
+
+def _object_lists() -> list[bytes]:
+    return [b'objects: [red block, {name: plate}]\ninstructions:\n  stack them: [red block]\n']
+
+
+def _read_objects(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.vision.describers.object_list import load_object_list
+
+    return load_object_list(_file(folder / 'objects.yaml', data))
+
+
+def _vlm_answers() -> list[bytes]:
+    return [b'{"objects": [{"name": "red block", "colour": "red"}, {"name": "plate"}]}']
+
+
+def _read_vlm_answer(data: bytes, _: Path) -> Any:
+    from mtv_world_ros.vision.describers.vlm import read_answer
+
+    return read_answer(data.decode(errors='replace'))
+
+
+def _trees() -> list[bytes]:
+    return [b'{"step": 3, "seed": 0, "ema_step": 3, "lora.rank": 0, "recent": [0.5, 0.25]}']
+
+
+def _read_state_card(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.training.resume import read_card, STATE
+
+    (folder / STATE).mkdir(exist_ok=True)
+    _file(folder / STATE / 'state.json', data)
+    return read_card(folder)
+
+
+def _features() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'features.npz'
+        np.savez(path, a=np.ones((4, 8), np.float32), b=np.zeros((2, 8), np.float32))
+        return [path.read_bytes()]
+
+
+def _read_features(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.evaluation.metrics.frechet.feature_store import load_features
+
+    return load_features(_file(folder / 'features.npz', data))
+
+
+def _read_rollout(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.evaluation.results import load_rollout
+
+    return load_rollout(_file(folder / 'rollout.npz', data))
+
+
+def _videos() -> list[bytes]:
+    from mtv_world_ros.evaluation.video import encode_video
+
+    return [encode_video(np.zeros((4, 32, 48, 3), np.uint8), 5.0)]
+
+
+def _read_video(data: bytes, _: Path) -> Any:
+    from mtv_world_ros.evaluation.video import decode_video
+
+    return decode_video(data)
+
+
+def _evaluations() -> list[bytes]:
+    metrics = {'label': 'a', 'episodes': [], 'checkpoint': 'bundled', 'views': ['low', 'high']}
+    return [json.dumps(metrics).encode()]
+
+
+def _read_evaluation(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.evaluation.report.read_back import read_evaluations
+
+    _file(folder / 'metrics.json', data)
+    return read_evaluations(folder)
+
+
+def _weights() -> list[bytes]:
+    """The autoencoder of the bundled checkpoint."""
+    folder = share_path('resource', 'checkpoint')
+    return [(folder / 'autoencoder' / 'diffusion_pytorch_model.safetensors').read_bytes()]
+
+
+def _read_weights(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.tensor_files import open_tensors
+
+    path = folder / 'weights'
+    path.mkdir(exist_ok=True)
+    _file(path / 'diffusion_pytorch_model.safetensors', data)
+    for tensor in open_tensors(path / 'diffusion_pytorch_model.safetensors').values():
+        tensor.read()
+
+
+def _networks() -> list[bytes]:
+    return [share_path('resource', 'checkpoint', 'object_motion', 'config.json').read_bytes()]
+
+
+def _read_network(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.object_motion.predictor import load_network
+
+    source = share_path('resource', 'checkpoint', 'object_motion')
+    (folder / 'motion').mkdir(exist_ok=True)
+    if not (folder / 'motion' / 'model.safetensors').exists():
+        (folder / 'motion' / 'model.safetensors').symlink_to(source / 'model.safetensors')
+    _file(folder / 'motion' / 'config.json', data)
+    return load_network(folder / 'motion')
+
+
+#: what an undamaged sample is refused for
+INCOMPLETE = ('evaluation', 'rollout', 'answer, language model')
+KINDS = {
+    'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
+    'robot': Kind(_config('robots'), _read_robot),
+    'urdf': Kind(_urdfs, _read_urdf, share=0.5),
+    'task': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
+    'policy': Kind(_config('policies'), _read_policy),
+    'policy list': Kind(_config('rankings'), _read_policies),
+    'preset': Kind(_config('models'), _read_preset),
+    'bag mapping': Kind(lambda: [share_path('config', 'datasets', 'bag.yaml').read_bytes()],
+                        _read_mapping),
+    'dataset mapping': Kind(
+        lambda: [share_path('config', 'datasets', 'example.yaml').read_bytes()],
+        _read_dataset_mapping),
+    'describer': Kind(lambda: [share_path('config', 'describer.yaml').read_bytes()],
+                      _read_describer),
+    'object list': Kind(_object_lists, _read_objects),
+    'image': Kind(_images, _read_image),
+    'video': Kind(_videos, _read_video),
+    'bag': Kind(_bags, _read_bag),
+    'bag, sqlite3': Kind(_recorded_sqlite, _read_sqlite),
+    'recover': Kind(_bags, _recover, share=0.25),
+    'metadata': Kind(_metadata, _read_metadata, share=0.5),
+    'training state': Kind(_trees, _read_state_card),
+    'features': Kind(_features, _read_features),
+    'rollout': Kind(_features, _read_rollout),
+    'evaluation': Kind(_evaluations, _read_evaluation),
+    'weights': Kind(_weights, _read_weights),
+    'object motion': Kind(_networks, _read_network, share=0.25),
+    'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, share=0.1),
+    'instruction': Kind(_instructions, _match, share=0.1),
+    'answer, msgpack': Kind(_answers, _read_answer),
+    'answer, pickle': Kind(_pickles, _read_pickle),
+    'answer, language model': Kind(_vlm_answers, _read_vlm_answer),
+    'message, CDR': Kind(_messages, _read_message),
+}  # fmt: skip
+
+
+def _is_installed(package: str) -> bool:
+    return importlib.util.find_spec(package) is not None
+
+
+def _damaged(key: str, samples: list[Any], rng: np.random.Generator) -> Any:
+    return damaged(key, rng)
+
+
+if _is_installed('rclpy'):
+    KINDS |= {
+        f'message, {key}': Kind(
+            partial(list, [None]),
+            lambda message, _, key=key: message and send(key, message),
+            damage=partial(_damaged, key),
+            share=20.0,
+        )
+        for key in DAMAGE
+    }
