@@ -446,6 +446,7 @@ JOINT_STATES = ('joint_states:=start/joint_states',)
 COMPRESSED = CompressedImage
 IMAGE = Image
 INFO = CameraInfo
+JOINT_STATE = JointState
 STRING = String
 REPORT = DiagnosticArray
 TRIGGER = Trigger

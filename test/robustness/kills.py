@@ -1,0 +1,290 @@
+"""Kills of recorder, player, policy node and world model at random moments: `make kills`.
+
+Nothing older than a second may be lost, whoever is left goes on, and whoever starts again works:
+a killed recording is recovered and read by rosbags, and the node that is started after a killed
+one answers a plan with one end. The processes are forked from one that has imported everything
+(so that starting hundreds is cheap), and are killed from 0 to `--longest` seconds after that.
+Prints a table; the exit status is 1 if anything was lost, hung or ended with a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import shutil
+import signal
+import sys
+import time
+from typing import Any, NamedTuple
+
+from node_messages import ROOT, ros
+import numpy as np
+from rosbags.highlevel import AnyReader
+
+from mtv_world_ros.data.bag.recover import find_damaged, recover
+from mtv_world_ros.errors import EpisodeError
+
+sys.path.insert(0, str(ROOT / 'test' / 'ros'))
+
+START_S = 60.0
+PERIOD_S = 0.01
+
+
+def imported() -> dict[str, Callable[[], int]]:
+    """What is run, by name; importing it takes seconds, which the fork server spends once."""
+    import fake_policy
+    import fake_world_model
+
+    from mtv_world_ros.ros.bags import player, recorder
+    from mtv_world_ros.ros.policy import node as policy
+    from mtv_world_ros.ros.world_model import node
+
+    def policy_main() -> int:
+        return policy.main(load=lambda _: lambda task, scene_seed: fake_policy.FakePolicy(task))
+
+    def node_main() -> int:
+        return node.main(load=fake_world_model.load)
+
+    return {
+        'recorder': recorder.main,
+        'player': player.main,
+        'policy': policy_main,
+        'world_model': node_main,
+    }
+
+
+def run_forked(name: str, words: list[str], log: str) -> None:
+    """Runs one in this process, which was forked for it."""
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    sys.argv = [name, *words]
+    main = imported()[name]
+    sys.exit(main(words) if name in ('recorder', 'player') else main())
+
+
+class Killed(NamedTuple):
+    """One kill: when [s after the start], what was wrong (empty = nothing), seconds to be well."""
+
+    after_s: float
+    problem: str
+    seconds: float
+
+
+class Kills:
+    """Starts, kills, and looks at what is left.
+
+    Args:
+        out: folder of logs and bags.
+        seed: of the moments.
+        longest_s: latest moment [s].
+    """
+
+    def __init__(self, out: Path, seed: int, longest_s: float) -> None:
+        self._out, self._longest_s = out, longest_s
+        self._rng = np.random.default_rng(seed)
+        self._context = multiprocessing.get_context('forkserver')
+        self._context.set_forkserver_preload(['kills_preload'])
+        self._client = ros().Client()
+        self._joints = self._client.node.create_publisher(ros().JOINT_STATE, '/joints', 1000)
+        self._sent: list[int] = []
+        self._client.node.create_timer(PERIOD_S, self._publish)
+        self._heard = 0
+        self._client.node.create_subscription(
+            ros().JOINT_STATE, '/joint_states', lambda _: self._hear(), 10
+        )
+        self._episode = self._write_episode()
+        ros().make_calibration(out / 'calibration.yaml')
+        if not (out / 'checkpoint').exists():
+            ros().make_checkpoint(out / 'checkpoint')
+
+    def kill(self, name: str) -> Killed:
+        """Starts and kills one of `VICTIMS`."""
+        after_s = float(self._rng.uniform(0, self._longest_s))
+        prepare, words, check = VICTIMS[name]
+        prepare(self)
+        log = self._out / f'{name}.log'
+        process = self._start(name, words(self), log)
+        self._sent.clear()
+        self._client.spin_for(after_s)
+        problem = ''
+        if process.exitcode not in (None, 0) and name != 'player':
+            problem = f'it had ended with {process.exitcode}'
+        if process.pid is not None and process.exitcode is None:
+            os.kill(process.pid, signal.SIGKILL)
+        killed_ns = time.time_ns()
+        process.join(10)
+        begin = time.monotonic()
+        try:
+            check(self, log, killed_ns)
+        except (AssertionError, EpisodeError) as error:
+            problem = f'{type(error).__name__}: {error}'
+        if 'Traceback' in log.read_text(errors='replace'):
+            problem = log.read_text(errors='replace')[-2000:]
+        return Killed(after_s, problem, time.monotonic() - begin)
+
+    def close(self) -> None:
+        """Ends the client."""
+        self._client.close()
+
+    def _publish(self) -> None:
+        message = ros().make_joint_state(time.time_ns())
+        self._joints.publish(message)
+        self._sent.append(time.time_ns())
+
+    def _hear(self) -> None:
+        self._heard += 1
+
+    def _start(self, name: str, words: list[str], log: Path) -> Any:
+        process = self._context.Process(target=run_forked, args=(name, words, str(log)))
+        process.start()
+        end = time.monotonic() + START_S
+        while not log.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        return process
+
+    def _write_episode(self) -> Path:
+        from mtv_world_ros.data.episode_writer import EpisodeWriter
+        from mtv_world_ros.geometry.calibration_file import load_calibration
+
+        shutil.rmtree(self._out / 'episode', ignore_errors=True)
+        cameras = load_calibration(ros().make_calibration(self._out / 'calibration.yaml'))
+        with EpisodeWriter(
+            self._out / 'episode', task='', instruction='', robot='yam_bimanual',
+            cameras=list(cameras.values()),
+        ) as writer:  # fmt: skip
+            for step in range(200):
+                stamp_ns = 1_700_000_000_000_000_000 + step * 50_000_000
+                writer.write_joint_states(stamp_ns, ros().JOINTS, ros().HOME)
+                for view, camera in cameras.items():
+                    writer.write_camera_info(view, stamp_ns, camera)
+                    writer.write_image(view, stamp_ns, ros().make_pixels(view))
+        return self._out / 'episode'
+
+    # recorder
+
+    def clear_bags(self) -> None:
+        """Removes the bags of the kill before."""
+        for path in [self._out / 'bag', *self._out.glob('.bag.*')]:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def recorder_words(self) -> list[str]:
+        """Records what the client publishes."""
+        return [str(self._out / 'bag'), '/joints']
+
+    def check_recorder(self, log: Path, killed_ns: int) -> None:
+        """Every message from the announcement to a second before the kill is in the bag."""
+        if ': recording' not in log.read_text(errors='replace'):
+            return  # killed while starting
+        bags = [recover(source) for source in find_damaged(self._out / 'bag')]
+        with AnyReader([bags[0].path]) as bag:
+            times = [stamp for _, stamp, _ in bag.messages()]
+        assert times, 'nothing was recorded'
+        sent = [at for at in self._sent if times[0] < at < killed_ns - 1_000_000_000]
+        got = sum(times[0] <= at < killed_ns - 1_000_000_000 for at in times)
+        # a message is sent a little before it is recorded: the one at either end may be left out
+        assert got >= len(sent) - 2, f'{got} of {len(sent)} messages older than 1 s'
+
+    # player
+
+    def player_words(self) -> list[str]:
+        """Plays to anybody, faster than it was recorded."""
+        return [str(self._episode), '--no-wait', '--loop', '--rate', '4']
+
+    def check_player(self, log: Path, killed_ns: int) -> None:
+        """Who listened goes on; what was played is whole (it could be deserialised)."""
+        self._client.spin_for(0.02)
+
+    # policy node
+
+    def policy_words(self) -> list[str]:
+        """The fake policy, of the fake model's sizes."""
+        values = (f'checkpoint:={self._out / "checkpoint"}',
+                  f'calibration_file:={self._out / "calibration.yaml"}',
+                  'diagnostics_period_s:=0.2', *ros().FROZEN)  # fmt: skip
+        return ['--ros-args', *(part for value in values for part in ('-p', value))]
+
+    # world model
+
+    def forget_node(self) -> None:
+        """Sends a plan, if a node that was not killed is there to hear it."""
+        self._client.forget_node()
+
+    def node_words(self) -> list[str]:
+        """The fake model."""
+        values = (f'calibration_file:={self._out / "calibration.yaml"}', 'pace:=burst',
+                  'diagnostics_period_s:=0.2', 'max_image_age_s:=10.0',
+                  'max_joint_state_age_s:=10.0')  # fmt: skip
+        return ['--ros-args', *(part for value in values for part in ('-p', value))]
+
+    def check_node(self, log: Path, killed_ns: int) -> None:
+        """Another one answers a plan, with one end."""
+        self._client.forget_node()
+        process = self._start('world_model', self.node_words(), log)
+        try:
+            self._client.connect_inputs(ros().INPUTS)
+            since = len(self._client.report_values())
+            self._client.send_scene()
+            self._client.send_trajectory()
+            ended = self._client.next_end(since)
+            assert ended['state'] == 'done', ended
+            self._client.send_trajectory()  # the kill comes to it, or after it
+        finally:
+            os.kill(process.pid, signal.SIGKILL)
+            process.join(10)
+            self._client.forget_node()
+
+
+def _nothing(*_: object) -> None:
+    pass
+
+
+#: name -> what is done before, its command line, what is looked at afterwards
+VICTIMS: dict[str, tuple[Callable[..., None], Callable[..., list[str]], Callable[..., None]]] = {
+    'recorder': (Kills.clear_bags, Kills.recorder_words, Kills.check_recorder),
+    'player': (_nothing, Kills.player_words, Kills.check_player),
+    'policy': (_nothing, Kills.policy_words, _nothing),
+    'world_model': (_nothing, Kills.node_words, Kills.check_node),
+}
+
+
+def main() -> int:
+    """Kills; 1 if something was wrong afterwards."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    parser.add_argument('--kills', type=int, default=500, help='of all together')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--longest', type=float, default=3.0, help='latest moment [s]')
+    parser.add_argument('--only', nargs='+', choices=VICTIMS, default=list(VICTIMS))
+    parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'kills')
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    print(f'seed {arguments.seed}', flush=True)
+    kills = Kills(arguments.out, arguments.seed, arguments.longest)
+    found: dict[str, list[Killed]] = {name: [] for name in arguments.only}
+    for number in range(arguments.kills):
+        name = arguments.only[number % len(arguments.only)]
+        found[name].append(kills.kill(name))
+        if found[name][-1].problem:
+            print(f'kill {number}, {name}: {found[name][-1].problem}', flush=True)
+        rows = [
+            {
+                'kind': f'kill of {name}',
+                'tried': len(done),
+                'failures': [one.problem for one in done if one.problem],
+                'worst_s': max((one.seconds for one in done), default=0.0),
+            }
+            for name, done in found.items()
+        ]
+        (arguments.out / 'kills.json').write_text(json.dumps(rows, indent=1))
+    kills.close()
+    for row in rows:
+        print(f'{row["kind"]}: {row["tried"]} tried, {len(row["failures"])} failed', flush=True)
+    return int(any(row['failures'] for row in rows))
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

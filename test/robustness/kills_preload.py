@@ -1,0 +1,5 @@
+"""Loaded by the fork server of `kills`: everything that is started, so that starting is cheap."""
+
+import kills
+
+kills.imported()
