@@ -156,7 +156,7 @@ def read_results(out: Path) -> list[Result]:
     found = []
     for path in sorted((out / FOLDER).glob('*.json')):
         try:
-            found.append(Result.from_json(json.loads(path.read_text(encoding='utf-8'))['result']))
+            found.append(Result.from_json(read_json(path)['result']))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(
                 f"'{path}' cannot be read ({type(error).__name__}: {error}); run `mtv-world rank` "
