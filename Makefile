@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test fuzz soak lint format docs clean distclean
+.PHONY: help install demo test fuzz kills soak lint format docs clean distclean
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -33,8 +33,11 @@ lint: $(STAMP)  ## ruff, pyright and import-linter
 test: lint  ## the linters, then all tests (about 10 minutes)
 	$(BIN)/python -m pytest
 
-fuzz: $(STAMP)  ## mutate everything that is read from outside (minutes); prints seed and table
+fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
 	$(BIN)/python test/robustness/fuzz.py
+
+kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour); prints a table
+	$(BIN)/python test/robustness/kills.py
 
 soak: $(STAMP)  ## many rollouts with faults (hours); memory, threads, latency under out/soak/
 	$(BIN)/python test/robustness/soak.py
