@@ -1,38 +1,42 @@
 """Which faults of a recording does `mtv-world doctor` find, and which right ones does it pass?
 
-    python benchmark/doctor_faults.py DATASET [--views low,high] [--episodes 10] [--robot YAML]
+    python benchmark/doctor_faults.py DATASET [DATASET ...] [--repeats 20]
 
-Every episode is judged as it is and with one thing wrong at a time: the camera turned about each
-axis, moved, with a scaled K or another view's calibration, or its clock late. The episodes' own
-calibration is taken to be right.
+Views of cameras that stand still are judged as they are and with one thing wrong at a time: the
+camera turned about each axis, moved, with a scaled K or another view's calibration, or its clock
+late or early. The episodes' own calibration is taken to be right. The sign of each fault is drawn.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from page import parse_arguments, publish, table
 
-from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.assembly import recorded_robot
 from mtv_world_ros.data.episode import Episode
-from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.inspection.inspect import load_inspector
+from mtv_world_ros.geometry.robot_shape import moving_links
+from mtv_world_ros.inspection.inspect import Inspector, load_inspector
 
-Fault = Callable[[Episode, str], Episode]
+#: (episode, view, sign) -> the same with something wrong
+Fault = Callable[[Episode, str, float], Episode]
 
 
 def turned(axis: int, degrees: float) -> Fault:
     """The camera turned about an axis of its own (0 right, 1 down, 2 ahead)."""
 
-    def change(episode: Episode, view: str) -> Episode:
+    def change(episode: Episode, view: str, sign: float) -> Episode:
         turn = np.eye(4)
         a, b = [k for k in range(3) if k != axis]
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        angle = sign * np.radians(degrees)
+        c, s = np.cos(angle), np.sin(angle)
         turn[[a, b, a, b], [a, b, b, a]] = c, c, -s, s
         camera = episode.cameras[view]
         return with_camera(episode, replace(camera, T_mount_camera=camera.T_mount_camera @ turn))
@@ -43,10 +47,10 @@ def turned(axis: int, degrees: float) -> Fault:
 def moved(metres: float) -> Fault:
     """The camera moved sideways."""
 
-    def change(episode: Episode, view: str) -> Episode:
+    def change(episode: Episode, view: str, sign: float) -> Episode:
         camera = episode.cameras[view]
         T = camera.T_mount_camera.copy()
-        T[:3, 3] += metres * T[:3, 0]
+        T[:3, 3] += sign * metres * T[:3, 0]
         return with_camera(episode, replace(camera, T_mount_camera=T))
 
     return change
@@ -55,17 +59,19 @@ def moved(metres: float) -> Fault:
 def zoomed(factor: float) -> Fault:
     """K for images of another size."""
 
-    def change(episode: Episode, view: str) -> Episode:
+    def change(episode: Episode, view: str, sign: float) -> Episode:
         camera = episode.cameras[view]
-        scale = np.diag([factor, factor, 1.0])
+        by = factor**sign
+        scale = np.diag([by, by, 1.0])
         return with_camera(episode, replace(camera, K=scale @ camera.K))
 
     return change
 
 
-def swapped(episode: Episode, view: str) -> Episode:
+def swapped(episode: Episode, view: str, sign: float) -> Episode:
     """The next view's calibration."""
-    names = list(episode.cameras)
+    del sign
+    names = list(episode.views)
     other = episode.cameras[names[(names.index(view) + 1) % len(names)]]
     return with_camera(episode, replace(other, view=view))
 
@@ -73,9 +79,9 @@ def swapped(episode: Episode, view: str) -> Episode:
 def late(seconds: float) -> Fault:
     """The images' clock late against the joint states'."""
 
-    def change(episode: Episode, view: str) -> Episode:
+    def change(episode: Episode, view: str, sign: float) -> Episode:
         track = episode.images[view]
-        stamps = track.stamps_ns + round(seconds * 1e9)
+        stamps = track.stamps_ns + round(sign * seconds * 1e9)
         return replace(episode, images={**episode.images, view: track._replace(stamps_ns=stamps)})
 
     return change
@@ -91,46 +97,76 @@ FAULTS: dict[str, Fault | None] = {
     'rolled by 10 degrees': turned(2, 10),
     'rolled by 40 degrees': turned(2, 40),
     'turned sideways by 3 degrees': turned(1, 3),
-    'tilted by 3 degrees': turned(0, -3),
+    'tilted by 3 degrees': turned(0, 3),
     'moved by 5 cm': moved(0.05),
-    'K scaled by 0.5': zoomed(0.5),
-    'K scaled by 1.15': zoomed(1.15),
-    'K scaled by 2': zoomed(2),
+    'K scaled by 1.15 or its inverse': zoomed(1.15),
+    'K scaled by 2 or 0.5': zoomed(2),
     'views swapped': swapped,
-    'images 0.2 s late': late(0.2),
-    'images 1 s late': late(1.0),
+    'images 0.2 s late or early': late(0.2),
+    'images 1 s late or early': late(1.0),
 }
 
 
-def main() -> None:
-    """Prints a row a fault: views judged, and how many got each verdict."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('dataset', type=Path)
-    parser.add_argument('--views')
-    parser.add_argument('--episodes', type=int, default=10)
-    parser.add_argument('--robot', default='yam_bimanual')
-    options = parser.parse_args()
-    inspector = load_inspector(robot_path(options.robot))
-    views = options.views.split(',') if options.views else None
-    paths = list_episodes(options.dataset)
-    paths = [paths[i * len(paths) // options.episodes] for i in range(options.episodes)]
+def judge(
+    inspector: Inspector, episode: Episode, view: str, rng: np.random.Generator
+) -> Iterator[tuple[str, str]]:
+    """Yields the name and the verdict of each fault in one view."""
+    for name, fault in FAULTS.items():
+        sign = float(rng.choice((-1.0, 1.0)))
+        judged = fault(episode, view, sign) if fault else episode
+        section = inspector.inspect(replace(judged, views=(view,))).views[0]
+        if fault is None and section.verdict != 'ok':
+            print(view, [finding.text for finding in section.findings], flush=True)
+        yield name, section.verdict
+
+
+def fixed_views(inspector: Inspector, path: Path) -> Episode:
+    """Returns an episode with the views that stand still, decoded."""
+    episode = read_episode(path, with_masks=False)
+    moving = moving_links(inspector.robot)
+    views = tuple(v for v in episode.views if episode.cameras[v].mount_link not in moving)
+    images = {v: episode.images[v] for v in views}
+    decoded = {v: t._replace(frames=np.asarray(t.frames)) for v, t in images.items()}
+    return replace(episode, views=views, images=decoded)
+
+
+def count(dataset: Path, repeats: int, seed: int) -> tuple[str, dict[str, Counter[str]]]:
+    """Returns the robot of a data set, and the verdicts of each fault in `repeats` views."""
+    rng, paths = np.random.default_rng(seed), list_episodes(dataset)
+    inspector = load_inspector(recorded_robot(paths[0], read_info(paths[0]).robot))
     counts: dict[str, Counter[str]] = {name: Counter() for name in FAULTS}
-    for path in paths:
-        read = read_episode(path, views=views, with_masks=False)
-        decoded = {v: t._replace(frames=np.asarray(t.frames)) for v, t in read.images.items()}
-        episode = replace(read, images=decoded)
-        for name, fault in FAULTS.items():
-            for view in episode.views:
-                judged = fault(episode, view) if fault else episode
-                section = inspector.inspect(replace(judged, views=(view,))).views[0]
-                counts[name][section.verdict] += 1
-                if fault is None and section.verdict != 'ok':
-                    print(path.name, view, [finding.text for finding in section.findings])
-    print(f'{inspector.robot.name}, {len(paths)} episodes, {inspector.shape.source}')
-    for name, count in counts.items():
-        total = sum(count.values())
-        good = count['ok'] if name == 'as it is' else count['suspicious'] + count['broken']
-        print(f'| {name} | {good} of {total} | {dict(count)} |', flush=True)
+    for path in rng.permutation(np.array(paths, dtype=object)):
+        episode = fixed_views(inspector, path)
+        for view in episode.views:
+            if counts['as it is'].total() < repeats:
+                for name, verdict in judge(inspector, episode, view, rng):
+                    counts[name][verdict] += 1
+                print(inspector.robot.name, {k: dict(v) for k, v in counts.items()}, flush=True)
+    return inspector.robot.name, counts
+
+
+def main() -> None:
+    """Publishes a row a fault and a column a robot."""
+
+    def more(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument('datasets', type=Path, nargs='+')
+
+    options = parse_arguments(__doc__, 20, more)
+    found = dict(count(path, options.repeats, options.seed) for path in options.datasets)
+    rows = [[name, *(_cell(name, counts[name]) for counts in found.values())] for name in FAULTS]
+    body = (
+        'Views that were judged right: passed (`ok`) as they are, found (`suspicious` or '
+        '`broken`) with a fault; n is the number of views of each robot at most.\n\n'
+        + table(['the view', *(f'`{name}`' for name in found)], rows)
+    )
+    title = 'Which faults does the doctor find, and which right views does it pass?'
+    command = f'python benchmark/doctor_faults.py {" ".join(p.name for p in options.datasets)}'
+    publish('doctor_faults', title, command, body, options, 'simulated episodes')
+
+
+def _cell(name: str, verdicts: Counter[str]) -> str:
+    wanted = ('ok',) if FAULTS[name] is None else ('suspicious', 'broken')
+    return f'{sum(verdicts[one] for one in wanted)} of {verdicts.total()}'
 
 
 if __name__ == '__main__':

@@ -31,6 +31,7 @@ DESCRIBES = {
     'collect': ('mtv_world_ros/sim',),
     'control_representations': ('mtv_world_ros/training', 'mtv_world_ros/model'),
     'denoising_steps': ('mtv_world_ros/model/sampler.py',),
+    'doctor': ('mtv_world_ros/inspection',),
     'distillation': ('mtv_world_ros/training', 'mtv_world_ros/model'),
     'evaluation': ('mtv_world_ros/evaluation',),
     'foresight': ('mtv_world_ros/ros',),
