@@ -171,4 +171,4 @@ def _runner_command(options: ImagineOptions, views: Sequence[str], out: Path) ->
         arguments += ['--episodes', *(str(path) for path in options.episodes)]
     else:
         arguments += ['--live']
-    return module_command('episodes.runner', *arguments)
+    return module_command('episodes.episode_runner', *arguments)

@@ -254,6 +254,9 @@ def check_ros2(words: Sequence[str]) -> bool:
         assert words[1] == 'mtv_world_ros'
         assert words[2] in ('mtv-world', 'world_model')
         PROGRAMS[words[2]](words[3:])
+    elif words[0] == 'lifecycle':
+        assert words[1:3] == ['set', '/world_model']
+        assert words[3:] in (['configure'], ['activate'], ['deactivate'], ['cleanup'])
     else:
         assert words[:2] in (['bag', 'play'], ['bag', 'record'])
     return False

@@ -1,7 +1,10 @@
 """Parameter file, its page, viewer layout, middleware profile and launch files fit the node."""
 
 import ast
+from importlib.util import find_spec
 import json
+from pathlib import Path
+import re
 import runpy
 from xml.etree import ElementTree
 
@@ -94,3 +97,13 @@ def test_launch_arguments_name_parameters_that_exist(name):
     for node in tree.body:
         if isinstance(node, ast.Assign) and node.targets[0].id == 'PARAMETERS':
             assert {key.value for key in node.value.keys} <= known
+
+
+def test_modules_that_are_started_as_processes_exist():
+    started = [
+        re.findall(r"module_command\(\s*'([\w.]+)'", path.read_text(encoding='utf-8'))
+        for path in Path(find_spec('mtv_world_ros').origin).parent.rglob('*.py')
+    ]
+    names = sorted({name for found in started for name in found})
+    assert len(names) >= 6
+    assert [name for name in names if find_spec(f'mtv_world_ros.ros.{name}') is None] == []

@@ -46,7 +46,7 @@ class Recording:
         logs.mkdir(parents=True, exist_ok=True)
         self._log = logs / 'recorder.log'
         arguments = (str(self._out), *topics, '--stamp', 'header')
-        command = module_command('episodes.recorder', *arguments)
+        command = module_command('episodes.episode_recorder', *arguments)
         self._process = start_process('recorder', command, logs)
         self._peers.wait(self._is_on, f"the recorder; see '{self._log}'", 2 * _TIMEOUT_S)
 
