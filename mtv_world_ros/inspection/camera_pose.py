@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.inspection.clocks import JointTrack
+
+#: turns [rad] and shifts [m] that change the picture about alike
+UNITS = np.array([0.01] * 3 + [0.005] * 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,15 +27,13 @@ class CameraEstimate:
         camera: with the estimated pose, at the size of the recorded images.
         std_mm: standard error of the camera's place [mm].
         std_deg: standard error of its direction and roll [degrees].
-        fit: correlation of drawn and seen motion, up to 1.
-        num_pairs: of frames.
+        evidence: what it was estimated from and how well that fits, in words.
     """
 
     camera: CameraModel
     std_mm: float
     std_deg: float
-    fit: float
-    num_pairs: int
+    evidence: str
 
 
 def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
@@ -46,6 +48,51 @@ def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArr
     change[:3, :3] = cv2.Rodrigues(np.asarray(parameters[:3], float))[0]
     change[:3, 3] = parameters[3:]
     return middle @ change @ np.linalg.inv(middle) @ T
+
+
+def aligned(
+    T: FloatArray,
+    errors: Callable[[FloatArray], NDArray[np.floating]],
+    centre: FloatArray | None = None,
+    *,
+    outlier: float,
+    iterations: int = 10,
+) -> FloatArray:
+    """Returns the pose nearby with the least errors (Levenberg-Marquardt).
+
+    Args:
+        T: the pose (4, 4) to start from.
+        errors: (N,) of a pose.
+        centre: point that it is turned about; None = its own place.
+        outlier: errors from here on count less (Cauchy's loss).
+        iterations: at most.
+    """
+    damping = 0.01
+
+    def cost(values: NDArray[np.floating]) -> float:
+        return float(np.log1p((values / outlier) ** 2).mean())
+
+    now = errors(T)
+    for _ in range(iterations):
+        middle = T[:3, 3] if centre is None else centre
+        slopes = np.stack(
+            [(errors(moved(T, s, middle)) - errors(moved(T, -s, middle))) / 2
+             for s in np.diag(UNITS)]
+        )  # fmt: skip
+        weighted = slopes / (1 + (now / outlier) ** 2)
+        normal, gradient = weighted @ slopes.T, weighted @ now
+        damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
+        step = -np.linalg.solve(damped, gradient)
+        step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
+        tried = moved(T, np.asarray(step * UNITS, np.float64), middle)
+        there = errors(tried)
+        if cost(there) < cost(now):
+            T, now, damping = tried, there, damping / 3
+        else:
+            damping *= 10
+        if float(np.abs(step).max()) < 0.01:
+            break
+    return T
 
 
 def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:
@@ -107,6 +154,24 @@ def spread(poses: Sequence[FloatArray]) -> tuple[float, float]:
         float(np.sqrt(factor * ((rows - rows.mean(axis=0)) ** 2).sum())) * unit
         for rows, unit in ((places, 1000.0), (turns, 180 / np.pi))
     )
+
+
+def influence(normals: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Returns how least-squares parameters change when a group of measurements is left out.
+
+    Args:
+        normals: (G, P, P) each group's part of the normal matrix.
+        gradients: (G, P) each group's part of the gradient, at the solution of all.
+    """
+    rest = normals.sum(axis=0) - normals
+    rest = rest + 1e-9 * np.trace(rest, axis1=1, axis2=2)[:, None, None] * np.eye(rest.shape[-1])
+    return np.asarray(np.linalg.solve(rest, gradients[..., None])[..., 0], np.float64)
+
+
+def standard_errors(changes: FloatArray) -> tuple[float, float]:
+    """Jackknife standard errors [mm, degrees] of changes (G, 6): turns [rad], shifts [m]."""
+    spreads = (len(changes) - 1) / len(changes) * ((changes - changes.mean(axis=0)) ** 2).sum(0)
+    return 1000 * float(np.sqrt(spreads[3:].sum())), float(np.degrees(np.sqrt(spreads[:3].sum())))
 
 
 def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
