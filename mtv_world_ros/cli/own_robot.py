@@ -13,9 +13,11 @@ from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import EpisodeSource
-    from mtv_world_ros.data.episode import Episode
+    from mtv_world_ros.data.episode import Episode, Track
+    from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot import RobotModel
     from mtv_world_ros.inspection.camera_pose import CameraEstimate
+    from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.inspect import Inspector
     from mtv_world_ros.inspection.inspection_report import Inspection
 
@@ -182,7 +184,11 @@ def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, Episod
 
 
 def _read(
-    path: Path, views: list[str] | None, source: EpisodeSource, robot: RobotModel
+    path: Path,
+    views: list[str] | None,
+    source: EpisodeSource,
+    robot: RobotModel,
+    unknown_mount: str = '',
 ) -> Episode:
     from mtv_world_ros.data.episode_reader import read_episode
 
@@ -193,6 +199,7 @@ def _read(
         with_masks=False,
         mapping=source.mapping,
         robot=robot,
+        unknown_mount=unknown_mount,
     )
 
 
@@ -219,7 +226,8 @@ def _views(arguments: argparse.Namespace) -> list[str] | None:
 def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'calibrate-camera',
-        help='estimate where a fixed camera is, from a recording in which the arm moves',
+        help='estimate where a camera is, fixed or on the arm, from a recording in which the arm '
+        'moves',
         epilog='Intrinsics come from the recording; the pose there is the guess to start from. '
         'This is the calibration of a camera: that of the success estimate is `calibrate`.',
     )
@@ -229,9 +237,14 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
         '--no-guess',
         dest='guess',
         action='store_false',
-        help='search from all sides instead of starting from the pose in the recording',
+        help='search from all sides instead of starting from the pose in the recording, which '
+        'need not have one',
     )
-    parser.add_argument('--mount-link', help='link that carries it; default: as recorded')
+    parser.add_argument(
+        '--mount-link',
+        help='link that carries it; `find` = the one of the arm whose motion fits; default: as '
+        'recorded',
+    )
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     add_source(parser)
     parser.add_argument('--seed', type=int, default=0, help='of the search')
@@ -259,12 +272,18 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"'{out}' has view '{arguments.view}' already; name another --out")
     file, source = _robot_file(arguments, arguments.episode)
     robot = load_robot(file)
-    episode = _read(arguments.episode, [arguments.view], source, robot)
+    episode = _read(
+        arguments.episode,
+        [arguments.view],
+        source,
+        robot,
+        '' if arguments.guess else robot.base_link,
+    )
     guess = episode.cameras[arguments.view]
     estimate = estimate_camera(episode, robot, arguments)
     camera = estimate.camera
     print(_estimate_text(estimate))
-    if arguments.guess:
+    if arguments.guess and guess.mount_link == camera.mount_link:
         mm, degrees = difference(guess.T_mount_camera, camera.T_mount_camera)
         print(f'the guess was {mm:.0f} mm and {degrees:.1f} degrees away')
     save_calibration(out, {**known, arguments.view: camera})
@@ -284,30 +303,66 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
 def estimate_camera(
     episode: Episode, robot: RobotModel, arguments: argparse.Namespace
 ) -> CameraEstimate:
-    """Returns the estimate for a view, on its mount link."""
+    """Returns the estimate for a view, on its mount link.
+
+    Raises:
+        CalibrationError: the recording does not determine it.
+        ConfigError: a guess is wanted for another link than the recorded one.
+    """
     from dataclasses import replace
 
-    import numpy as np
-
     from mtv_world_ros.errors import EpisodeError
-    from mtv_world_ros.geometry.robot_shape import load_shape, moving_links
-    from mtv_world_ros.geometry.transforms import inverse
+    from mtv_world_ros.geometry.robot_shape import moving_links
     from mtv_world_ros.inspection.clocks import JointTrack
-    from mtv_world_ros.inspection.fixed_camera import FixedCamera
+    from mtv_world_ros.inspection.wrist_camera import (
+        find_mount,
+        follow_scene,
+        WristCamera,
+    )
 
     if episode.joint_states is None:
         raise EpisodeError(f"'{episode.info.path}' has no joint_states")
     joints = JointTrack(episode.joint_states, robot)
     track, camera = episode.images[arguments.view], episode.cameras[arguments.view]
     link = arguments.mount_link or camera.mount_link
-    rest = robot.link_poses(link, np.zeros((1, len(robot.joint_names))))[0]
-    if link in moving_links(robot):
+    on_arm = link in (*moving_links(robot), 'find')
+    if arguments.guess and link != camera.mount_link and on_arm:
         raise ConfigError(
-            f"view '{arguments.view}' moves with '{link}'; only cameras that stand still can be "
-            'estimated (--mount-link names the link that carries it)'
+            f"the pose in the recording is one in link '{camera.mount_link}' and no guess for "
+            f"'{link}'; give --no-guess"
         )
+    if link == 'find':
+        return find_mount(follow_scene(track, camera, robot, joints), camera, robot)
+    if on_arm:
+        tracks = follow_scene(track, camera, robot, joints)
+        on_link = replace(camera, mount_link=link)
+        return WristCamera(tracks, on_link, robot).estimate(guess=arguments.guess)
+    return _estimate_fixed(track, camera, link, robot, joints, arguments)
+
+
+def _estimate_fixed(
+    track: Track,
+    camera: CameraModel,
+    link: str,
+    robot: RobotModel,
+    joints: JointTrack,
+    arguments: argparse.Namespace,
+) -> CameraEstimate:
+    from dataclasses import replace
+
+    import numpy as np
+
+    from mtv_world_ros.geometry.robot_shape import load_shape
+    from mtv_world_ros.geometry.transforms import inverse
+    from mtv_world_ros.inspection.fixed_camera import FixedCamera
+
+    def rest(name: str) -> FloatArray:
+        return robot.link_poses(name, np.zeros((1, len(robot.joint_names))))[0]
+
     on_base = replace(
-        camera, mount_link=robot.base_link, T_mount_camera=rest @ camera.T_mount_camera
+        camera,
+        mount_link=robot.base_link,
+        T_mount_camera=rest(camera.mount_link) @ camera.T_mount_camera,
     )
     shape = load_shape(robot)
     if not shape.is_known:
@@ -317,7 +372,7 @@ def estimate_camera(
         )
     fixed = FixedCamera(track, on_base, robot, shape.parts, joints)
     found = fixed.estimate(guess=arguments.guess, seed=arguments.seed)
-    pose = inverse(rest) @ found.camera.T_mount_camera
+    pose = inverse(rest(link)) @ found.camera.T_mount_camera
     return replace(found, camera=replace(found.camera, mount_link=link, T_mount_camera=pose))
 
 
@@ -326,7 +381,6 @@ def _estimate_text(estimate: CameraEstimate) -> str:
     x, y, z = (float(v) for v in camera.T_mount_camera[:3, 3])
     return (
         f"view '{camera.view}' on link '{camera.mount_link}': at ({x:.3f}, {y:.3f}, {z:.3f}) m, "
-        f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees\n'
-        f'correlation of drawn and seen motion {estimate.fit:.2f} over {estimate.num_pairs} pairs '
-        'of frames'
+        f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees '
+        f'(95 % of errors are within twice that)\n{estimate.evidence}'
     )

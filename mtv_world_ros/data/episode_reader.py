@@ -38,7 +38,7 @@ from mtv_world_ros.data.episode import (
     parse_info,
     Track,
 )
-from mtv_world_ros.data.transform_tree import read_tree, TransformTree
+from mtv_world_ros.data.transform_tree import Mount, read_tree, TransformTree
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -70,6 +70,7 @@ def read_episode(
     topics: Mapping[str, str] | None = None,
     mapping: BagMapping | None = None,
     robot: RobotModel | None = None,
+    unknown_mount: str = '',
 ) -> Episode:
     """Reads an episode; frames are decoded later, when asked for.
 
@@ -88,13 +89,15 @@ def read_episode(
             `{'low': '/camera_low/color/image_raw'}`.
         mapping: what the topics of a robot's own bag are; `topics` goes before it.
         robot: its links may carry cameras whose poses are from TF; None = any frame may.
+        unknown_mount: link that carries cameras of which nothing but a CameraInfo is known, with
+            no pose in it; empty = they are an error.
 
     Raises:
         EpisodeError: no bag, a view is missing, or none of its images can be used.
         CalibrationError: a view's calibration is missing or does not fit its CameraInfo.
     """
     reader = _EpisodeReader(Path(path), views, topics or {}, with_masks, mapping, robot)
-    return reader.read(calibration, with_cameras)
+    return reader.read(calibration, with_cameras, unknown_mount)
 
 
 def read_info(path: Path | str) -> EpisodeInfo:
@@ -154,7 +157,9 @@ class _EpisodeReader:
         self.received: dict[str, Stamped] = {}
         self.refused: dict[str, list[str]] = {}
 
-    def read(self, calibration: Path | str | None, with_cameras: bool) -> Episode:
+    def read(
+        self, calibration: Path | str | None, with_cameras: bool, unknown_mount: str
+    ) -> Episode:
         self._receive()
         topics = self.topics
         images = {view: self._images(view, names) for view, names in topics.views.items()}
@@ -165,7 +170,7 @@ class _EpisodeReader:
         return Episode(
             info=episode_info,
             views=tuple(topics.views),
-            cameras=self._cameras(calibration, images) if with_cameras else {},
+            cameras=self._cameras(calibration, images, unknown_mount) if with_cameras else {},
             images=images,
             joint_states=states,
             trajectories=self._trajectories(states),
@@ -283,14 +288,17 @@ class _EpisodeReader:
         return ObjectPoses(stamps, np.stack([poses for _, poses in ordered]))
 
     def _cameras(
-        self, calibration: Path | str | None, images: Mapping[str, Track]
+        self,
+        calibration: Path | str | None,
+        images: Mapping[str, Track],
+        unknown_mount: str,
     ) -> dict[str, CameraModel]:
         folder = self.path if self.path.is_dir() else self.path.parent
         file = Path(calibration) if calibration else folder / CALIBRATION_FILE
         tree = None
         if not file.is_file():
             tree = self._tree()
-            if calibration or not tree.frames:
+            if calibration or not (tree.frames or unknown_mount):
                 raise CalibrationError(
                     f"'{file}' is not there: an episode needs the cameras' poses; put a "
                     f'{CALIBRATION_FILE} into its folder or name one in `calibration` (the bag '
@@ -300,7 +308,7 @@ class _EpisodeReader:
         cameras = {}
         for view, names in self.topics.views.items():
             if tree is not None:
-                known[view] = self._from_tree(tree, view, names)
+                known[view] = self._from_tree(tree, view, names, unknown_mount)
             if view not in known:
                 raise CalibrationError(
                     f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}"
@@ -316,7 +324,9 @@ class _EpisodeReader:
         self.warnings += tree.problems
         return tree
 
-    def _from_tree(self, tree: TransformTree, view: str, names: ViewTopics) -> CameraModel:
+    def _from_tree(
+        self, tree: TransformTree, view: str, names: ViewTopics, unknown_mount: str
+    ) -> CameraModel:
         """The camera's pose by TF; its intrinsics come from CameraInfo."""
         topic = self._camera_info(view, names)
         infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
@@ -335,7 +345,10 @@ class _EpisodeReader:
         row = self.mapping.views.get(view)
         frame = (row.frame if row else '') or of_info or of_images
         links = () if self.robot is None else self.robot.link_names
-        mount = tree.mount(frame, links)
+        if unknown_mount and tree.name(frame) not in tree.frames:
+            mount = Mount(unknown_mount, np.eye(4), None)
+        else:
+            mount = tree.mount(frame, links)
         return CameraModel(
             view=view,
             width=1,

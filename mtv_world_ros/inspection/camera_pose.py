@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,12 +28,14 @@ class CameraEstimate:
         std_mm: standard error of the camera's place [mm].
         std_deg: standard error of its direction and roll [degrees].
         evidence: what it was estimated from and how well that fits, in words.
+        residual_px: median distance of points from where they should be; NaN of silhouettes.
     """
 
     camera: CameraModel
     std_mm: float
     std_deg: float
     evidence: str
+    residual_px: float = float('nan')
 
 
 def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
@@ -130,48 +132,29 @@ def covered_frames(track: Track, joints: JointTrack) -> np.ndarray:
     return indices
 
 
-def jackknife(
-    estimate: Callable[[np.ndarray], FloatArray], num_items: int, num_groups: int = 5
-) -> tuple[float, float]:
-    """Returns standard errors [mm, degrees] of a pose by leaving out a group of items at a time.
+def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Returns (6,) how a pose changes without some measurements: turns [rad], shifts [m].
+
+    One step of Gauss and Newton from the pose that was estimated from all.
 
     Args:
-        estimate: the pose (4, 4) of some of the items, by their numbers.
-        num_items: that it was estimated from.
-        num_groups: groups of neighbouring items, left out in turn.
+        total: (6, 6) normal matrix of all measurements, in `UNITS`.
+        normal: (6, 6) that of those left out.
+        gradient: (6,) theirs.
     """
-    groups = np.array_split(np.arange(num_items), num_groups)
-    poses = [estimate(np.setdiff1d(np.arange(num_items), group)) for group in groups]
-    return spread(poses)
+    ridge = 1e-6 * np.trace(total) * np.eye(6)
+    return np.asarray(np.linalg.solve(total - normal + ridge, gradient) * UNITS, np.float64)
 
 
-def spread(poses: Sequence[FloatArray]) -> tuple[float, float]:
-    """Jackknife standard errors [mm, degrees] of poses that each left out one group."""
-    places = np.array([T[:3, 3] for T in poses])
-    turns = np.array([cv2.Rodrigues(poses[0][:3, :3].T @ T[:3, :3])[0].ravel() for T in poses])
-    factor = (len(poses) - 1) / len(poses)
-    return tuple(  # type: ignore[return-value]
-        float(np.sqrt(factor * ((rows - rows.mean(axis=0)) ** 2).sum())) * unit
-        for rows, unit in ((places, 1000.0), (turns, 180 / np.pi))
-    )
+def spread(changes: FloatArray) -> tuple[float, float]:
+    """Jackknife standard errors [mm, degrees] of changes (G, 6): turns [rad], shifts [m].
 
-
-def influence(normals: FloatArray, gradients: FloatArray) -> FloatArray:
-    """Returns how least-squares parameters change when a group of measurements is left out.
-
-    Args:
-        normals: (G, P, P) each group's part of the normal matrix.
-        gradients: (G, P) each group's part of the gradient, at the solution of all.
+    Each change is by leaving out one of G groups.
     """
-    rest = normals.sum(axis=0) - normals
-    rest = rest + 1e-9 * np.trace(rest, axis1=1, axis2=2)[:, None, None] * np.eye(rest.shape[-1])
-    return np.asarray(np.linalg.solve(rest, gradients[..., None])[..., 0], np.float64)
-
-
-def standard_errors(changes: FloatArray) -> tuple[float, float]:
-    """Jackknife standard errors [mm, degrees] of changes (G, 6): turns [rad], shifts [m]."""
-    spreads = (len(changes) - 1) / len(changes) * ((changes - changes.mean(axis=0)) ** 2).sum(0)
-    return 1000 * float(np.sqrt(spreads[3:].sum())), float(np.degrees(np.sqrt(spreads[:3].sum())))
+    factor = (len(changes) - 1) / len(changes)
+    variances = factor * ((changes - changes.mean(axis=0)) ** 2).sum(axis=0)
+    turn, shift = (float(np.sqrt(part.sum())) for part in np.split(variances, 2))
+    return 1000 * shift, float(np.degrees(turn))
 
 
 def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:

@@ -23,30 +23,33 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.inspection.camera_pose import (
+    aligned,
     CameraEstimate,
     covered_frames,
     grey,
-    jackknife,
     moved,
     shrunk,
+    UNITS,
     with_pose,
 )
 from mtv_world_ros.inspection.clocks import JointTrack
 
 #: widths of the images and blurs [px] of the steps of the search, from coarse to fine
 _COARSE, _WIDE, _MIDDLE, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (240, 1.5)
-#: units of the turns [rad] and shifts [m]: each moves the drawn robot by about a pixel
-_UNITS = np.array([0.01] * 3 + [0.005] * 3)
 #: difference of drawn and seen change from which on a pixel counts less
 _OUTLIER = 0.3
+#: where the robot is in both frames, a pixel may change or not
+_INSIDE = 0.3
 _NUM_FRAMES = 24
 #: grey levels from which a pixel counts as changed: so few that a pixel at the robot's edge does,
 #: as in the drawn silhouettes
 _CHANGED = 12.0
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
-_NUM_TRIED, _NUM_KEPT = 2500, 10
+_NUM_TRIED, _NUM_KEPT = 1500, 6
+#: measurements that the pixels of all frames are worth
+_NUM_INDEPENDENT = 12
 #: correlation below which a found pose explains the pictures no better than chance
-_LEAST_FIT = 0.25
+_LEAST_FIT = 0.45
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,19 +133,13 @@ class FixedCamera:
                 'and does the arm move through the view? A guess nearer to the truth may help'
             )
 
-        def without(kept: np.ndarray) -> FloatArray:
-            some = _Changes(
-                camera=fine.camera, pairs=fine.pairs[kept], seen=fine.seen[kept], blur=fine.blur
-            )
-            return self._aligned(T, some, iterations=3)
-
-        std_mm, std_deg = jackknife(without, len(fine.pairs))
+        std_mm, std_deg = self._standard_errors(T, fine)
         return CameraEstimate(
             camera=with_pose(self._camera, T),
             std_mm=std_mm,
             std_deg=std_deg,
-            fit=fit,
-            num_pairs=len(fine.pairs),
+            evidence=f'correlation of drawn and seen motion {fit:.2f} over {len(fine.pairs)} '
+            'pairs of frames',
         )
 
     def _far_pairs(self) -> np.ndarray:
@@ -182,51 +179,56 @@ class FixedCamera:
 
     def _drawn(self, T: FloatArray, changes: _Changes) -> NDArray[np.float32]:
         """(P, H, W) where the pictures of each pair should differ, 0 .. 1."""
+        before, after = self._silhouettes(T, changes, self._parts)
+        differs = (before ^ after) + np.float32(_INSIDE) * (before & after)
+        return np.stack([cv2.GaussianBlur(one, (0, 0), changes.blur) for one in differs])
+
+    def _silhouettes(
+        self, T: FloatArray, changes: _Changes, parts: Sequence[LinkShape]
+    ) -> NDArray[np.uint8]:
+        """(2, P, H, W) 1 where parts are drawn in the frames of each pair."""
         camera = with_pose(changes.camera, T)
         rows = np.unique(changes.pairs)
         T_all = np.repeat(T[None], len(rows), axis=0)
         drawn = fill(
-            [project_part(p, self._poses[p.link][rows], camera, T_all) for p in self._parts],
-            camera,
+            [project_part(p, self._poses[p.link][rows], camera, T_all) for p in parts], camera
         )
-        place = np.searchsorted(rows, changes.pairs)
-        differs = cv2.absdiff(drawn[place[:, 0]], drawn[place[:, 1]]).astype(np.float32)
-        return np.stack([cv2.GaussianBlur(one, (0, 0), changes.blur) for one in differs])
+        return drawn[np.searchsorted(rows, changes.pairs.T)]
 
-    def _aligned(self, T: FloatArray, changes: _Changes, iterations: int = 10) -> FloatArray:
-        """The pose nearby at which drawn and seen changes differ least (Levenberg-Marquardt).
+    def _aligned(self, T: FloatArray, changes: _Changes) -> FloatArray:
+        """The pose nearby at which drawn and seen changes differ least.
 
         Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
         """
-        damping = 0.01
+        return aligned(T, lambda pose: self._errors(pose, changes).ravel(), self.centre,
+                       outlier=_OUTLIER)  # fmt: skip
 
-        def errors(pose: FloatArray) -> NDArray[np.float32]:
-            return (self._drawn(pose, changes) - changes.seen).ravel()
+    def _errors(self, T: FloatArray, changes: _Changes) -> NDArray[np.float32]:
+        """(P, H W) drawn minus seen changes."""
+        return (self._drawn(T, changes) - changes.seen).reshape(len(changes.pairs), -1)
 
-        def cost(values: NDArray[np.float32]) -> float:
-            return float(np.log1p((values / _OUTLIER) ** 2).mean())
+    def _standard_errors(self, T: FloatArray, changes: _Changes) -> tuple[float, float]:
+        """Of a fit to few independent measurements [mm, degrees].
 
-        now = errors(T)
-        for _ in range(iterations):
-            steps = np.diag(_UNITS)
-            slopes = np.stack(
-                [(errors(moved(T, s, self.centre)) - errors(moved(T, -s, self.centre))) / 2
-                 for s in steps]
-            )  # fmt: skip
-            weighted = slopes / (1 + (now / _OUTLIER) ** 2)
-            normal, gradient = weighted @ slopes.T, weighted @ now
-            damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
-            step = -np.linalg.solve(damped, gradient)
-            step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
-            tried = moved(T, np.asarray(step * _UNITS, np.float64), self.centre)
-            there = errors(tried)
-            if cost(there) < cost(now):
-                T, now, damping = tried, there, damping / 3
-            else:
-                damping *= 10
-            if float(np.abs(step).max()) < 0.01:
-                break
-        return T
+        Errors of the shapes, shadows and the robot's own pattern are the same for a whole link
+        in all frames, so that pixels say much less than their number.
+        """
+        errors = self._errors(T, changes).ravel()
+        slopes = np.stack(
+            [(self._errors(moved(T, row, self.centre), changes)
+              - self._errors(moved(T, -row, self.centre), changes)).ravel() / 2
+             for row in np.diag(UNITS)]
+        )  # fmt: skip
+        weights = 1 / (1 + (errors / _OUTLIER) ** 2)
+        normal = np.asarray((weights * slopes) @ slopes.T, np.float64)
+        variance = float((weights * errors**2).sum()) / _NUM_INDEPENDENT
+        at_centre = np.diag(UNITS) @ np.linalg.pinv(normal) @ np.diag(UNITS) * variance
+        away = T[:3, :3].T @ (T[:3, 3] - self.centre)
+        x, y, z = away
+        lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+        moves = np.hstack([lever, np.eye(3)])
+        shift = np.sqrt(np.trace(moves @ at_centre @ moves.T))
+        return 1000 * float(shift), float(np.degrees(np.sqrt(np.trace(at_centre[:3, :3]))))
 
     def _refined(
         self,
@@ -273,7 +275,7 @@ class FixedCamera:
                 best.append(T)
             if len(best) == _NUM_KEPT:
                 break
-        improved = [self._refined(T, changes, turn=0.25, shift=0.1, evaluations=80) for T in best]
+        improved = [self._refined(T, changes, turn=0.25, shift=0.1, evaluations=70) for T in best]
         improved.sort(key=lambda T: -self._fit(T, changes))
         return improved[:3]
 

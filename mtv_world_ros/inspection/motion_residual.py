@@ -106,7 +106,10 @@ def measure_residual(
         search: what is tried.
     """
     if camera.mount_link in moving_links(robot):
-        return MotionResidual(reason=f"the camera moves with '{camera.mount_link}'")
+        return MotionResidual(
+            reason=f"the camera moves with '{camera.mount_link}' (`mtv-world calibrate-camera` "
+            'estimates its pose: compare)'
+        )
     pairs = _pairs(track.stamps_ns, joints, search.max_pairs)
     if len(pairs) == 0:
         return MotionResidual(

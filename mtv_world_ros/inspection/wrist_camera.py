@@ -10,7 +10,7 @@ M tracks of L frames each, S stretches, J joints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -21,16 +21,17 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import unproject
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_shape import moving_links
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.inspection.camera_pose import (
     aligned,
     CameraEstimate,
     covered_frames,
     grey,
-    influence,
+    left_out,
     moved,
     shrunk,
-    standard_errors,
+    spread,
     UNITS,
     with_pose,
 )
@@ -47,6 +48,9 @@ _LEAST_STILL, _LEAST_TRACKS = 8, 80
 _NUM_GROUPS = 8
 #: a track that is off by more than this forwards and backwards is lost [px]
 _LOST_PX = 0.7
+#: a point is moved to a corner that is this near [px]
+_LEAST_DRIFT_PX = 1.0
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 0.02)
 #: points that move less are on the hand [px]
 _LEAST_MOTION_PX = 6.0
 #: distance from the epipolar line beyond which a point is not of the still scene [px]
@@ -58,6 +62,9 @@ _LEAST_TURN, _TURN_FACTOR, _TURN_APART = 0.06, 0.15, 0.02
 _AGREE = 0.12
 #: points are farther from the camera than the inverse of this [1/m]
 _NEAREST = 50.0
+#: measurements that all points are worth: some errors are the same in all stretches, e.g. of
+#: points that slide along edges
+_NUM_INDEPENDENT = 100
 #: errors beyond which a pose counts as not found [mm, degrees]; twice the standard error
 _WORST_MM, _WORST_DEG = 100.0, 10.0
 
@@ -123,6 +130,7 @@ class WristCamera:
             evidence=f'{len(self._tracks.rays)} points of the scene tracked over '
             f'{len(self._poses)} stretches of frames, median distance from '
             f'where they should be {px:.2f} px',
+            residual_px=px,
         )
 
     def _direction(self) -> FloatArray:
@@ -146,9 +154,9 @@ class WristCamera:
         if best[0] < max(4, len(carried) // 3):
             raise CalibrationError(
                 f"view '{self._camera.view}': the camera's direction was not found: its turns "
-                f'agree with those of the link in {best[0]} of {len(carried)} stretches of frames. '
-                'Record one in which the wrist turns about at least two axes, or give a guess; '
-                'are link, K and clock right?'
+                f'agree with those of the link in {best[0]} of {len(carried)} stretches of '
+                'frames. Record one in which the wrist turns about at least two axes, or give a '
+                'guess; are link, K and clock right?'
             )
         T = np.eye(4)
         T[:3, :3] = best[1]
@@ -203,12 +211,41 @@ class WristCamera:
         normal = np.einsum('mlki,mlk,mlkj->mij', slopes, weights, slopes)
         gradient = np.einsum('mlki,mlk,mlk->mi', slopes, weights, errors)
         block = self._tracks.stretch * _NUM_GROUPS // len(self._poses)
-        groups = [block == number for number in range(_NUM_GROUPS)]
-        changes = influence(
-            np.stack([normal[group].sum(axis=0) for group in groups]),
-            np.stack([gradient[group].sum(axis=0) for group in groups]),
+        total = normal.sum(axis=0)
+        without = [
+            left_out(total, normal[block == n].sum(axis=0), gradient[block == n].sum(axis=0))
+            for n in range(_NUM_GROUPS)
+        ]
+        variance = float((weights[..., None] * errors[..., None] ** 2).sum()) / _NUM_INDEPENDENT
+        shared = np.sqrt(variance * np.diag(np.linalg.pinv(total))) * UNITS
+        mm, degrees = spread(np.stack(without))
+        return (
+            float(np.hypot(mm, 1000 * np.linalg.norm(shared[3:]))),
+            float(np.hypot(degrees, np.degrees(np.linalg.norm(shared[:3])))),
         )
-        return standard_errors(changes * UNITS)
+
+
+def find_mount(tracks: SceneTracks, camera: CameraModel, robot: RobotModel) -> CameraEstimate:
+    """Returns the estimate on the moving link whose motion fits the camera's best, without guess.
+
+    Of links that move alike in the recording, the first one from the base.
+
+    Raises:
+        CalibrationError: none fits.
+    """
+    moving = moving_links(robot)
+    found, why = [], ''
+    for link in robot.link_names:
+        if link in moving:
+            try:
+                wrist = WristCamera(tracks, replace(camera, mount_link=link), robot)
+                found.append(wrist.estimate(guess=False))
+            except CalibrationError as error:
+                why = str(error)
+    if not found:
+        raise CalibrationError(f"no link moves like view '{camera.view}': {why}")
+    best = min(estimate.residual_px for estimate in found)
+    return next(estimate for estimate in found if estimate.residual_px <= 1.02 * best)
 
 
 def _rotation_between(turns: FloatArray) -> FloatArray | None:
@@ -320,17 +357,27 @@ def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArra
     corners = cv2.goodFeaturesToTrack(before, _NUM_POINTS, 0.01, 8)
     if corners is None:
         return np.zeros((0, 1, 2))
-    paths = corners.reshape(-1, 1, 2).astype(np.float64)
+    paths = _on_corner(before, corners).reshape(-1, 1, 2).astype(np.float64)
     for index in chosen[1:]:
         after = grey(np.asarray(track.frames[int(index)]), camera)
         start = paths[:, -1].astype(np.float32).reshape(-1, 1, 2)
         ahead, back, ok = _there_and_back(before, after, start)
         kept = ok & (np.linalg.norm((back - start).reshape(-1, 2), axis=1) < _LOST_PX)
+        inside = (ahead >= 4) & (ahead < np.array([camera.width, camera.height]) - 4)
+        kept &= inside.reshape(-1, 2).all(axis=1)
         if kept.sum() < _LEAST_POINTS:
             break
-        paths = np.concatenate([paths[kept], ahead.reshape(-1, 1, 2)[kept]], axis=1)
+        there = _on_corner(after, ahead[kept]).reshape(-1, 1, 2)
+        paths = np.concatenate([paths[kept], there], axis=1)
         before = after
     return paths
+
+
+def _on_corner(image: ByteArray, points: np.ndarray) -> np.ndarray:
+    """Points (N, 1, 2) moved to the corner they are at, so that they do not drift off it."""
+    found = cv2.cornerSubPix(image, points.copy(), (3, 3), (-1, -1), _STOP)
+    near = np.linalg.norm(found - points, axis=-1, keepdims=True) < _LEAST_DRIFT_PX
+    return np.where(near, found, points)
 
 
 def _there_and_back(

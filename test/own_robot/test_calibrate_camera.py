@@ -1,18 +1,21 @@
 """`mtv-world calibrate-camera` against the pose that the pictures were drawn with."""
 
 from dataclasses import replace
+import shutil
 
 from crane import load, make_cameras, make_positions, write_episode
 import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot_shape import load_shape
 from mtv_world_ros.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.fixed_camera import FixedCamera
+from mtv_world_ros.inspection.wrist_camera import follow_scene, WristCamera
 
 
 def test_a_fixed_camera_is_found_from_a_guess(tmp_path, capsys):
@@ -45,8 +48,6 @@ def test_an_arm_that_stands_still_calibrates_nothing(tmp_path):
     path = write_episode(
         tmp_path / 'episode', robot, {'door': make_cameras()['door']}, positions
     )  # fmt: skip
-    from mtv_world_ros.data.episode_reader import read_episode
-
     episode = read_episode(path)
     joints = JointTrack(episode.joint_states, robot)
     with pytest.raises(CalibrationError, match='the arm hardly moves'):
@@ -55,12 +56,80 @@ def test_an_arm_that_stands_still_calibrates_nothing(tmp_path):
         )
 
 
+@pytest.fixture(scope='module')
+def wrist(tmp_path_factory):
+    """A recording of the camera on the hand whose calibration is 3 cm and 6 degrees wrong."""
+    folder = tmp_path_factory.mktemp('wrist')
+    robot = load(folder)
+    palm = make_cameras()['palm']
+    change = moved(np.eye(4), np.array([0.06, -0.05, 0.07, 0.02, 0.015, -0.02]), np.zeros(3))
+    guess = replace(palm, T_mount_camera=palm.T_mount_camera @ change)
+    path = write_episode(
+        folder / 'episode', robot, {'palm': palm}, make_positions(8.0, seed=2, speed=0.5),
+        recorded_as={'palm': guess},
+    )  # fmt: skip
+    return robot, palm, path
+
+
+@pytest.mark.parametrize('options', [[], ['--no-guess'], ['--no-guess', '--mount-link', 'find']])
+def test_a_camera_on_the_arm_is_found(wrist, tmp_path, capsys, options):
+    robot, palm, path = wrist
+    out = tmp_path / 'found.yaml'
+    command = ['calibrate-camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
+    assert main([*command, *options, '--out', str(out)]) == 0
+    assert 'points of the scene tracked' in capsys.readouterr().out
+    found = load_calibration(out)['palm']
+    assert found.mount_link == 'hand'
+    mm, degrees = difference(palm.T_mount_camera, found.T_mount_camera)
+    assert mm < 15 and degrees < 0.6, (mm, degrees)
+
+
+def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
+    robot, palm, path = wrist
+    bag = tmp_path / 'bag'
+    shutil.copytree(path, bag)
+    (bag / 'calibration.yaml').unlink()
+    out = tmp_path / 'found.yaml'
+    command = ['calibrate-camera', str(bag), '--view', 'palm', '--robot', str(robot.file)]
+    assert main([*command, '--out', str(out)]) == 1  # no guess in the recording
+    assert main([*command, '--no-guess', '--mount-link', 'hand', '--out', str(out)]) == 0
+    mm, degrees = difference(
+        palm.T_mount_camera, load_calibration(out)['palm'].T_mount_camera
+    )  # fmt: skip
+    assert mm < 15 and degrees < 0.6, (mm, degrees)
+
+
+def test_a_guess_is_of_the_recorded_link(wrist, tmp_path, capsys):
+    robot, _, path = wrist
+    command = ['calibrate-camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
+    assert main([*command, '--mount-link', 'jib', '--out', str(tmp_path / 'a.yaml')]) == 1
+    assert 'give --no-guess' in capsys.readouterr().err
+
+
+def test_a_wrist_that_turns_about_one_axis_determines_nothing(tmp_path):
+    robot = load(tmp_path)
+    positions = np.repeat(make_positions(3.0)[:1], 30, axis=0)
+    positions[:, 0] += np.linspace(-0.5, 0.5, 30)
+    palm = make_cameras()['palm']
+    path = write_episode(tmp_path / 'episode', robot, {'palm': palm}, positions)
+    episode = read_episode(path)
+    joints = JointTrack(episode.joint_states, robot)
+    tracks = follow_scene(episode.images['palm'], palm, robot, joints)
+    with pytest.raises(CalibrationError, match='at least two axes'):
+        WristCamera(tracks, palm, robot).estimate(guess=False)
+
+
+def test_pictures_without_motion_calibrate_nothing(wrist):
+    robot, palm, path = wrist
+    episode = read_episode(path)
+    still = np.repeat(np.asarray(episode.images['palm'].frames)[:1], 50, axis=0)
+    track = episode.images['palm']._replace(frames=still)
+    with pytest.raises(CalibrationError, match='record a scene with texture'):
+        follow_scene(track, palm, robot, JointTrack(episode.joint_states, robot))
+
+
 def test_the_jackknife_has_the_textbook_value():
-    places = np.array([[0.0, 0, 0], [0.001, 0, 0], [0.002, 0, 0], [0.003, 0, 0]])
-    poses = []
-    for place in places:
-        T = np.eye(4)
-        T[:3, 3] = place
-        poses.append(T)
+    changes = np.zeros((4, 6))
+    changes[:, 3] = [0.0, 0.001, 0.002, 0.003]
     # sqrt(3/4 * ((1.5^2 + 0.5^2) * 2)) mm
-    assert spread(poses) == pytest.approx((np.sqrt(0.75 * 5.0), 0.0))
+    assert spread(changes) == pytest.approx((np.sqrt(0.75 * 5.0), 0.0))
