@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from math import ceil
-from threading import Lock
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
@@ -23,8 +22,8 @@ from mtv_world_ros.data_types import (
     SuccessEstimate,
     WorldModelSpec,
 )
-from mtv_world_ros.errors import ObservationError, RolloutPreempted
-from mtv_world_ros.geometry.camera import camera_poses, scaled, tools_in_view
+from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.geometry.camera import camera_poses, tools_in_view
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
@@ -34,19 +33,16 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
+from mtv_world_ros.rollout_state import ChunkPlan, RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_of
-from mtv_world_ros.success.rollout_memory import footage_of, RolloutMemory
+from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
 SEED_STEP = 1_000_003
-#: a real frame is looked at if it comes at least this share of the model's period after another
-_SEEN_SHARE = 0.9
-#: chunks of real frames that may wait to be looked at; then every second frame is dropped
-_MOST_WAITING_CHUNKS = 8
 #: of an estimate for which the model was shown no motion
 _UNSEEN = 'no view shows a tool at any time'
 
@@ -163,7 +159,7 @@ class Pipeline:
             num_inference_steps=num_inference_steps,
             limit_tolerance=limit_tolerance,
             should_stop=should_stop,
-            _rollouts=(_RolloutState.at(observation, self.spec),),
+            _rollouts=(RolloutState.at(observation, self.spec),),
         )
 
     def draw(
@@ -192,6 +188,14 @@ class Pipeline:
             objects=objects,
             config=self.rendering,
         )
+
+
+class ObservedChunk(NamedTuple):
+    """What was found in real frames: masks of the frame before them (T = 1) and of all of them."""
+
+    start_masks: ObjectMasks
+    masks: ObjectMasks
+    success: SuccessEstimate
 
 
 @dataclass(slots=True, kw_only=True)
@@ -223,7 +227,7 @@ class ImaginedEpisode:
     limit_tolerance: float
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
-    _rollouts: tuple[_RolloutState, ...]
+    _rollouts: tuple[RolloutState, ...]
 
     @property
     def observation(self) -> Observation:
@@ -290,11 +294,11 @@ class ImaginedEpisode:
         Raises:
             ObservationError: the views are not the model's.
         """
-        state = _RolloutState.at(observation, self.pipeline.spec)
+        state = RolloutState.at(observation, self.pipeline.spec)
         memory = self._rollouts[0].memory
         return replace(self, _rollouts=(replace(state, memory=memory),))
 
-    def _plan_chunks(self, trajectory: JointTrajectory) -> list[_ChunkPlan]:
+    def _plan_chunks(self, trajectory: JointTrajectory) -> list[ChunkPlan]:
         """The trajectory on the model's clock, cut into chunks."""
         robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
         trajectory = match_joints(trajectory, robot, start.positions)
@@ -304,7 +308,7 @@ class ImaginedEpisode:
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
         positions = resample(trajectory, start.positions, times)
         return [
-            _ChunkPlan(
+            ChunkPlan(
                 times=times[first : first + spec.num_frames + 1],
                 positions=positions[first : first + spec.num_frames + 1],
                 num_frames=min(spec.num_frames, total - first),
@@ -318,8 +322,8 @@ class ImaginedEpisode:
         ]
 
     def _imagine_chunk(
-        self, state: _RolloutState, plan: _ChunkPlan, seed: int
-    ) -> tuple[Prediction, _RolloutState]:
+        self, state: RolloutState, plan: ChunkPlan, seed: int
+    ) -> tuple[Prediction, RolloutState]:
         """One chunk of one rollout, stage by stage, and where the rollout stands then."""
         pipeline, start, clock = self.pipeline, state.observation, StageClock()
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
@@ -374,7 +378,7 @@ class ImaginedEpisode:
         return prediction, state
 
     def _move_objects(
-        self, state: _RolloutState, plan: _ChunkPlan, start_masks: ObjectMasks
+        self, state: RolloutState, plan: ChunkPlan, start_masks: ObjectMasks
     ) -> tuple[ByteArray | None, FoundObjects | None]:
         """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after it.
 
@@ -412,12 +416,12 @@ class ImaginedEpisode:
         cameras, robot = self.observation.cameras, self.pipeline.robot
         return np.stack([camera_poses(camera, robot, positions) for camera in cameras])
 
-    def _find_start_masks(self, state: _RolloutState) -> ObjectMasks:
+    def _find_start_masks(self, state: RolloutState) -> ObjectMasks:
         """Masks of the frame that a chunk starts from (T = 1)."""
         return self.pipeline.segmenter.segment(state.observation.frames[:, None], self.names)
 
     def _follow_masks(
-        self, state: _RolloutState, start_masks: ObjectMasks, frames: ByteArray
+        self, state: RolloutState, start_masks: ObjectMasks, frames: ByteArray
     ) -> ObjectMasks:
         """Masks of the frames (V, T, H, W, 3) after the start frame."""
         return self.pipeline.segmenter.segment(
@@ -429,7 +433,7 @@ class ImaginedEpisode:
 
     def _judge(
         self,
-        state: _RolloutState,
+        state: RolloutState,
         positions: FloatArray,
         start_masks: ObjectMasks,
         masks: ObjectMasks,
@@ -451,217 +455,3 @@ class ImaginedEpisode:
             num = len(objects.positions) - round(left_s / objects.tracked.step_s)
             foreseen = foreseen_of(pipeline.robot, objects, num)
         return pipeline.estimator.estimate(footage, self.instruction, state.memory, foreseen)
-
-
-class ObservedEpisode:
-    """The real frames of an episode so far, so that every plan is judged with what came before.
-
-    `see` may be called from another thread than the others.
-
-    Args:
-        pipeline: finds and judges what is seen.
-    """
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        self._pipeline = pipeline
-        self._period_ns = round(_SEEN_SHARE / pipeline.spec.fps * 1e9)
-        self._lock = Lock()
-        self._seen: ImaginedEpisode | None = None
-        self._seen_ns = 0
-        self._waiting: list[Observation] = []
-
-    def is_due(self, stamp_ns: int) -> bool:
-        """Tells whether an observation at this time would be kept: one a frame of the model."""
-        with self._lock:
-            last_ns = self._waiting[-1].stamp_ns if self._waiting else self._seen_ns
-            return self._seen is not None and stamp_ns - last_ns >= self._period_ns
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether a chunk of observations waits to be looked at."""
-        with self._lock:
-            return len(self._waiting) >= self._pipeline.spec.num_frames
-
-    def see(self, observation: Observation) -> None:
-        """Keeps a real observation until it is looked at.
-
-        Raises:
-            ObservationError: the views are not the model's.
-        """
-        observation = fit_observation(observation, self._pipeline.spec)
-        with self._lock:
-            self._waiting.append(observation)
-            if len(self._waiting) > _MOST_WAITING_CHUNKS * self._pipeline.spec.num_frames:
-                del self._waiting[::2]
-
-    def forget(self) -> None:
-        """The next plan begins a new episode."""
-        with self._lock:
-            self._seen, self._waiting = None, []
-
-    def catch_up(self) -> None:
-        """Looks at the observations that wait."""
-        with self._lock:
-            seen, waiting = self._seen, self._waiting
-            self._waiting = []
-            self._seen_ns = waiting[-1].stamp_ns if waiting else self._seen_ns
-        if seen is not None:
-            _look_at(seen, waiting)
-
-    def begin(
-        self, observation: Observation, *, instruction: str, objects: tuple[str, ...] = ()
-    ) -> ImaginedEpisode:
-        """Returns an episode that begins at an observation and remembers what was seen before.
-
-        Another instruction, or other objects, begin a new episode.
-
-        Args:
-            observation: real, of V views; not before those that were seen.
-            instruction: what the robot is told.
-            objects: names of the objects; empty = the pipeline's, else those of the instruction.
-
-        Raises:
-            ObservationError: the views are not the model's.
-        """
-        start = fit_observation(observation, self._pipeline.spec)
-        with self._lock:
-            seen, waiting = self._seen, self._waiting
-            if seen is None or (seen.instruction, seen.objects) != (instruction, objects):
-                seen = self._pipeline.begin(start, instruction=instruction, objects=objects)
-                self._seen, self._seen_ns, waiting = seen, start.stamp_ns, []
-            new = [o for o in waiting if o.stamp_ns < start.stamp_ns]
-            self._waiting = [o for o in waiting if o.stamp_ns > start.stamp_ns]
-            if start.stamp_ns > self._seen_ns:
-                new.append(start)
-                self._seen_ns = start.stamp_ns
-        _look_at(seen, new)
-        return seen.branch(observation)
-
-
-def _look_at(episode: ImaginedEpisode, observations: Sequence[Observation]) -> None:
-    """The episode observes these, at the model's size."""
-    if observations:
-        frames = np.stack([observation.frames for observation in observations], axis=1)
-        positions = [episode.observation, *observations]
-        episode.observe(frames, np.stack([observation.positions for observation in positions]))
-
-
-class ObservedChunk(NamedTuple):
-    """What was found in real frames: masks of the frame before them (T = 1) and of all of them."""
-
-    start_masks: ObjectMasks
-    masks: ObjectMasks
-    success: SuccessEstimate
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _RolloutState:
-    """Where the rollout of one seed stands: what its next chunk goes on from.
-
-    Attributes:
-        observation: its last frame, at the model's size.
-        history: the frames before that one.
-        source: the last real observation, at its own size.
-        objects: where the named objects are; None before the first chunk after `source`.
-        memory: what the estimate remembers; None before the first chunk.
-        num_imagined: frames since the last real one.
-    """
-
-    observation: Observation
-    history: History
-    source: Observation
-    objects: FoundObjects | None = None
-    memory: RolloutMemory | None = None
-    num_imagined: int = 0
-
-    @classmethod
-    def at(cls, observation: Observation, spec: WorldModelSpec) -> _RolloutState:
-        """Returns the state of an episode that begins at a real observation.
-
-        Raises:
-            ObservationError: the views are not the model's.
-        """
-        start = fit_observation(observation, spec)
-        return cls(observation=start, history=History.begin(start.frames), source=observation)
-
-    def after(
-        self,
-        frames: ByteArray,
-        positions: FloatArray,
-        stamp_ns: int,
-        num_history: int,
-        memory: RolloutMemory,
-        objects: FoundObjects | None = None,
-    ) -> _RolloutState:
-        """Returns the state at the last of the frames (V, T, H, W, 3).
-
-        Args:
-            frames: (V, T, H, W, 3) uint8 RGB after `observation`.
-            positions: (J,) commanded at the last one [rad or m].
-            stamp_ns: of the last one [ns].
-            num_history: most frames to keep before it.
-            memory: what the estimate remembers then.
-            objects: where the objects are then.
-        """
-        start = self.observation
-        return _RolloutState(
-            observation=replace(
-                start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
-            ),
-            history=self.history.after(start.frames, frames, num_history),
-            source=self.source,
-            objects=objects,
-            memory=memory,
-            num_imagined=self.num_imagined + frames.shape[1],
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _ChunkPlan:
-    """The part of a trajectory that one chunk shows.
-
-    Attributes:
-        times: (1 + T,) of a whole chunk, from the stamp on [s]; row 0 its start.
-        positions: (1 + T, J) then [rad or m].
-        num_frames: frames to keep: the last chunk ends with the trajectory.
-        stamp_ns: of the observation that the trajectory started from [ns].
-        chunk: its index in the trajectory.
-        num_chunks: of the trajectory.
-        trajectory: the whole, in the robot's joint order.
-        current: (J,) where the robot stood when it began.
-    """
-
-    times: FloatArray
-    positions: FloatArray
-    num_frames: int
-    stamp_ns: int
-    chunk: int
-    num_chunks: int
-    trajectory: JointTrajectory
-    current: FloatArray
-
-    def fine_positions(self, step_s: float) -> FloatArray:
-        """Returns the joints (N, J) of the whole chunk, `step_s` apart; row 0 its start."""
-        count = round((self.times[-1] - self.times[0]) / step_s)
-        times = self.times[0] + step_s * np.arange(count + 1)
-        return resample(self.trajectory, self.current, times)
-
-
-def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:
-    """Returns the observation with frames and cameras at the model's size.
-
-    Raises:
-        ObservationError: the views are not the model's.
-    """
-    if observation.views != spec.views:
-        raise ObservationError(
-            f'the observation has views {list(observation.views)}, the model was trained on '
-            f'{list(spec.views)} in this order'
-        )
-    if observation.frames.shape[1:3] == (spec.height, spec.width):
-        return observation
-    return replace(
-        observation,
-        cameras=tuple(scaled(c, spec.width, spec.height) for c in observation.cameras),
-        frames=resize_frames(observation.frames, spec.width, spec.height),
-    )

@@ -24,7 +24,8 @@ from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
-from mtv_world_ros.pipeline import ObservedEpisode, Pipeline
+from mtv_world_ros.observed_episode import ObservedEpisode
+from mtv_world_ros.pipeline import Pipeline
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'

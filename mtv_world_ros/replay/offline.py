@@ -17,7 +17,8 @@ from mtv_world_ros.data.recording import DEFAULT
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.pipeline import ObservedEpisode, Pipeline
+from mtv_world_ros.observed_episode import ObservedEpisode
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.replay.prediction_writer import ERROR, OK, PredictionWriter
 

@@ -13,7 +13,8 @@ from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.pipeline import ImaginedEpisode, ObservedEpisode, Pipeline
+from mtv_world_ros.observed_episode import ObservedEpisode
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO

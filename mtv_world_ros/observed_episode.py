@@ -1,0 +1,110 @@
+"""The real frames of an episode before a plan, which the estimate remembers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from threading import Lock
+
+import numpy as np
+
+from mtv_world_ros.data_types import Observation
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.rollout_state import fit_observation
+
+#: a real frame is looked at if it comes at least this share of the model's period after another
+_SEEN_SHARE = 0.9
+#: chunks of real frames that may wait to be looked at; then every second frame is dropped
+_MOST_WAITING_CHUNKS = 8
+
+
+class ObservedEpisode:
+    """The real frames of an episode so far, so that every plan is judged with what came before.
+
+    `see` may be called from another thread than the others.
+
+    Args:
+        pipeline: finds and judges what is seen.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._period_ns = round(_SEEN_SHARE / pipeline.spec.fps * 1e9)
+        self._lock = Lock()
+        self._seen: ImaginedEpisode | None = None
+        self._seen_ns = 0
+        self._waiting: list[Observation] = []
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Tells whether an observation at this time would be kept: one a frame of the model."""
+        with self._lock:
+            last_ns = self._waiting[-1].stamp_ns if self._waiting else self._seen_ns
+            return self._seen is not None and stamp_ns - last_ns >= self._period_ns
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether a chunk of observations waits to be looked at."""
+        with self._lock:
+            return len(self._waiting) >= self._pipeline.spec.num_frames
+
+    def see(self, observation: Observation) -> None:
+        """Keeps a real observation until it is looked at.
+
+        Raises:
+            ObservationError: the views are not the model's.
+        """
+        observation = fit_observation(observation, self._pipeline.spec)
+        with self._lock:
+            self._waiting.append(observation)
+            if len(self._waiting) > _MOST_WAITING_CHUNKS * self._pipeline.spec.num_frames:
+                del self._waiting[::2]
+
+    def forget(self) -> None:
+        """The next plan begins a new episode."""
+        with self._lock:
+            self._seen, self._waiting = None, []
+
+    def catch_up(self) -> None:
+        """Looks at the observations that wait."""
+        with self._lock:
+            seen, waiting = self._seen, self._waiting
+            self._waiting = []
+            self._seen_ns = waiting[-1].stamp_ns if waiting else self._seen_ns
+        if seen is not None:
+            _look_at(seen, waiting)
+
+    def begin(
+        self, observation: Observation, *, instruction: str, objects: tuple[str, ...] = ()
+    ) -> ImaginedEpisode:
+        """Returns an episode that begins at an observation and remembers what was seen before.
+
+        Another instruction, or other objects, begin a new episode.
+
+        Args:
+            observation: real, of V views; not before those that were seen.
+            instruction: what the robot is told.
+            objects: names of the objects; empty = the pipeline's, else those of the instruction.
+
+        Raises:
+            ObservationError: the views are not the model's.
+        """
+        start = fit_observation(observation, self._pipeline.spec)
+        with self._lock:
+            seen, waiting = self._seen, self._waiting
+            if seen is None or (seen.instruction, seen.objects) != (instruction, objects):
+                seen = self._pipeline.begin(start, instruction=instruction, objects=objects)
+                self._seen, self._seen_ns, waiting = seen, start.stamp_ns, []
+            new = [o for o in waiting if o.stamp_ns < start.stamp_ns]
+            self._waiting = [o for o in waiting if o.stamp_ns > start.stamp_ns]
+            if start.stamp_ns > self._seen_ns:
+                new.append(start)
+                self._seen_ns = start.stamp_ns
+        _look_at(seen, new)
+        return seen.branch(observation)
+
+
+def _look_at(episode: ImaginedEpisode, observations: Sequence[Observation]) -> None:
+    """The episode observes these, at the model's size."""
+    if observations:
+        frames = np.stack([observation.frames for observation in observations], axis=1)
+        positions = [episode.observation, *observations]
+        episode.observe(frames, np.stack([observation.positions for observation in positions]))
