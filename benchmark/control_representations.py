@@ -115,7 +115,7 @@ def train_row(name: str, options: argparse.Namespace) -> dict[str, Any]:
     checkpoint = train(
         TrainingRun(
             config=config,
-            dataset=select(options.train, options.split).paths,
+            dataset=tuple(select(options.train, options.split).paths),
             num_episodes=options.episodes,
             out=folder,
             seed=options.seed,

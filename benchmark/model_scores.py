@@ -93,7 +93,7 @@ def run_of(options: argparse.Namespace, name: str, changes: dict[str, object]) -
     """Returns a training of the preset with changes, whose folder is `name`."""
     return TrainingRun(
         config=load_training_config(options.preset, changes),
-        dataset=select(options.train, 'all').paths,
+        dataset=tuple(select(options.train, 'all').paths),
         num_episodes=options.episodes,
         out=options.work / name,
         seed=options.seed,

@@ -68,6 +68,7 @@ def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[s
         'pictures': config['record']['pictures'],
     }
     usual = {
+        'robot': CollectConfig().robot,
         **plain['randomization'],
         'fps': f'{1 / plain["record"]["frame_period_s"]:g}',
         'pictures': plain['record']['pictures'],
