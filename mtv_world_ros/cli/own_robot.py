@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 import sys
 import tempfile
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_source
+from mtv_world_ros.cli.shared_options import add_source, names
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -132,7 +133,9 @@ def _add_doctor(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--seconds', type=float, default=10.0, help='with --live: how long to record'
     )
-    parser.add_argument('--views', help='comma-separated; default: all; needed with --live')
+    parser.add_argument(
+        '--views', type=names, help='comma-separated; default: all; needed with --live'
+    )
     add_source(parser)
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
@@ -146,14 +149,15 @@ def _doctor(arguments: argparse.Namespace) -> int:
         return _check(arguments, arguments.episode, arguments.episode.name)
     from mtv_world_ros.inspection.live import record_topics
 
-    views = _views(arguments)
-    if not views:
+    if not arguments.views:
         raise ConfigError('--live needs the names of the views: --views low,high')
     if arguments.robot is None or arguments.calibration is None:
         raise ConfigError('--live needs --robot and --calibration: topics do not carry them')
     with tempfile.TemporaryDirectory(prefix='mtv_world_doctor_') as folder:
-        print(f'recording {", ".join(views)} for {arguments.seconds:g} s', file=sys.stderr)
-        bag = record_topics(views, Path(folder) / 'live', arguments.seconds)
+        print(
+            f'recording {", ".join(arguments.views)} for {arguments.seconds:g} s', file=sys.stderr
+        )
+        bag = record_topics(arguments.views, Path(folder) / 'live', arguments.seconds)
         return _check(arguments, bag, 'live')
 
 
@@ -163,7 +167,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
 
     file, source = _robot_file(arguments, path)
     inspector = load_inspector(file)
-    episode = _read(path, _views(arguments), source, inspector.robot)
+    episode = _read(path, arguments.views, source, inspector.robot)
     inspection = inspector.inspect(episode)
     out = arguments.out or Path('out/doctor') / name
     _write_inspection(inspector, episode, inspection, out)
@@ -185,7 +189,7 @@ def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, Episod
 
 def _read(
     path: Path,
-    views: list[str] | None,
+    views: Sequence[str] | None,
     source: EpisodeSource,
     robot: RobotModel,
     unknown_mount: str = '',
@@ -215,12 +219,6 @@ def _write_inspection(
         pictures[view] = f'{view}.png'
         write_whole(out / pictures[view], encode_png(inspector.picture(episode, view)))
     write_whole(out / 'report.md', to_markdown(inspection, pictures))
-
-
-def _views(arguments: argparse.Namespace) -> list[str] | None:
-    if arguments.views is None:
-        return None
-    return [name.strip() for name in arguments.views.split(',') if name.strip()]
 
 
 def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_overwrite
+from mtv_world_ros.cli.shared_options import add_overwrite, names
 from mtv_world_ros.files import check_free
 
 
@@ -23,7 +23,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
     parser.add_argument('--init', type=Path, metavar='DIR', help='start from DIR/object_motion')
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
-    parser.add_argument('--views', default='low,high', help='comma-separated')
+    parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument(
         '--starts',
         type=int,
@@ -69,10 +69,9 @@ def _train(arguments: argparse.Namespace) -> int:
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
-    views = [view.strip() for view in arguments.views.split(',')]
     paths = find_episodes(arguments.dataset)
     refuse_test_kinds(paths, 'training')
-    tracks, skipped = read_tracks(paths, robot, views, arguments.starts)
+    tracks, skipped = read_tracks(paths, robot, arguments.views, arguments.starts)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     held_out = [starts[0] for starts in tracks[::20]]
