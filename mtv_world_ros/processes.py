@@ -13,6 +13,7 @@ import sys
 #: tells a node whose child it is: it ends with that process, however that ends
 PARENT_VARIABLE = 'MTV_WORLD_PARENT'
 _STOP_S = 30.0
+_TAIL_BYTES = 4000
 
 
 def private_domain() -> dict[str, str]:
@@ -58,6 +59,13 @@ def start_process(
             env={**(os.environ if environment is None else environment), **parent},
             start_new_session=True,
         )
+
+
+def last_line(log: Path, otherwise: str) -> str:
+    """Returns what a process wrote last into its log; `otherwise` where it wrote nothing."""
+    tail = log.read_bytes()[-_TAIL_BYTES:].decode(errors='replace')
+    lines = [line.strip() for line in tail.splitlines() if line.strip()]
+    return lines[-1] if lines else otherwise
 
 
 def stop_process(process: subprocess.Popen[bytes] | None) -> None:

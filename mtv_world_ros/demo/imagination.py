@@ -18,6 +18,7 @@ from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
 from mtv_world_ros.model.card import read_card, spec_of
 from mtv_world_ros.processes import (
+    last_line,
     module_command,
     private_domain,
     ros_arguments,
@@ -102,10 +103,9 @@ def imagine_episodes(
             stop_process(started.get(name))
     status = started['runner'].returncode
     if status != 0:
-        said = (logs / 'runner.log').read_text(errors='replace').strip().splitlines()
+        text = last_line(logs / 'runner.log', 'silently')
         raise EpisodeError(
-            f'the episode runner ended with status {status}: {said[-1] if said else "silently"} '
-            f"(logs are in '{logs}')"
+            f"the episode runner ended with status {status}: {text} (logs are in '{logs}')"
         )
     return json.loads((out / 'episodes.json').read_text())
 
@@ -117,8 +117,7 @@ def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:
         time.sleep(0.2)
         dead = [n for n, p in processes.items() if p is not runner and p.poll() is not None]
         if dead and not (logs.parent / 'episodes.json').is_file():
-            said = (logs / f'{dead[0]}.log').read_text(errors='replace').strip().splitlines()
-            text = said[-1] if said else 'silently'
+            text = last_line(logs / f'{dead[0]}.log', 'silently')
             if any(logs.parent.glob('.episode_*')):  # the runner notices, and closes the record
                 with suppress(subprocess.TimeoutExpired):
                     runner.wait(60.0)

@@ -14,7 +14,7 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.processes import module_command, start_process, stop_process
+from mtv_world_ros.processes import last_line, module_command, start_process, stop_process
 
 
 def record_topics(
@@ -55,8 +55,7 @@ def _start(
 
 
 def _failure(log: Path) -> EpisodeError:
-    said = [line for line in log.read_text(errors='replace').splitlines() if line.strip()]
     return EpisodeError(
-        f'the topics could not be recorded: {said[-1] if said else "no message"} (are the robot '
+        f'the topics could not be recorded: {last_line(log, "no message")} (are the robot '
         'and its cameras running, with the same ROS_DOMAIN_ID?)'
     )

@@ -13,7 +13,7 @@ import time
 import weakref
 
 from mtv_world_ros.errors import PolicyServerError
-from mtv_world_ros.processes import start_process
+from mtv_world_ros.processes import last_line, start_process
 
 #: stands for the port in a command
 PORT = '{port}'
@@ -21,7 +21,6 @@ PORT = '{port}'
 MAX_STARTS = 3
 _POLL_S = 0.1
 _STOP_S = 5.0
-_LOG_TAIL_BYTES = 4000
 
 
 class ServerProcess:
@@ -98,7 +97,7 @@ class ServerProcess:
             if status is not None:
                 raise PolicyServerError(
                     f"the server of policy '{self._name}' ended with status {status} when it was "
-                    f"started: {self._last_line()} ('{self._log}')"
+                    f"started: {last_line(self._log, 'its log is empty')} ('{self._log}')"
                 )
             if _listens(self.port):
                 return
@@ -109,11 +108,6 @@ class ServerProcess:
             f"{self._start_timeout_s:g} s ('start_timeout_s'); its command must use {PORT}, its "
             f"log is '{self._log}'"
         )
-
-    def _last_line(self) -> str:
-        tail = self._log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors='replace')
-        lines = [line for line in tail.splitlines() if line.strip()]
-        return lines[-1].strip() if lines else 'its log is empty'
 
 
 def _tie() -> list[str]:
