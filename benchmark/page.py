@@ -36,6 +36,7 @@ DESCRIBES = {
     'evaluation': ('mtv_world_ros/evaluation',),
     'foresight': ('mtv_world_ros/ros',),
     'forward_kinematics': ('mtv_world_ros/geometry',),
+    'interval_coverage': ('mtv_world_ros/evaluation/metrics',),
     'long_rollouts': ('mtv_world_ros/model',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),

@@ -1,6 +1,7 @@
 """`mtv-world import-bag`: a robot's own bags, with TF, its description and no commands."""
 
 from dataclasses import replace
+import shlex
 
 from bags import record
 from crane import FPS, load, make_cameras, make_positions, render
@@ -70,6 +71,17 @@ def test_views_joints_cameras_and_robot_come_from_the_bag(
     np.testing.assert_allclose(commanded, positions[1:], atol=1e-9)
     guessed = load_robot(tmp_path / 'out' / 'robot' / 'robot.yaml')
     assert guessed.tools[0].gripper_joint == 'jaw_left' and guessed.base_link == 'plinth'
+
+
+def test_the_look_at_the_robot_that_is_printed_runs(robot, scene, tmp_path, capsys, monkeypatch):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    assert run(tmp_path, bag) == 0
+    words = shlex.split(capsys.readouterr().out.partition('look at it with: ')[2].split('\n')[0])
+    assert words[:2] == ['mtv-world', 'robot']
+    monkeypatch.chdir(tmp_path)
+    assert main(words[1:]) == 0
+    assert (tmp_path / 'out' / 'robot' / 'crane.png').is_file()
 
 
 def test_again_keeps_what_is_there_and_another_mapping_is_named(robot, scene, tmp_path, capsys):

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.ranking.ranking_report import markdown, remarks, write_ranking
+from mtv_world_ros.ranking.ranking_report import console, markdown, remarks, write_ranking
 from mtv_world_ros.ranking.ranking_summary import Summary
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 
@@ -103,6 +103,22 @@ def test_files_hold_the_same_numbers_and_the_page_is_whole(summary, tmp_path):
         tree = ElementTree.fromstring(chart)
         assert sum(found.get('class') == 'point' for found in tree.iter('g')) == 3
     assert len(charts) == 4 and not list(tmp_path.rglob('*.part'))
+
+
+def test_tables_fit_a_console_and_no_column_is_empty(summary, make_result):
+    long = [
+        make_result(f'expert-elsewhere-0.1{"0" * i}', k, k > i, 0.9 if k else nan, end='time out')
+        for i in range(4)
+        for k in range(4)
+    ]
+    many = Summary(results=long, failed=summary.failed, num_true=2, provenance={})
+    for one in (summary, many):
+        rows = [line for line in console(one).splitlines() if line.startswith('|')]
+        assert rows and max(map(len, rows)) <= 100
+        for part in re.findall(r'(?:^\|.*\|\n?)+', console(one), re.M):
+            cells = [line.strip('| ').split(' | ') for line in part.strip().splitlines()]
+            columns = list(zip(*(cells[:1] + cells[2:]), strict=True))
+            assert all(any(c.strip() not in ('', '–') for c in col[1:]) for col in columns)
 
 
 def test_a_result_survives_its_file(make_result):

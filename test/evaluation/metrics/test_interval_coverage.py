@@ -1,0 +1,41 @@
+"""Intervals of the reports in 1,000 simulated sets: they hold the truth as often as they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import sys
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(scope='module')
+def benchmark(tmp_path_factory):
+    """The benchmark's script, which imports its neighbour `page`."""
+    import importlib
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / 'benchmark'))
+        yield importlib.import_module('interval_coverage')
+    for name in ('interval_coverage', 'page'):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize('name', ['t, mean of J', 'Wilson, share of independent trials'])
+def test_the_table_is_what_the_code_gives_and_93_to_97_percent_hold(benchmark, name):
+    """Any change of an interval, or of the draws, changes it."""
+    (page,) = (ROOT / 'benchmark' / 'results').glob('interval_coverage_*.md')
+    row = re.search(rf'^\| {name} \| (.+) \|$', page.read_text(), re.M)
+    told = [float(cell.split()[0]) for cell in row[1].split(' | ')]
+    found = [benchmark.coverage(name, num, 1000, 0)[0] for num in benchmark.SIZES]
+    np.testing.assert_allclose(told, found, atol=6e-4)
+    assert benchmark.SIZES == (4, 8, 20, 60)
+    assert 0.93 <= min(found) <= max(found) <= 0.97
+
+
+def test_the_percentile_bootstrap_did_not(benchmark):
+    covered, _ = benchmark.coverage('before: percentile bootstrap, mean of J', 4, 300, 0)
+    assert covered < 0.9
