@@ -22,6 +22,8 @@ from mtv_world_ros.vision.jaccard import jaccard
 
 #: an object has parted where its overlap is too small in so many frames in a row
 _FRAMES_APART = 3
+#: an object is hidden where this share of what was seen of it at first is seen in neither world
+_HIDDEN = 1 / 3
 #: files of a rollout: both worlds as a video and a contact sheet, and as frames with masks
 VIDEO, SHEET, FRAMES = '.mp4', '.webp', '.rollout.npz'
 #: quality of a video is lowered until it is smaller [bytes]
@@ -138,12 +140,14 @@ def command_gaps(real: Sequence[FloatArray], imagined: Sequence[FloatArray]) -> 
 def object_overlaps(true: BoolArray, found: BoolArray) -> FloatArray:
     """Returns (O, T) J of masks (V, O, T', H, W) of two worlds, in the view of the largest J.
 
-    NaN where no view shows the object in either world.
+    NaN where no view shows the object in either world: little of it is seen in both, as where it
+    lies below another one, and J of what is left says nothing.
     """
     common = min(true.shape[2], found.shape[2])
     true, found = true[:, :, :common], found[:, :, :common]
     scores = jaccard(found, true)
-    shown = (true | found).any(axis=(-2, -1))
+    seen = np.maximum(true.sum(axis=(-2, -1)), found.sum(axis=(-2, -1)))
+    shown = seen > _HIDDEN * seen[:, :, :1]
     best = np.where(shown, scores, -1.0).max(axis=0)
     return np.where(shown.any(axis=0), best, nan)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from browser import Browser
 import numpy as np
 import pytest
 
@@ -51,6 +52,16 @@ def test_what_no_view_shows_has_no_overlap():
     nothing = np.zeros_like(block(0))
     assert np.isnan(object_overlaps(nothing, nothing)).all()
     assert (object_overlaps(block(4), nothing) == 0).all()
+
+
+def test_what_is_hidden_in_both_worlds_does_not_part():
+    true, found = block(4), block(4)
+    true[:, :, 2:, :, :9] = False  # a column of six is left, and none of the other
+    found[:, :, 2:] = False
+    assert np.isnan(object_overlaps(true, found)[0, 2:]).all()
+    assert first_apart(object_overlaps(true, found)) == [-1]
+    # lost in one world alone
+    assert first_apart(object_overlaps(block(4), found)) == [2]
 
 
 @dataclass
@@ -148,3 +159,24 @@ def test_a_course_survives_its_file_and_old_results_have_none(make_result):
     np.testing.assert_equal(back, course)
     assert Result.from_json({k: v for k, v in values.items() if k != 'course'}).course is None
     assert 'they part at 0.4 s' in curves(course)
+
+
+def test_the_page_plays_and_filters_rollouts_in_a_browser(ranked, tmp_path):
+    out, results = ranked
+    wrong = replace(results['expert'], final=False)
+    found = [results['expert-stop-0.3'], wrong]
+    page = write_ranking(Summary(results=found, failed={}, num_true=1, provenance={}), out)
+    browser = Browser(tmp_path / 'profile')
+    try:
+        browser.open(page.as_uri())
+        assert [text.split(' · ')[0] for text in browser.shown()] == ['expert', 'expert-stop-0.3']
+        browser.choose('verdict', 'false success')
+        assert len(browser.shown()) == 1
+        browser.choose('policy', 'expert-stop-0.3')
+        assert browser.shown() == []
+        browser.choose('verdict', 'all')
+        assert [text.split(' · ')[0] for text in browser.shown()] == ['expert-stop-0.3']
+        width, seconds = browser.play(1)
+        assert width > 300 and seconds > 0
+    finally:
+        browser.close()
