@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import ceil
 
 import cv2
 import numpy as np
@@ -30,6 +33,10 @@ _EDGE_RANGE = (0.25, 0.6)
 #: darker pixels have no hue [0-100]
 _MIN_LIGHTNESS = 8.0
 _TRACKING = TrackingConfig()
+#: pixels of at least this share of the core's saturation say what colour the object has
+_STRONG_SHARE = 0.8
+#: pixels of a view from which on views are looked at in threads of their own
+_LEAST_FOR_THREADS = 1_000_000
 
 
 class ColourSegmenter:
@@ -47,6 +54,21 @@ class ColourSegmenter:
         colours = _lab(np.array([list(PALETTE.values())], np.uint8))[0]
         self._saturations = _saturation(colours)
         self._word_of_ab = _hue_table(colours)
+        self._boxes = [self._box(word) for word in range(len(self._words))]
+
+    def _box(self, word: int) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+        """Least and greatest 8-bit L, a, b of pixels that `_pixels` may count as a word's."""
+        darkest = min(ceil(_MIN_LIGHTNESS * 2.55), 255)
+        floor = _MIN_SATURATION * self._saturations[word]
+        a, b = np.meshgrid(np.arange(256), np.arange(256), indexing='ij')
+        saturation = np.hypot(a - 128, b - 128) / (darkest * 100 / 255 + 16)
+        # a share of the core's, which is above the floor; less, for rounding
+        is_near = (self._word_of_ab == word) & (saturation > 0.99 * _STRONG_SHARE * floor)
+        rows, columns = np.flatnonzero(is_near.any(1)), np.flatnonzero(is_near.any(0))
+        if not len(rows):
+            return (255, 255, 255), (0, 0, 0)
+        low = darkest, int(rows[0]), int(columns[0])
+        return low, (255, int(rows[-1]), int(columns[-1]))
 
     def segment(
         self,
@@ -59,43 +81,49 @@ class ColourSegmenter:
         check_request(frames, names, first_masks, first_frames)
         num_views, num_frames, height, width, _ = frames.shape
         masks = np.zeros((num_views, len(names), num_frames, height, width), np.bool_)
-        status: list[list[str]] = []
-        for view in range(num_views):
+
+        def look_at(view: int) -> tuple[str, ...]:
             firsts = None if first_masks is None else first_masks[view]
-            tracks = self._segment_view(frames[view], names, firsts)
+            tracks = self._segment_view(frames[view], names, firsts, masks[view])
             for index, found in enumerate(tracks):
-                masks[view, index] = found.masks
-            status.append([found.status for found in tracks])
-        return ObjectMasks(names=names, masks=masks, status=tuple(map(tuple, status)))
+                if not np.shares_memory(found.masks, masks):
+                    masks[view, index] = found.masks
+            return tuple(found.status for found in tracks)
+
+        if num_frames * height * width < _LEAST_FOR_THREADS or cv2.getNumThreads() < 2:
+            status = tuple(map(look_at, range(num_views)))
+        else:  # most of it is OpenCV and numpy, which run beside each other
+            with ThreadPoolExecutor(min(num_views, cv2.getNumThreads())) as pool:
+                status = tuple(pool.map(look_at, range(num_views)))
+        return ObjectMasks(names=names, masks=masks, status=status)
 
     def _segment_view(
-        self, frames: ByteArray, names: tuple[str, ...], firsts: BoolArray | None
+        self,
+        frames: ByteArray,
+        names: tuple[str, ...],
+        firsts: BoolArray | None,
+        out: BoolArray,
     ) -> list[Track]:
-        """Tracks of the named objects in (T, H, W, 3) frames of one view."""
-        num_frames, height, width, _ = frames.shape
-        lab = cv2.cvtColor(frames.reshape(num_frames * height, width, 3), cv2.COLOR_RGB2LAB)
-        lab = np.asarray(lab, np.uint8).reshape(frames.shape)
-        words = self._word_of_ab[lab[..., 1], lab[..., 2]]
-        words[lab[..., 0] < _MIN_LIGHTNESS * 2.55] = len(self._words)
+        """Tracks of the named objects in (T, H, W, 3) frames of one view; `out` may take them."""
+        images = self._look(frames, names)
         tracks: list[Track] = []
         for index, name in enumerate(names):
             word = colour_of(name)
             if word is None:
-                tracks.append(Track.missing((num_frames, height, width), 'out_of_palette'))
+                tracks.append(Track.missing(frames.shape[:3], 'out_of_palette'))
                 continue
             rivals = [
                 i for i, other in enumerate(names) if colour_of(other) == word and i != index
             ]
             first = None if firsts is None or not firsts[index].any() else firsts[index]
             others = _others(tracks, rivals, index)
-            pixels = self._pixels(frames, lab, words == self._words.index(word), word)
-            found = track(pixels, first, _TRACKING, taken=others)
+            pixels = self._pixels(images, word)
+            found = track(pixels, first, _TRACKING, taken=others, out=out[index])
             if rivals and first is None and found.status == 'ok':
                 found = Track(masks=found.masks, status='ambiguous')
             tracks.append(found)
         return [
-            self._complete(tracks, index, name, firsts, (frames, lab, words))
-            for index, name in enumerate(names)
+            self._complete(tracks, index, name, firsts, images) for index, name in enumerate(names)
         ]
 
     def _complete(
@@ -104,42 +132,101 @@ class ColourSegmenter:
         index: int,
         name: str,
         firsts: BoolArray | None,
-        images: tuple[ByteArray, ByteArray, ByteArray],
+        images: _Images,
     ) -> Track:
         """The track of an object with its part of another colour, where its noun has one."""
         word = part_of(name, colour_of(name))
         if word is None or not tracks[index].masks.any():
             return tracks[index]
-        frames, lab, words = images
-        pixels = self._pixels(frames, lab, words == self._words.index(word), word)
+        pixels = self._pixels(images, word)
         others = [track.masks for i, track in enumerate(tracks) if i != index]
         first = None if firsts is None else firsts[index]
         return with_part(tracks[index], pixels, others, first, _TRACKING)
 
-    def _pixels(self, frames: ByteArray, lab: ByteArray, gate: BoolArray, word: str) -> BoolArray:
+    def _look(self, frames: ByteArray, names: tuple[str, ...]) -> _Images:
+        """Looks at (T, H, W, 3) frames for pixels of the hues that the names speak of.
+
+        All that are out of a word's box in CIELAB are too pale for `_pixels`: most of an image
+        is, and is looked at only once.
+        """
+        colours = [colour_of(name) for name in names]
+        parts = [part_of(name, word) for name, word in zip(names, colours, strict=True)]
+        wanted = sorted({word for word in (*colours, *parts) if word is not None})
+        nothing = (np.zeros(0, np.intp), np.zeros((0, 3), np.uint8))
+        found = {word: [nothing] for word in wanted}
+        num_pixels, width = frames[0, ..., 0].size, frames.shape[2]
+        for number, frame in enumerate(frames):
+            lab = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2LAB), np.uint8)
+            for word, pieces in found.items():
+                index = self._words.index(word)
+                near = cv2.findNonZero(cv2.inRange(lab, *self._boxes[index]))
+                if near is None:
+                    continue
+                at = np.asarray(near).reshape(-1, 2) @ np.array([1, width])
+                values = lab.reshape(-1, 3).take(at, axis=0)
+                is_word = self._word_of_ab[values[:, 1], values[:, 2]] == index
+                if not is_word.all():
+                    at, values = at[is_word], values[is_word]
+                pieces.append((at + number * num_pixels, values))
+        return _Images(
+            frames=frames,
+            background=_median(frames[:, ::4, ::4]),
+            inside={
+                word: (np.concatenate([at for at, _ in pieces]),
+                       np.concatenate([values for _, values in pieces]))
+                for word, pieces in found.items()
+            },
+        )  # fmt: skip
+
+    def _pixels(self, images: _Images, word: str) -> BoolArray:
         """(T, H, W) pixels of a colour, down to where the object makes up half of a pixel."""
         floor = _MIN_SATURATION * self._saturations[self._words.index(word)]
-        inside = np.flatnonzero(gate)
-        saturation = _saturation(_centred(lab.reshape(-1, 3)[inside]))
-        num_core = len(gate) * max(1, _TRACKING.min_area(gate.shape) // 2)
-        pixels = np.zeros(gate.shape, np.bool_)
+        inside, values = images.inside[word]
+        saturation = _saturation(_centred(values))
+        shape = images.frames.shape[:3]
+        num_core = shape[0] * max(1, _TRACKING.min_area(shape) // 2)
+        pixels = np.zeros(shape, np.bool_)
         if np.count_nonzero(saturation > floor) > num_core:
             core = np.partition(saturation, -num_core)[-num_core]
-            colour = np.median(frames.reshape(-1, 3)[inside[saturation > 0.8 * core]], axis=0)
-            floor = max(floor, _edge(colour, frames, core))
+            strong = inside[saturation > _STRONG_SHARE * core]
+            colour = _median(images.frames.reshape(-1, 3).take(strong, axis=0))
+            floor = max(floor, _edge(colour, images.background, core))
         pixels.reshape(-1)[inside[saturation > floor]] = True
         return pixels
 
 
-def _edge(colour: Floats, frames: ByteArray, core: float) -> float:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Images:
+    """The frames of one view, and what in them may be coloured objects.
+
+    Attributes:
+        frames: (T, H, W, 3) uint8 RGB.
+        background: (3,) the median colour, RGB.
+        inside: by word the N pixels of its hue, but for some of the palest: flat indices (N,)
+            into T, H, W, and (N, 3) uint8 CIELAB as OpenCV packs it.
+    """
+
+    frames: ByteArray
+    background: Floats
+    inside: dict[str, tuple[NDArray[np.intp], ByteArray]]
+
+
+def _edge(colour: Floats, background: Floats, core: float) -> float:
     """Saturation of a pixel that is half object, half background.
 
     A dark object's edge pixels look pale beside it, a light one's do not.
     """
-    background = np.median(frames[:, ::4, ::4].reshape(-1, 3), axis=0)
     mixed = np.round((colour + background) / 2).astype(np.uint8)
     edge = float(_saturation(_lab(mixed[None, None]))[0, 0])
     return min(max(edge, _EDGE_RANGE[0] * core), _EDGE_RANGE[1] * core)
+
+
+def _median(pixels: ByteArray) -> Floats:
+    """(3,) the median of (..., 3) uint8 by channel, which numpy takes longer to sort."""
+    channels = pixels.reshape(-1, 3).T
+    middle = [(channels.shape[1] - 1) // 2, channels.shape[1] // 2]
+    counts = [np.bincount(channel, minlength=256).cumsum() for channel in channels]
+    return np.array([np.searchsorted(count, middle, side='right').mean() for count in counts])
 
 
 def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolArray | None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, hypot
 from types import MappingProxyType
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,13 +71,18 @@ class Track:
 
 @dataclass(slots=True)
 class _State:
-    """Where the object was last seen, how large, and whether at the image's edge."""
+    """Where the object was last seen, how large, and whether at the image's edge.
+
+    `shown` counts the frames with the object, `slivers` those with no more than a sliver of it.
+    """
 
     centre: FloatArray | None = None
     area: float = 0.0
     gap: int = 0
     at_edge: bool = False
     status: str = 'ok'
+    shown: int = 0
+    slivers: int = 0
 
     def doubt(self, status: str) -> None:
         """Keeps the first reason for doubt."""
@@ -89,6 +95,7 @@ def track(
     first: BoolArray | None,
     config: TrackingConfig,
     taken: BoolArray | None = None,
+    out: BoolArray | None = None,
 ) -> Track:
     """Follows one object through the pixels of its colour.
 
@@ -97,20 +104,18 @@ def track(
         first: (H, W) its mask just before frame 0, where known.
         config: how pieces are joined and followed.
         taken: (T, H, W) pixels that another object of the same colour holds.
+        out: (T, H, W) all False, takes the masks; None = a new array.
     """
     if taken is not None:
         pixels = pixels & ~taken
-    masks = np.zeros(pixels.shape, np.bool_)
+    masks = np.zeros(pixels.shape, np.bool_) if out is None else out
     state = _State()
     if first is not None:
-        _remember(first, state)
-    for index, frame in enumerate(pixels):
-        found = _find(frame, state, config)
-        if found is None:
+        _remember(_patch(first), state)
+    for frame, mask in zip(pixels, masks, strict=True):
+        if not _find(_patch(frame), state, config, mask):
             state.gap += 1
-            continue
-        masks[index] = found
-    _doubt_whole(masks, state, config)
+    _doubt_whole(len(masks), state, config)
     return Track(masks=masks, status=state.status)
 
 
@@ -123,22 +128,54 @@ def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
         config: when to doubt.
     """
     state = _State()
-    _remember(first, state)
+    _remember(_patch(first), state)
     for mask in masks:
-        if mask.any():
-            _check(mask, state, config, hypot(*mask.shape))
+        patch = _patch(mask)
+        if patch.pixels.size:
+            _check(patch, state, config)
         else:
             state.gap += 1
-    _doubt_whole(masks, state, config)
+    _doubt_whole(len(masks), state, config)
     return state.status
 
 
-def _doubt_whole(masks: BoolArray, state: _State, config: TrackingConfig) -> None:
+class _Patch(NamedTuple):
+    """The part of a frame or mask outside which nothing is set.
+
+    Attributes:
+        pixels: (h, w) bool; a view.
+        top: its first row in the frame.
+        left: its first column.
+        shape: (H, W) of the frame.
+    """
+
+    pixels: BoolArray
+    top: int
+    left: int
+    shape: tuple[int, int]
+
+    def inside(self, mask: BoolArray) -> BoolArray:
+        """Returns the view of an (H, W) mask that the patch covers."""
+        height, width = self.pixels.shape
+        return mask[self.top : self.top + height, self.left : self.left + width]
+
+
+def _patch(frame: BoolArray) -> _Patch:
+    """The patch of what is set in a frame (H, W); begins at even pixels, empty if nothing is.
+
+    Connected components are found in blocks of 2 by 2: those of the patch are numbered as those
+    of the frame.
+    """
+    left, top, width, height = cv2.boundingRect(frame.view(np.uint8))
+    right, bottom = left + width, top + height
+    left, top = left - left % 2, top - top % 2
+    return _Patch(frame[top:bottom, left:right], top, left, frame.shape)
+
+
+def _doubt_whole(num_frames: int, state: _State, config: TrackingConfig) -> None:
     """Sets the status of an object that is absent, out of view, lost or barely visible."""
-    shown = [mask for mask in masks if mask.any()]
-    if len(shown) >= (1 - config.max_missing) * len(masks) and shown:
-        slivers = sum(not _has_body(mask) for mask in shown)
-        if slivers > config.max_slivers * len(shown):
+    if state.shown >= (1 - config.max_missing) * num_frames and state.shown:
+        if state.slivers > config.max_slivers * state.shown:
             state.doubt('barely_visible')
     elif state.centre is None:
         state.doubt('absent')
@@ -148,38 +185,54 @@ def _doubt_whole(masks: BoolArray, state: _State, config: TrackingConfig) -> Non
         state.doubt('lost')
 
 
-def _find(frame: BoolArray, state: _State, config: TrackingConfig) -> BoolArray | None:
-    """Finds the object in one frame and updates the state."""
-    components = cv2.connectedComponentsWithStats(frame.view(np.uint8), connectivity=8)
-    count, labels = components[:2]
-    stats, centres = np.asarray(components[2], np.int64), np.asarray(components[3], np.float64)
+def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray) -> bool:
+    """Finds the object in one frame's pixels and updates the state.
+
+    Args:
+        patch: pixels of the object's colour.
+        state: of the track so far.
+        config: how pieces are joined and followed.
+        mask: (H, W) all False; the object is set in it.
+
+    Returns:
+        Whether it was found.
+    """
+    if not patch.pixels.size:
+        return False
+    components = cv2.connectedComponentsWithStats(patch.pixels.view(np.uint8), connectivity=8)
+    labels, stats = components[1], np.asarray(components[2], np.int64)
     areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     areas[0] = 0
-    largest = config.max_area_share * frame.size
-    pieces = np.flatnonzero((areas >= config.min_area(frame.shape)) & (areas <= largest))
+    largest = config.max_area_share * mask.size
+    pieces = np.flatnonzero((areas >= config.min_area(mask.shape)) & (areas <= largest))
     if not len(pieces):
-        if count > 1 and areas.max() > largest:
+        if areas.max() > largest:
             state.doubt('ambiguous')
-        return None
-    diagonal = hypot(*frame.shape)
+        return False
     if state.centre is None:
         main = int(pieces[np.argmax(areas[pieces])])
     else:
-        main = _nearest(pieces, areas, centres, state.centre, config.max_step * diagonal)
+        # sums of whole pixels, which are exact, so that the frame's edge does not matter
+        sums = np.rint(np.asarray(components[3]) * stats[:, 4:]) + stats[:, 4:] * patch[2:0:-1]
+        centres = sums[pieces] / stats[pieces, 4:]
+        main = _nearest(pieces, areas, centres, state.centre, config.max_step * hypot(*mask.shape))
     joined = _join(main, pieces, stats, config)
     rest = [areas[piece] for piece in pieces if piece not in joined]
     if state.centre is None and rest and max(rest) >= config.rival_share * areas[main]:
         state.doubt('ambiguous')
-    mask = np.isin(labels, joined)
-    _check(mask, state, config, diagonal)
-    return mask
+    is_joined = np.zeros(len(areas), np.bool_)
+    is_joined[joined] = True
+    found = is_joined[labels]
+    patch.inside(mask)[...] = found
+    _check(patch._replace(pixels=found), state, config)
+    return True
 
 
 def _nearest(
     pieces: Labels, areas: FloatArray, centres: FloatArray, centre: FloatArray, reach: float
 ) -> int:
     """Label of the piece nearest to the last position; small pieces must be clearly nearer."""
-    steps = np.hypot(*(centres[pieces] - centre).T)
+    steps = np.hypot(*(centres - centre).T)
     size = np.sqrt(areas[pieces] / areas[pieces].max())
     return int(pieces[np.argmin(steps / reach - size)])
 
@@ -200,29 +253,36 @@ def _has_body(mask: BoolArray) -> bool:
     return bool((pairs[:, 1:] & pairs[:, :-1]).any())
 
 
-def _check(mask: BoolArray, state: _State, config: TrackingConfig, diagonal: float) -> None:
-    """Doubts jumps in place or area, then remembers the mask."""
-    centre, area = _centroid(mask), float(np.count_nonzero(mask))
-    if state.centre is not None:
-        step = hypot(*(centre - state.centre))
-        if step > config.max_step * diagonal * (1 + state.gap):
+def _check(patch: _Patch, state: _State, config: TrackingConfig) -> None:
+    """Doubts jumps in place or area, then remembers the mask, which is not empty."""
+    centre, area = state.centre, state.area
+    gap = state.gap
+    _remember(patch, state)
+    if centre is not None and state.centre is not None:
+        step = hypot(*(state.centre - centre))
+        if step > config.max_step * hypot(*patch.shape) * (1 + gap):
             state.doubt('teleport')
-    if state.area and area > config.max_growth * max(state.area, 5 * config.min_area(mask.shape)):
+    if area and state.area > config.max_growth * max(area, 5 * config.min_area(patch.shape)):
         state.doubt('area_jump')
-    _remember(mask, state)
+    state.shown += 1
+    state.slivers += not _has_body(patch.pixels)
 
 
-def _remember(mask: BoolArray, state: _State) -> None:
-    state.centre, state.area = _centroid(mask), float(np.count_nonzero(mask))
-    state.gap = 0
-    border = (mask[0], mask[-1], mask[:, 0], mask[:, -1])
-    state.at_edge = any(bool(line.any()) for line in border)
-
-
-def _centroid(mask: BoolArray) -> FloatArray:
-    """(2,) x, y of the mean pixel [px]."""
-    rows, columns = np.nonzero(mask)
-    return np.array([columns.mean(), rows.mean()])
+def _remember(patch: _Patch, state: _State) -> None:
+    by_row, by_column = np.count_nonzero(patch.pixels, 1), np.count_nonzero(patch.pixels, 0)
+    area = by_row.sum()
+    x = (by_column @ np.arange(patch.left, patch.left + len(by_column))) / area
+    y = (by_row @ np.arange(patch.top, patch.top + len(by_row))) / area
+    state.centre, state.area, state.gap = np.array([x, y]), float(area), 0
+    ends = np.array([patch.top + len(by_row), patch.left + len(by_column)]) == patch.shape
+    starts = patch.top == 0, patch.left == 0
+    border = (
+        starts[0] and by_row[0],
+        ends[0] and by_row[-1],
+        starts[1] and by_column[0],
+        ends[1] and by_column[-1],
+    )
+    state.at_edge = any(map(bool, border))
 
 
 #: noun -> colour word of a part that such things have beside their main colour

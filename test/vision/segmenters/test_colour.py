@@ -270,3 +270,16 @@ def test_resized_mask_covers_half_pixels():
     mask[0, :4, :6] = True
     small = resize_masks(mask, 2, 2)
     assert small.tolist() == [[[True, True], [False, False]]]
+
+
+def test_no_pixel_that_may_count_is_left_out_by_its_words_box():
+    """Over all 8-bit CIELAB at four lightnesses: hue of the word, saturation near the floor."""
+    segmenter = ColourSegmenter()
+    a, b = np.meshgrid(np.arange(256), np.arange(256), indexing='ij')
+    for word, (low, high) in enumerate(segmenter._boxes):
+        floor = 0.8 * 0.3 * segmenter._saturations[word]
+        for lightness in (21, 60, 128, 255):
+            saturation = np.hypot(a - 128.0, b - 128.0) / (lightness / 2.55 + 16)
+            counts = (segmenter._word_of_ab == word) & (saturation > floor)
+            in_box = (a >= low[1]) & (a <= high[1]) & (b >= low[2]) & (b <= high[2])
+            assert low[0] <= 21 and not (counts & ~in_box).any(), word
