@@ -95,6 +95,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='an episode also ends when the task is done, or the estimate abstains, after N '
         'answers in a row; default: only the policy and --max-chunks end it',
     )
+    parser.add_argument(
+        '--no-clips',
+        dest='clips',
+        action='store_false',
+        help='keep the last frames of each rollout alone, without a video to play: faster',
+    )
     add_overwrite(parser)
     add_checkpoint(parser)
     add_dtype(parser)
@@ -129,6 +135,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         num_inference_steps=arguments.steps,
         max_chunks=arguments.max_chunks,
         hold=arguments.hold,
+        clips=arguments.clips,
     )
     if listed:
         policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())

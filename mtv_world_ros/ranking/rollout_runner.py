@@ -43,12 +43,15 @@ class RolloutConfig:
         max_chunks: answers of the policy at most.
         hold: an episode also ends when the task is done, or the estimate abstains, after this
             number of answers in a row; 0 = then it goes on.
+        clips: keep each rollout as a video, a contact sheet and frames; takes as long as
+            imagining it.
         make_policy: makes a policy for an episode.
     """
 
     num_inference_steps: int = 1
     max_chunks: int = 8
     hold: int = 0
+    clips: bool = True
     make_policy: MakePolicy = scripted_policy
 
     def __post_init__(self) -> None:
@@ -140,7 +143,10 @@ class RolloutRunner:
                 'imagining': imagining_s,
             },
             course=both.course(),
-            files={'.png': base64.b64encode(last).decode(), **both.files()},
+            files={
+                '.png': base64.b64encode(last).decode(),
+                **(both.files() if self.config.clips else {}),
+            },
         )
 
     def _begin(self, real: SimulatedRollout, job: Job) -> ImaginedEpisode:
