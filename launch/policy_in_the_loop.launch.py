@@ -23,6 +23,13 @@ OPTIONS = {
 }
 
 
+def end_launch(event, context):
+    """Ends the launch with a process; where that failed, with an exit status."""
+    if event.returncode and not context.is_shutdown:
+        raise RuntimeError(f'{event.process_name} ended with status {event.returncode}')
+    return Shutdown(reason='all episodes are over')
+
+
 def generate_launch_description():
     """Arguments, and the command that starts world model, policy, runner and recorder."""
     arguments = [
@@ -53,7 +60,7 @@ def generate_launch_description():
             cmd=[command, 'imagine', *start, *options],
             output='screen',
             condition=IfCondition(condition),
-            on_exit=Shutdown(reason='all episodes are over'),
+            on_exit=end_launch,
         )
         for condition, start in runs.items()
     ]

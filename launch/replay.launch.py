@@ -15,6 +15,13 @@ from launch_ros.substitutions import FindPackageShare
 SHARE = FindPackageShare('mtv_world_ros')
 
 
+def end_launch(event, context):
+    """Ends the launch with a process; where that failed, with an exit status."""
+    if event.returncode and not context.is_shutdown:
+        raise RuntimeError(f'{event.process_name} ended with status {event.returncode}')
+    return Shutdown(reason='the episode is over')
+
+
 def generate_launch_description():
     """Arguments, the node on the episode's clock, and the player in lock-step with it."""
     episode = LaunchConfiguration('episode')
@@ -66,6 +73,6 @@ def generate_launch_description():
                    '--rate', LaunchConfiguration('rate'),
                    '--wait-timeout', LaunchConfiguration('wait_timeout')],
         output='screen',
-        on_exit=Shutdown(reason='the episode is over'),
+        on_exit=end_launch,
     )  # fmt: skip
     return LaunchDescription([*arguments, node, player])

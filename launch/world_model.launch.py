@@ -25,6 +25,13 @@ PARAMETERS = {
 }
 
 
+def end_launch(event, context):
+    """Ends the launch with a process; where that failed, with an exit status."""
+    if event.returncode and not context.is_shutdown:
+        raise RuntimeError(f'{event.process_name} ended with status {event.returncode}')
+    return Shutdown(reason='world_model ended')
+
+
 def make_node(context):
     """The node, with the parameter file and what was given beside it."""
     given = {
@@ -43,7 +50,7 @@ def make_node(context):
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
         output='screen',
         emulate_tty=True,
-        on_exit=Shutdown(reason='world_model ended') if is_required else None,
+        on_exit=end_launch if is_required else None,
     )
     return [node]
 

@@ -106,6 +106,22 @@ def test_replays_in_two_namespaces_at_once(launch):
 
 
 @pytest.mark.native_ros
+@pytest.mark.parametrize(
+    ('name', 'argument', 'said'),
+    [
+        ('replay.launch.py', 'checkpoint:=/nowhere', 'world_model'),
+        ('replay.launch.py', 'episode:=/nowhere', 'nowhere'),
+        ('policy_in_the_loop.launch.py', 'episodes:=/nowhere', 'nowhere'),
+    ],
+)
+def test_a_process_that_fails_is_the_status_of_the_launch(launch, name, argument, said):
+    process = launch(name, argument)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 1, output
+    assert said in output and 'ended with status 1' in output
+
+
+@pytest.mark.native_ros
 def test_policy_lives_an_episode_and_the_launch_ends(launch, tmp_path):
     episode = share_path('resource', 'demo_episode')
     process = launch(

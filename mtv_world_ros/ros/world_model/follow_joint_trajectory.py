@@ -90,6 +90,7 @@ class FollowJointTrajectory:
         robot: whose joints goals move.
         settings: the present parameters.
         on_goal: gets the goals, to hand them back by `started` or `refused`.
+        start_waiting: hands back those that wait.
         give_up: pre-empts a plan, by the number of its rollout, with a text.
     """
 
@@ -101,10 +102,11 @@ class FollowJointTrajectory:
         settings: Callable[[], Settings],
         *,
         on_goal: Callable[[Goal], None],
+        start_waiting: Callable[[], None],
         give_up: Callable[[int, str], None],
     ) -> None:
         self._action, self._robot, self._settings = action, robot, settings
-        self._on_goal, self._give_up = on_goal, give_up
+        self._on_goal, self._start_waiting, self._give_up = on_goal, start_waiting, give_up
         self._goals: dict[int, Goal] = {}
         self._server = _Server(
             node,
@@ -145,6 +147,7 @@ class FollowJointTrajectory:
         self._on_goal(Goal(handle=handle))
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        self._start_waiting()  # it may have come with the goal
         for rollout, goal in self._goals.items():
             if goal.handle == handle:
                 self._give_up(rollout, 'cancelled by its client')

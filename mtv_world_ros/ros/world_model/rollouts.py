@@ -151,6 +151,7 @@ class Rollouts:
             self._robot,
             self._settings,
             on_goal=self._on_trajectory,
+            start_waiting=self._start_rollouts,
             give_up=self._worker.give_up,
         )
         undo.callback(action.close)

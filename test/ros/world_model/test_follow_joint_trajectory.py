@@ -136,6 +136,18 @@ def test_cancel_in_mid_chunk(client, new_controller, ros):
 
 
 @needs_control_msgs
+def test_cancel_right_behind_the_goal(client, new_controller, ros):
+    controller = new_controller()
+    client.set(seed=BLOCKS)
+    for _ in range(10):
+        handle = controller.send(ros.make_trajectory())
+        answer = handle.cancel_goal_async()
+        client.wait(answer.done, 'an answer')
+        assert answer.result().goals_canceling
+        assert controller.result(handle)[0] == GoalStatus.STATUS_CANCELED
+
+
+@needs_control_msgs
 def test_cancel_after_a_chunk_tells_what_was_known(client, new_controller, ros):
     controller = new_controller()
     client.set(seed=SLOW)
