@@ -167,6 +167,11 @@ class _LateScoring(_Scoring):
             self._score = _raising(error)
 
 
+def threads_each(workers: int) -> int:
+    """Returns the usable cores' share of each of some processes, at least 1."""
+    return max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)
+
+
 def score_all(
     jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
 ) -> Iterator[tuple[Job, Outcome]]:

@@ -18,7 +18,7 @@ from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 

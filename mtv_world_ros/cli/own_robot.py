@@ -113,11 +113,10 @@ def describe(robot: RobotModel) -> str:
 
 
 def _draw_robot(robot: RobotModel, path: Path) -> None:
-    from mtv_world_ros.data.bag.messages import encode_png
-    from mtv_world_ros.files import write_whole
     from mtv_world_ros.inspection.robot_picture import robot_picture
+    from mtv_world_ros.rendering.images import write_png
 
-    write_whole(path, encode_png(robot_picture(robot)))
+    write_png(path, robot_picture(robot))
 
 
 def _add_doctor(commands: argparse._SubParsersAction) -> None:
@@ -210,14 +209,14 @@ def _read(
 def _write_inspection(
     inspector: Inspector, episode: Episode, inspection: Inspection, out: Path
 ) -> None:
-    from mtv_world_ros.data.bag.messages import encode_png
     from mtv_world_ros.files import write_whole
     from mtv_world_ros.inspection.inspection_report import to_markdown
+    from mtv_world_ros.rendering.images import write_png
 
     pictures = {}
     for view in episode.views:
         pictures[view] = f'{view}.png'
-        write_whole(out / pictures[view], encode_png(inspector.picture(episode, view)))
+        write_png(out / pictures[view], inspector.picture(episode, view))
     write_whole(out / 'report.md', to_markdown(inspection, pictures))
 
 
@@ -255,14 +254,13 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from mtv_world_ros.data.bag.messages import encode_png
-    from mtv_world_ros.files import write_whole
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.geometry.robot_shape import load_shape
     from mtv_world_ros.inspection.camera_pose import difference
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.inspect import overlay_picture
+    from mtv_world_ros.rendering.images import write_png
 
     out = arguments.out or Path('out/camera') / f'{arguments.view}.yaml'
     known = load_calibration(out) if out.is_file() else {}
@@ -293,7 +291,7 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
         load_shape(robot).parts,
         JointTrack(episode.joint_states, robot),
     )
-    write_whole(out.with_suffix('.png'), encode_png(picture))
+    write_png(out.with_suffix('.png'), picture)
     print(f'calibration: {out}\nlook at it: {out.with_suffix(".png")}')
     return 0
 

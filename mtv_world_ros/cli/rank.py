@@ -119,7 +119,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.ranking.ranking_summary import Summary
     from mtv_world_ros.ranking.rollout_runner import RolloutConfig
     from mtv_world_ros.ranking.run_jobs import FOLDER, run_jobs
-    from mtv_world_ros.sim.collect.contact_sheet import write_sheet
+    from mtv_world_ros.rendering.images import write_png
 
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
@@ -176,7 +176,7 @@ def _rank(arguments: argparse.Namespace) -> int:
             continue
         sheet = flip_sheet(results, optimism[name].flips, out / FOLDER)
         if sheet is not None:
-            write_sheet(out / 'flips.png', sheet)
+            write_png(out / 'flips.png', sheet)
     print(f'{console(summaries[0])}\n\nreport: {path}')
     return 0
 

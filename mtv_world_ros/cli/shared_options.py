@@ -124,8 +124,9 @@ def add_dtype(parser: argparse.ArgumentParser) -> None:
 
 def threads_of_workers(arguments: argparse.Namespace) -> int:
     """Returns the CPU threads of each of `--workers` processes: as asked, else its share."""
-    cores = len(os.sched_getaffinity(0))
-    return arguments.threads or max(cores // max(arguments.workers, 1), 1)
+    from mtv_world_ros.parallel import threads_each
+
+    return arguments.threads or threads_each(arguments.workers)
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:

@@ -177,9 +177,10 @@ def use_threads(arguments: argparse.Namespace) -> None:
 
     import torch
 
+    from mtv_world_ros.parallel import threads_each
+
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
-    cores = max(1, len(os.sched_getaffinity(0)) // processes)
-    torch.set_num_threads(arguments.threads or cores)
+    torch.set_num_threads(arguments.threads or threads_each(processes))
 
 
 def run_of(

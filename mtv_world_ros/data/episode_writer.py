@@ -29,6 +29,7 @@ from mtv_world_ros.data.episode import (
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.calibration_file import save_calibration
+from mtv_world_ros.rendering.images import encode_jpeg, encode_png
 
 
 class EpisodeWriter(BagWriter):
@@ -83,7 +84,7 @@ class EpisodeWriter(BagWriter):
                 f"view '{view}': frame is {rgb.shape} {rgb.dtype}, expected (H, W, 3) uint8"
             )
         if compressed:
-            data = messages.encode_jpeg(rgb, self._jpeg_quality)
+            data = encode_jpeg(rgb, self._jpeg_quality)
             self._write_compressed(
                 f'{image_topic(view)}/compressed',
                 view,
@@ -111,7 +112,7 @@ class EpisodeWriter(BagWriter):
             raise EpisodeError(
                 f"view '{view}': mask is {ids.shape} {ids.dtype}, expected (H, W) uint8"
             )
-        data = messages.encode_png(ids)
+        data = encode_png(ids)
         self._write_compressed(
             mask_topic(view), view, stamp_ns, 'mono8; png compressed mono8', data
         )

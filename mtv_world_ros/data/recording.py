@@ -32,7 +32,7 @@ from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.rendering.resize import resize_frames, resize_labels
+from mtv_world_ros.rendering.images import resize_frames, resize_labels
 
 DEFAULT = EpisodeSource()
 #: largest distance of a frame from the wanted time, as a share of the model's period

@@ -30,11 +30,11 @@ from mtv_world_ros.evaluation.video import (
     Comparison,
     contact_sheet,
     side_by_side,
-    write_png,
     write_video,
 )
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.rendering.images import write_png
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-import os
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -32,7 +31,7 @@ from mtv_world_ros.evaluation.report.evaluation_summary import Group, Summary
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import check_same_settings, plain, write_json
-from mtv_world_ros.parallel import score_all
+from mtv_world_ros.parallel import score_all, threads_each
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.describers.scene_objects import names_of
@@ -269,9 +268,7 @@ class _Run:
             return score_all(jobs, here, 1, 1)
         there = partial(make_scorer, self.parallel.make_pipeline, self.config, self.out)
         workers = self.parallel.workers
-        usable = len(os.sched_getaffinity(0))
-        threads = self.parallel.threads or max(usable // max(workers, 1), 1)
-        return score_all(jobs, there, workers, threads)
+        return score_all(jobs, there, workers, self.parallel.threads or threads_each(workers))
 
     def _file(self, job: Job) -> Path:
         return self.out / 'episodes' / f'{job.name}.json'

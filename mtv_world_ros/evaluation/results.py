@@ -23,7 +23,7 @@ from mtv_world_ros.evaluation.metrics.scores import episode_means, QUALITY, Scor
 from mtv_world_ros.evaluation.video import compare, decode_video, encode_video
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.rendering.resize import resize_frames, resize_labels
+from mtv_world_ros.rendering.images import resize_frames, resize_labels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -165,13 +165,6 @@ def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
     return f'{kind}  {caption}' if kind == 'imagined' else kind
 
 
-def write_png(path: Path, image: ByteArray) -> None:
-    """Writes an RGB picture beside its name and renames it."""
-    done, data = cv2.imencode('.png', image[..., ::-1])
-    assert done
-    write_whole(path, data.tobytes())
-
-
 def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> None:
     """Writes (T, H, W, 3) uint8 RGB frames of even size as H.264 in MP4.
 

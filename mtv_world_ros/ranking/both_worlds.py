@@ -17,7 +17,7 @@ from mtv_world_ros.pipeline import ObservedChunk
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, Course, OBJECTS_PART, THRESHOLD
 from mtv_world_ros.ranking.worlds import SeenChunk
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: an object has parted where its overlap is too small in so many frames in a row

@@ -30,6 +30,7 @@ from mtv_world_ros.evaluation.metrics.statistics import (
     UNKNOWN,
 )
 from mtv_world_ros.ranking.rollout_jobs import Judged, Result
+from mtv_world_ros.rendering.images import encode_png
 from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, parse_variant
 
 #: who judges: field of a result -> words
@@ -298,8 +299,7 @@ def is_nearer(imagined: ByteArray, real: ByteArray, other: ByteArray) -> bool:
 def last_frames_png(real: ByteArray, imagined: ByteArray) -> bytes:
     """Returns a PNG of a rollout's last frames (V, H, W, 3): views in a row, real ones on top."""
     rows = [np.concatenate(list(frames), axis=1) for frames in (real, imagined)]
-    picture = cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR)
-    return cv2.imencode('.png', picture)[1].tobytes()
+    return encode_png(np.concatenate(rows))
 
 
 def read_last_frames(path: Path) -> tuple[ByteArray, ByteArray] | None:

@@ -6,7 +6,6 @@ import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from tqdm import tqdm
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
-from mtv_world_ros.parallel import Outcome, score_all
+from mtv_world_ros.parallel import Outcome, score_all, threads_each
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
@@ -128,8 +127,7 @@ def _scored(
         from mtv_world_ros.parallel import score_with_ray
 
         return score_with_ray(jobs, make, workers, ray_address)
-    threads = max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)
-    return score_all(jobs, make, workers, threads)
+    return score_all(jobs, make, workers, threads_each(workers))
 
 
 def _path(out: Path, job: Job) -> Path:

@@ -24,7 +24,7 @@ from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ranking.rollout_jobs import Judged
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.sim.collect.record import START_NS
 from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final

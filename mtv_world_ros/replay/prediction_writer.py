@@ -13,6 +13,7 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode import optical_frame
 from mtv_world_ros.data_types import ByteArray, CameraModel, ObjectMasks
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.rendering.images import encode_jpeg
 
 NODE = '/world_model'
 FLOAT64 = 'std_msgs/msg/Float64'
@@ -108,7 +109,7 @@ class PredictionWriter(BagWriter):
             messages.COMPRESSED_IMAGE,
             header=messages.make_header(stamp_ns, frame_id),
             format='rgb8; jpeg compressed bgr8',
-            data=np.frombuffer(messages.encode_jpeg(rgb, self._jpeg_quality), np.uint8),
+            data=np.frombuffer(encode_jpeg(rgb, self._jpeg_quality), np.uint8),
         )
         topic = f'{base}/image_raw/compressed'
         self.write_message(topic, messages.COMPRESSED_IMAGE, stamp_ns, image)

@@ -14,10 +14,9 @@ from mtv_world_ros.evaluation.video import (
     contact_sheet,
     KINDS,
     side_by_side,
-    write_png,
     write_video,
 )
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames, write_png
 from mtv_world_ros.viewing.streams import read_streams, Streams
 
 SHEET, VIDEO = 'contact_sheet.png', 'comparison.mp4'

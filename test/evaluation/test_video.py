@@ -10,9 +10,9 @@ from mtv_world_ros.evaluation.video import (
     Comparison,
     contact_sheet,
     side_by_side,
-    write_png,
     write_video,
 )
+from mtv_world_ros.rendering.images import write_png
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.transforms import inverse, quaternion
+from mtv_world_ros.rendering.images import encode_jpeg
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FRAMES = {'door': 'door_optical', 'palm': 'palm_optical'}
@@ -128,7 +129,7 @@ def _write_view(bag: Bag, stamp: int, view: str, camera: CameraModel, frame: Byt
     if view == 'palm':
         message = messages.make(
             messages.COMPRESSED_IMAGE, header=header, format='rgb8; jpeg compressed bgr8',
-            data=np.frombuffer(messages.encode_jpeg(frame, 95), np.uint8),
+            data=np.frombuffer(encode_jpeg(frame, 95), np.uint8),
         )  # fmt: skip
         topic = f'/cell/{view}/color/image_raw/compressed'
         bag.write(topic, messages.COMPRESSED_IMAGE, stamp, message)

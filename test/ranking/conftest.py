@@ -11,7 +11,7 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.ranking.rollout_runner import RolloutConfig, RolloutRunner
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy

@@ -14,6 +14,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rendering.images import encode_jpeg
 from mtv_world_ros.viewing.streams import read_streams
 
 EPISODE = share_path('resource', 'demo_episode')
@@ -34,7 +35,7 @@ def write_predictions(path: Path) -> Path:
                     messages.COMPRESSED_IMAGE,
                     header=header,
                     format='rgb8; jpeg compressed bgr8',
-                    data=np.frombuffer(messages.encode_jpeg(frame, 90), np.uint8),
+                    data=np.frombuffer(encode_jpeg(frame, 90), np.uint8),
                 )
                 topic = f'/world_model/low/{stream}/image_raw/compressed'
                 data = messages.serialize(messages.COMPRESSED_IMAGE, image)

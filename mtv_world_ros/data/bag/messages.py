@@ -7,7 +7,6 @@ from functools import cache
 import struct
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.serde import SerdeError
@@ -246,20 +245,3 @@ def parse_joint_trajectory(message: Any) -> JointTrajectory:
         positions=np.array([point.positions for point in message.points]).reshape(shape),
         velocities=None if rates is None else np.array(rates).reshape(shape),
     )
-
-
-def encode_jpeg(rgb: NDArray[np.uint8], quality: int) -> bytes:
-    """JPEG file of an (H, W, 3) RGB image."""
-    return _encode('.jpg', rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """PNG file of an (H, W, 3) RGB or (H, W) image."""
-    return _encode('.png', image[..., ::-1] if image.ndim == 3 else image, [])
-
-
-def _encode(extension: str, image: NDArray[np.uint8], options: list[int]) -> bytes:
-    encoded, data = cv2.imencode(extension, np.ascontiguousarray(image), options)
-    if not encoded:
-        raise EpisodeError(f'an image of shape {image.shape} cannot be encoded as {extension}')
-    return data.tobytes()

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.data_types import CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import to_positions
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection

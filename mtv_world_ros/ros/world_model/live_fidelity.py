@@ -16,7 +16,7 @@ from std_msgs.msg import Float32MultiArray
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
-from mtv_world_ros.rendering.resize import resize_frames
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import to_multi_array
 from mtv_world_ros.ros.messages.rejection import Rejection

@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.parallel import run_all
-from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, SHEET_FILE, write_sheet
+from mtv_world_ros.rendering.images import encode_png
+from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, SHEET_FILE
 from mtv_world_ros.sim.collect.dataset_card import (
     card_of,
     check_same_set,
@@ -23,6 +24,7 @@ from mtv_world_ros.sim.collect.dataset_card import (
     remove_leftovers,
     TASKS_SET,
     write_card,
+    write_file,
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.sim.collect.dataset_readme import write_readme
@@ -216,7 +218,7 @@ class _DataSet:
         """Writes the card as data and as text, and the contact sheets."""
         self._write_card()
         entries = list(self.entries.values())
-        write_sheet(self._out / SHEET_FILE, contact_sheet(self._out, entries))
+        write_file(self._out / SHEET_FILE, encode_png(contact_sheet(self._out, entries)))
         write_readme(self._out, self._card(), entries)
         if not sheets:
             return
@@ -224,7 +226,7 @@ class _DataSet:
             chosen = [e for e in entries if (e.zero_shot, e.task) == key]
             name = '_'.join(part for part in key if part)
             sheet = contact_sheet(self._out, chosen, pairs=4, num_frames=8, width=240)
-            write_sheet(self._out / SHEETS_FOLDER / f'{name}.png', sheet)
+            write_file(self._out / SHEETS_FOLDER / f'{name}.png', encode_png(sheet))
 
     def _card(self) -> dict[str, Any]:
         return card_of(self._kind, self._seed, self._config, self.entries.values())

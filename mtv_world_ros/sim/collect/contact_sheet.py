@@ -10,7 +10,7 @@ import numpy as np
 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry, write_file
+from mtv_world_ros.sim.collect.dataset_card import EpisodeEntry
 
 SHEET_FILE = 'contact_sheet.png'
 OUTCOMES = ('success', 'failure')
@@ -102,9 +102,3 @@ def contact_sheet(
     rows = [_row(out, pair, num_frames, width) for pair in _pairs(entries, pairs)]
     gap = np.full((_GAP, rows[0].shape[1], 3), _PAPER, np.uint8)
     return np.concatenate([part for row in rows for part in (row, gap)])
-
-
-def write_sheet(path: Path, sheet: ByteArray) -> None:
-    """Writes a picture (H, W, 3) uint8 RGB as PNG."""
-    _, data = cv2.imencode('.png', np.ascontiguousarray(sheet[..., ::-1]))
-    write_file(path, data.tobytes())

@@ -7,7 +7,8 @@ import pytest
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, film_strip, write_sheet
+from mtv_world_ros.rendering.images import write_png
+from mtv_world_ros.sim.collect.contact_sheet import contact_sheet, film_strip
 from mtv_world_ros.sim.collect.dataset_card import (
     card_of,
     read_entry,
@@ -115,7 +116,7 @@ def test_the_contact_sheet_has_a_row_per_task_and_a_blank_for_what_is_missing(ma
     assert (sheet[row + 18 : row + 46, right:] == 235).all()
     larger = contact_sheet(tmp_path, entries, pairs=2, num_frames=3, width=16)
     assert larger.shape[0] == 3 * row
-    write_sheet(tmp_path / 'sheet.png', sheet)
+    write_png(tmp_path / 'sheet.png', sheet)
     assert (cv2.imread(str(tmp_path / 'sheet.png'))[..., ::-1] == sheet).all()
 
 

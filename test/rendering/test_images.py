@@ -1,6 +1,6 @@
 import numpy as np
 
-from mtv_world_ros.rendering.resize import resize_frames, resize_labels
+from mtv_world_ros.rendering.images import resize_frames, resize_labels
 
 
 def test_frames_shrink_to_the_mean_of_their_area():
