@@ -88,11 +88,11 @@ def measure(
 
     CPU time of this process, which other work on the machine lengthens less than wall time.
     """
-    spent = in_turns(candidates, repeats, clock=time.process_time)
-    return {
-        name: tuple(1e3 * float(found) for found in np.percentile(times, (50, 5, 95)))
-        for name, times in spent.items()
-    }
+    found = {}
+    for name, times in in_turns(candidates, repeats, clock=time.process_time).items():
+        median, low, high = (1e3 * float(at) for at in np.percentile(times, (50, 5, 95)))
+        found[name] = (median, low, high)
+    return found
 
 
 def in_turns(
