@@ -28,6 +28,7 @@ from mtv_world_ros.files import content_digest
 ROOT = Path(__file__).resolve().parents[1]
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
+    'camera_calibration': ('mtv_world_ros/inspection',),
     'collect': ('mtv_world_ros/sim',),
     'control_representations': ('mtv_world_ros/training', 'mtv_world_ros/model'),
     'denoising_steps': ('mtv_world_ros/model/sampler.py',),

@@ -55,6 +55,8 @@ _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 0.02)
 _LEAST_MOTION_PX = 6.0
 #: distance from the epipolar line beyond which a point is not of the still scene [px]
 _EPIPOLAR_PX = 1.5
+#: ways to turn that explain a stretch: by its essential matrix, and by its homography
+_NUM_TURNS = 5
 #: a stretch says where the camera points if link and camera turn by this at least [rad], and by
 #: the same angle up to this factor and this difference [rad]
 _LEAST_TURN, _TURN_FACTOR, _TURN_APART = 0.06, 0.15, 0.02
@@ -77,7 +79,8 @@ class SceneTracks:
         rays: (M, L, 3) unit rays in the optical frame.
         stretch: (M,) which stretch each is of, 0 .. S - 1, by time.
         positions: (S, L, J) of the joints.
-        turns: (S, 3) how the camera turned over a stretch, in its first optical frame [rad].
+        turns: (S, K, 3) ways in which the camera may have turned over a stretch, in its first
+            optical frame [rad]; NaN where there are fewer than K.
         focal_px: of the images that they were tracked in.
     """
 
@@ -140,14 +143,16 @@ class WristCamera:
         """
         carried = inverse(self._poses[:, 0]) @ self._poses[:, -1]
         links = [_vector(T[:3, :3]) for T in carried]
-        pairs = [(a, b) for a, b in zip(links, self._tracks.turns, strict=True) if _alike(a, b)]
-        turns = np.array(pairs).reshape(-1, 2, 3)
+        pairs = [(n, link, seen) for n, link in enumerate(links) for seen in self._tracks.turns[n]
+                 if _alike(link, seen)]  # fmt: skip
+        stretch = np.array([n for n, _, _ in pairs])
+        turns = np.array([pair[1:] for pair in pairs]).reshape(-1, 2, 3)
         best: tuple[int, FloatArray] = (0, np.eye(3))
         for pair in combinations(range(len(turns)), 2):
             R = _rotation_between(turns[list(pair)])
             if R is not None:
                 agree = _agree(R, turns)
-                count = int(agree.sum())
+                count = len(np.unique(stretch[agree]))
                 if count > best[0]:
                     better = _rotation_between(turns[agree])
                     best = (count, R if better is None else better)
@@ -298,7 +303,7 @@ def follow_scene(
         rays=np.concatenate([rays for rays, _, _ in found]),
         stretch=np.repeat(np.arange(len(found)), [len(rays) for rays, _, _ in found]),
         positions=joints.at(stamps.ravel()).reshape(*stamps.shape, len(robot.joint_names)),
-        turns=np.stack([turn for _, _, turn in found]),
+        turns=np.stack([turns for _, _, turns in found]),
         focal_px=float(small.K[0, 0]),
     )
 
@@ -306,17 +311,17 @@ def follow_scene(
 def _stretch(
     track: Track, chosen: np.ndarray, camera: CameraModel
 ) -> tuple[FloatArray, np.ndarray, FloatArray] | None:
-    """Rays (M, L, 3) tracked from the first frame on, the L frames, and the camera's turn."""
+    """Rays (M, L, 3) tracked from the first frame on, the L frames, and the camera's turns."""
     pixels = _tracked(track, chosen, camera)
     if len(pixels) < _LEAST_STILL or pixels.shape[1] < 3:
         return None
     steps = np.linspace(0, pixels.shape[1] - 1, _LENGTH).round().astype(int)
     rays = unproject(camera, pixels[:, steps])
     rays = rays[np.isfinite(rays).all(axis=(1, 2))]
-    still, R = _still_scene(rays, camera)
+    still, turns = _still_scene(rays, camera)
     if still.sum() < _LEAST_STILL:
         return None
-    return rays[still], chosen[steps], _vector(R.T)
+    return rays[still], chosen[steps], turns
 
 
 def _alike(link: FloatArray, seen: FloatArray) -> bool:
@@ -329,23 +334,32 @@ def _vector(R: FloatArray) -> FloatArray:
 
 
 def _still_scene(rays: FloatArray, camera: CameraModel) -> tuple[np.ndarray, FloatArray]:
-    """Tracks (N,) that move as one still scene would, and the turn R_last_first."""
+    """Tracks (N,) that move as one still scene would, and ways (K, 3) to turn that explain it.
+
+    Of a flat scene the essential matrix is not unique; its homography has up to four solutions.
+    """
     focal = float(camera.K[0, 0])
     first, last = (rays[:, k, :2] / rays[:, k, 2:] for k in (0, -1))
     moves = np.linalg.norm((rays[..., :2] / rays[..., 2:]) - first[:, None], axis=-1).max(axis=1)
     moving = moves * focal > _LEAST_MOTION_PX
-    nothing = np.zeros(len(rays), bool), np.eye(3)
+    nothing = np.zeros(len(rays), bool), np.full((_NUM_TURNS, 3), np.nan)
     if moving.sum() < _LEAST_STILL:
         return nothing
+    first, last = first[moving], last[moving]
     E, inside = cv2.findEssentialMat(
-        first[moving], last[moving], np.eye(3), cv2.RANSAC, 0.999, _EPIPOLAR_PX / focal
+        first, last, np.eye(3), cv2.RANSAC, 0.999, _EPIPOLAR_PX / focal
     )
     if E is None or E.shape != (3, 3):
         return nothing
-    _, R, _, _ = cv2.recoverPose(E, first[moving], last[moving], np.eye(3), mask=inside.copy())
+    rotations = [cv2.recoverPose(E, first, last, np.eye(3), mask=inside.copy())[1]]
+    H, _ = cv2.findHomography(first, last, cv2.RANSAC, 2 * _EPIPOLAR_PX / focal)
+    if H is not None:
+        rotations += list(cv2.decomposeHomographyMat(H, np.eye(3))[1])
+    turns = nothing[1]
+    turns[: len(rotations)] = [_vector(np.asarray(R).T) for R in rotations]
     still = np.zeros(len(rays), bool)
     still[np.flatnonzero(moving)[inside.ravel() > 0]] = True
-    return still, np.asarray(R, np.float64)
+    return still, turns
 
 
 def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArray:
