@@ -15,7 +15,7 @@ from mtv_world_ros.data.episode import check_outcome
 STATE = 'state'
 #: parts of an image topic's name that say nothing of the view
 _NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
-               'rgb', 'compressed', 'camera', 'image_rect_raw'}  # fmt: skip
+               'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
 #: no pictures of the scene
 _NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
 
@@ -23,7 +23,7 @@ _NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
 class ViewTopics(Schema):
     """Where a view is from."""
 
-    image: str = Field(description='topic of Image or CompressedImage')
+    image: str = Field(description='topic of Image, CompressedImage or FFMPEGPacket')
     camera_info: str = Field(default='', description='default: beside the images')
     frame: str = Field(
         default='', description="optical frame in TF; default: the CameraInfo's, or the images'"
@@ -129,7 +129,7 @@ def guess_views(topics: Collection[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for topic in sorted(topics):
-        plain = topic.removesuffix('/compressed')
+        plain = topic.removesuffix('/compressed').removesuffix('/ffmpeg')
         if any(word in plain for word in _NO_COLOURS):
             continue
         parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]

@@ -20,8 +20,14 @@ from mtv_world_ros.data.bag.image_decoding import (
     compressed_to_rgb,
     raw_to_rgb,
 )
-from mtv_world_ros.data.bag.messages import COMPRESSED_IMAGE, IMAGE
+from mtv_world_ros.data.bag.messages import IMAGE_TYPES
 from mtv_world_ros.data.bag.reader import BagReader, iter_messages
+from mtv_world_ros.data.bag.video_packets import (
+    check_packet,
+    FFMPEG_PACKET,
+    from_first_key,
+    VideoFrames,
+)
 from mtv_world_ros.data.bag_mapping import BagMapping, STATE
 from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
@@ -56,7 +62,7 @@ STREAMS = {
     'object_poses': OBJECT_POSES,
 }
 TF_TOPICS = ('/tf', '/tf_static')
-_PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed)?')
+_PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed|/ffmpeg)?')
 Item = TypeVar('Item')
 
 
@@ -216,11 +222,23 @@ class _EpisodeReader:
                 good.append((stamp, message))
             except MtvWorldError as error:
                 self._refuse(topic, error)
+        if self.types.get(topic) == FFMPEG_PACKET:
+            return self._video(topic, good)
         if not good:
             return None
         ordered = in_order(topic, good, self.warnings)
         stamps = np.array([stamp for stamp, _ in ordered], np.int64)
         return Track(stamps, LazyFrames(topic, [message for _, message in ordered], decode))
+
+    def _video(self, topic: str, packets: Stamped) -> Track | None:
+        whole = from_first_key(in_order(topic, packets, self.warnings))
+        if len(whole) < len(packets):
+            self._warn_once(f"'{topic}': {len(packets) - len(whole)} packets before the first key "
+                            'frame were left out')  # fmt: skip
+        if not whole:
+            return None
+        stamps = np.array([stamp for stamp, _ in whole], np.int64)
+        return Track(stamps, VideoFrames(topic, [message for _, message in whole]))
 
     def _take(self, topic: str, msgtype: str) -> Stamped:
         """Messages of a topic, in recorded order; those of another type are refused."""
@@ -419,7 +437,7 @@ def _rectified(info: Any) -> Any:
 
 
 def _is_raw(message: Any) -> bool:
-    return hasattr(message, 'encoding')
+    return hasattr(message, 'step')
 
 
 def _layout(message: Any) -> dict[str, Any]:
@@ -429,13 +447,15 @@ def _layout(message: Any) -> dict[str, Any]:
 def _check_image(message: Any) -> None:
     if _is_raw(message):
         check_raw(**_layout(message), num_bytes=len(message.data))
+    elif hasattr(message, 'pts'):
+        check_packet(message)
     else:
         check_compressed(message.format, message.data)
 
 
 def _to_rgb(message: Any) -> ByteArray:
     if _is_raw(message):
-        return raw_to_rgb(message.data, **_layout(message))
+        return raw_to_rgb(message.data, **_layout(message), is_bigendian=message.is_bigendian)
     return compressed_to_rgb(message.format, message.data)
 
 
@@ -490,7 +510,7 @@ def find_topics(
     Raises:
         EpisodeError: a view is not there, or `named` has a key that is neither.
     """
-    images = [topic for topic, kind in found.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+    images = [topic for topic, kind in found.items() if kind in IMAGE_TYPES]
     if views is None:
         views = [key for key in named if key not in STREAMS] or _plain_views(images)
     unknown = [key for key in named if key not in STREAMS and key not in views]
@@ -520,7 +540,8 @@ def _view_topics(
     path: Path, view: str, images: Sequence[str], named: Mapping[str, str]
 ) -> ViewTopics:
     wanted = named.get(view, image_topic(view))
-    image = next((t for t in (wanted, f'{wanted}/compressed') if t in images), None)
+    forms = (wanted, f'{wanted}/compressed', f'{wanted}/ffmpeg')
+    image = next((topic for topic in forms if topic in images), None)
     if image is None:
         there = _plain_views(images)
         raise EpisodeError(
@@ -528,7 +549,7 @@ def _view_topics(
             f"'{wanted}/compressed'; its views are {_listed(there)}{nearest(view, there)}, its "
             f'image topics {_listed(images)} (map a view to a topic in `topics`)'
         )
-    camera = image.removesuffix('/compressed').rpartition('/')[0]
+    camera = image.removesuffix('/compressed').removesuffix('/ffmpeg').rpartition('/')[0]
     return ViewTopics(
         image=image, camera_info=f'{camera}/camera_info', mask=f'{camera}/mask/compressed'
     )

@@ -59,12 +59,14 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
     """
     if mapping.views:
         return mapping
-    kinds = (messages.IMAGE, messages.COMPRESSED_IMAGE)
-    topics = [name for name, kind in BagReader(bag).topics().items() if kind in kinds]
+    found = BagReader(bag).topics()
+    topics = [name for name, kind in found.items() if kind in messages.IMAGE_TYPES]
     inside = [t for t in topics if t.startswith(mapping.topic(''))] or topics
     views = guess_views(inside)
     if not views:
-        raise EpisodeError(f"'{bag}' has no images (topics of Image or CompressedImage)")
+        raise EpisodeError(
+            f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket)"
+        )
     return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
 
 

@@ -29,6 +29,15 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     'bayer_bggr8': (1, cv2.COLOR_BayerRG2RGB),
     'bayer_gbrg8': (1, cv2.COLOR_BayerGR2RGB),
     'bayer_grbg8': (1, cv2.COLOR_BayerGB2RGB),
+    'mono16': (2, cv2.COLOR_GRAY2RGB),
+    'rgb16': (6, None),
+    'bgr16': (6, cv2.COLOR_BGR2RGB),
+    'rgba16': (8, cv2.COLOR_RGBA2RGB),
+    'bgra16': (8, cv2.COLOR_BGRA2RGB),
+    'bayer_rggb16': (2, cv2.COLOR_BayerBG2RGB),
+    'bayer_bggr16': (2, cv2.COLOR_BayerRG2RGB),
+    'bayer_gbrg16': (2, cv2.COLOR_BayerGR2RGB),
+    'bayer_grbg16': (2, cv2.COLOR_BayerGB2RGB),
     'uyvy': (2, cv2.COLOR_YUV2RGB_UYVY),
     'yuv422': (2, cv2.COLOR_YUV2RGB_UYVY),
     'yuyv': (2, cv2.COLOR_YUV2RGB_YUY2),
@@ -84,9 +93,17 @@ def _data_rows(encoding: str, height: int) -> int:
 
 
 def raw_to_rgb(
-    data: NDArray[np.uint8], *, encoding: str, height: int, width: int, step: int
+    data: NDArray[np.uint8],
+    *,
+    encoding: str,
+    height: int,
+    width: int,
+    step: int,
+    is_bigendian: int = 0,
 ) -> ByteArray:
     """(H, W, 3) RGB of the fields of a sensor_msgs/Image; `data` is flat uint8.
+
+    Of 16 bits the upper 8 are taken.
 
     Raises:
         ObservationError: as `check_raw`.
@@ -97,7 +114,9 @@ def raw_to_rgb(
     rows = np.lib.stride_tricks.as_strided(
         data, (num_rows, width * channels), (step, 1), writeable=False
     )
-    image = np.array(rows).reshape(num_rows, width, channels)
+    if encoding.endswith('16'):
+        rows = rows.reshape(num_rows, -1, 2)[..., 0 if is_bigendian else 1]
+    image = np.array(rows).reshape(num_rows, width, -1)
     return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
 
 

@@ -10,15 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.serde import SerdeError
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, FFMPEG_PACKET_DEFINITION
 from mtv_world_ros.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, nearest
 from mtv_world_ros.geometry.transforms import quaternion, rotation
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+#: of a view's images
+IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE, FFMPEG_PACKET)
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 JOINT_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
@@ -38,8 +41,10 @@ _ROS_DISTORTION = {'none': 'plumb_bob'}
 
 @cache
 def typestore() -> Typestore:
-    """Definitions of every message type that a Jazzy desktop installs."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """Definitions of every message type that a Jazzy desktop installs, and of video packets."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(FFMPEG_PACKET_DEFINITION, FFMPEG_PACKET))
+    return store
 
 
 def is_standard(msgtype: str) -> bool:

@@ -58,6 +58,7 @@ def to_rgb(message: Image | CompressedImage) -> ByteArray:
             height=message.height,
             width=message.width,
             step=message.step,
+            is_bigendian=message.is_bigendian,
         )
 
 

@@ -171,3 +171,22 @@ def test_masks_have_one_channel() -> None:
     colours = cv2.imencode('.png', np.zeros((8, 8, 3), np.uint8))[1].ravel()
     with pytest.raises(ObservationError, match=r'\(8, 8, 3\) uint8, expected \(H, W\)'):
         compressed_to_ids('rgb8; png compressed bgr8', colours)
+
+
+@pytest.mark.parametrize('is_bigendian', [0, 1])
+@pytest.mark.parametrize('encoding', ['rgb16', 'bgr16', 'mono16', 'bayer_rggb16'])
+def test_sixteen_bits_become_eight(encoding, is_bigendian) -> None:
+    eight = {'rgb16': 'rgb8', 'bgr16': 'bgr8', 'mono16': 'mono8', 'bayer_rggb16': 'bayer_rggb8'}
+    channels = 3 if 'b16' in encoding[1:5] or encoding == 'bgr16' else 1
+    values = np.random.default_rng(0).integers(0, 2**16, (4, 6 * channels), np.uint16)
+    data = values.astype('>u2' if is_bigendian else '<u2').view(np.uint8)
+    size = {'height': 4, 'width': 6}
+    wanted = raw_to_rgb(
+        (values >> 8).astype(np.uint8).ravel(),
+        encoding=eight[encoding], step=6 * channels, **size,
+    )  # fmt: skip
+    step = 12 * channels
+    found = raw_to_rgb(
+        data.ravel(), encoding=encoding, step=step, is_bigendian=is_bigendian, **size
+    )
+    assert np.array_equal(found, wanted)

@@ -1,0 +1,133 @@
+"""Video packets of ffmpeg_image_transport as frames: a packet an image, most are differences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import av
+from av.video.codeccontext import VideoCodecContext
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.bounded_input import check_limit, LimitError
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import EpisodeError, ObservationError
+
+FFMPEG_PACKET = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket'
+#: as in ros-misc-utilities/ffmpeg_image_transport_msgs
+FFMPEG_PACKET_DEFINITION = """std_msgs/Header header
+int32 width
+int32 height
+string encoding
+uint64 pts
+uint8 flags
+bool is_bigendian
+uint8[] data
+"""
+#: flag of a packet that can be decoded without the ones before it
+_KEY = 1
+#: encoders that are named where the codec should be, and the decoders of what they write
+_CODECS = {'libx264': 'h264', 'libx264rgb': 'h264', 'libx265': 'hevc', 'h265': 'hevc',
+           'libsvtav1': 'av1', 'libaom-av1': 'av1', 'librav1e': 'av1', 'libvpx': 'vp8',
+           'libvpx-vp9': 'vp9'}  # fmt: skip
+_HARDWARE = ('_nvenc', '_vaapi', '_qsv', '_nvmpi', '_v4l2m2m', '_videotoolbox', '_omx')
+
+
+def codec_of(encoding: str) -> str:
+    """Returns the decoder of a packet's `encoding`, e.g. `h264_nvenc` or `h264;yuv420p;bgr8`.
+
+    Raises:
+        ObservationError: there is none.
+    """
+    name = encoding.split(';')[0].strip().lower()
+    for suffix in _HARDWARE:
+        name = name.removesuffix(suffix)
+    name = _CODECS.get(name, name)
+    try:
+        av.Codec(name, 'r')
+    except (av.FFmpegError, ValueError) as error:
+        raise ObservationError(
+            f"video packets of encoding '{encoding}' cannot be decoded ({error})"
+        ) from error
+    return name
+
+
+def check_packet(message: Any) -> None:
+    """Checks the fields of an FFMPEGPacket.
+
+    Raises:
+        ObservationError: no such decoder, no data, or too large.
+    """
+    codec_of(message.encoding)
+    if len(message.data) == 0:
+        raise ObservationError('a video packet has no data')
+    try:
+        size = message.width * message.height
+        check_limit('image_pixels', size, f'a video of {message.width}x{message.height}')
+        check_limit('image_bytes', len(message.data), 'a video packet')
+    except LimitError as error:
+        raise ObservationError(str(error)) from error
+
+
+def from_first_key(messages: Sequence[tuple[int, Any]]) -> list[tuple[int, Any]]:
+    """Returns the (stamp, packet) from the first one on that needs no other."""
+    first = next((i for i, (_, m) in enumerate(messages) if m.flags & _KEY), len(messages))
+    return list(messages[first:])
+
+
+class VideoFrames:
+    """Frames of packets, decoded when asked for, in order best (`episode.Frames`).
+
+    Args:
+        topic: where they come from, for error texts.
+        packets: in the order of their stamps; the first one is a key frame.
+    """
+
+    def __init__(self, topic: str, packets: Sequence[Any]) -> None:
+        self._topic, self._packets = topic, packets
+        self._codec = codec_of(packets[0].encoding)
+        self._keys = [i for i, packet in enumerate(packets) if packet.flags & _KEY]
+        self._ahead: Iterator[tuple[int, ByteArray]] = iter(())
+        self._last: tuple[int, ByteArray] | None = None
+
+    def __len__(self) -> int:
+        return len(self._packets)
+
+    def __getitem__(self, index: Any) -> ByteArray:
+        chosen = np.arange(len(self))[index]
+        if chosen.ndim == 0:
+            return self._frame(int(chosen))
+        frames = [self._frame(int(i)) for i in chosen]
+        return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        frames = self[:]
+        return frames if dtype is None else frames.astype(dtype, copy=False)
+
+    def _frame(self, wanted: int) -> ByteArray:
+        key = max(i for i in self._keys if i <= wanted)
+        if self._last is None or not key <= self._last[0] <= wanted:
+            self._ahead, self._last = self._decoded(key), None
+        while self._last is None or self._last[0] < wanted:
+            self._last = next(self._ahead, None)
+            if self._last is None:
+                raise EpisodeError(f"'{self._topic}', frame {wanted}: its packet gives no image")
+        if self._last[0] != wanted:
+            raise EpisodeError(f"'{self._topic}', frame {wanted}: its packet gives no image")
+        return self._last[1]
+
+    def _decoded(self, key: int) -> Iterator[tuple[int, ByteArray]]:
+        """Yields number and image of the frames from a key frame on."""
+        context = av.CodecContext.create(self._codec, 'r')
+        assert isinstance(context, VideoCodecContext)
+        try:
+            for number in range(key, len(self._packets)):
+                packet = av.Packet(bytes(self._packets[number].data))
+                packet.pts = packet.dts = number
+                for frame in context.decode(packet):
+                    yield int(frame.pts or 0), frame.to_ndarray(format='rgb24')
+            for frame in context.decode(None):
+                yield int(frame.pts or 0), frame.to_ndarray(format='rgb24')
+        except av.FFmpegError as error:
+            raise EpisodeError(f"'{self._topic}': a video packet is damaged ({error})") from error
