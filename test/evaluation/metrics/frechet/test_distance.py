@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.metrics.frechet.distance import frechet_distance, frechet_interval
+from mtv_world_ros.evaluation.metrics.frechet.feature_store import (
+    frechet_distance,
+    frechet_interval,
+)
 
 
 def sample(mean, covariance, count=400, seed=0):
