@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from page import parse_arguments, publish, table
 
@@ -22,6 +23,7 @@ from mtv_world_ros.assembly import recorded_robot
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
 from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.robot_shape import moving_links
 from mtv_world_ros.inspection.inspect import Inspector, load_inspector
 
@@ -120,23 +122,36 @@ def judge(
         yield name, section.verdict
 
 
-def fixed_views(inspector: Inspector, path: Path) -> Episode:
-    """Returns an episode with the views that stand still, decoded."""
+def fixed_views(inspector: Inspector, path: Path, width: int) -> Episode:
+    """Returns an episode with the views that stand still, decoded and shrunk to a width [px]."""
     episode = read_episode(path, with_masks=False)
     moving = moving_links(inspector.robot)
     views = tuple(v for v in episode.views if episode.cameras[v].mount_link not in moving)
-    images = {v: episode.images[v] for v in views}
-    decoded = {v: t._replace(frames=np.asarray(t.frames)) for v, t in images.items()}
-    return replace(episode, views=views, images=decoded)
+    cameras = {v: episode.cameras[v] for v in views}
+    small = {v: scaled(c, width, round(width * c.height / c.width)) for v, c in cameras.items()}
+    images = {
+        v: episode.images[v]._replace(
+            frames=np.stack(
+                [
+                    cv2.resize(frame, (c.width, c.height), interpolation=cv2.INTER_AREA)
+                    for frame in np.asarray(episode.images[v].frames)
+                ]
+            )
+        )
+        for v, c in small.items()
+    }
+    return replace(episode, views=views, images=images, cameras=small)
 
 
-def count(dataset: Path, repeats: int, seed: int) -> tuple[str, dict[str, Counter[str]]]:
+def count(
+    dataset: Path, repeats: int, seed: int, width: int
+) -> tuple[str, dict[str, Counter[str]]]:
     """Returns the robot of a data set, and the verdicts of each fault in `repeats` views."""
     rng, paths = np.random.default_rng(seed), list_episodes(dataset)
     inspector = load_inspector(recorded_robot(paths[0], read_info(paths[0]).robot))
     counts: dict[str, Counter[str]] = {name: Counter() for name in FAULTS}
     for path in rng.permutation(np.array(paths, dtype=object)):
-        episode = fixed_views(inspector, path)
+        episode = fixed_views(inspector, path, width)
         for view in episode.views:
             if counts['as it is'].total() < repeats:
                 for name, verdict in judge(inspector, episode, view, rng):
@@ -150,13 +165,17 @@ def main() -> None:
 
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('datasets', type=Path, nargs='+')
+        parser.add_argument('--width', type=int, default=384, help='of the images [px]')
 
     options = parse_arguments(__doc__, 20, more)
-    found = dict(count(path, options.repeats, options.seed) for path in options.datasets)
+    found = dict(
+        count(path, options.repeats, options.seed, options.width) for path in options.datasets
+    )
     rows = [[name, *(_cell(name, counts[name]) for counts in found.values())] for name in FAULTS]
     body = (
         'Views that were judged right: passed (`ok`) as they are, found (`suspicious` or '
-        '`broken`) with a fault; n is the number of views of each robot at most.\n\n'
+        '`broken`) with a fault; n is the number of views of each robot at most. Images are '
+        f'{options.width} px wide; each sign of a fault is as likely.\n\n'
         + table(['the view', *(f'`{name}`' for name in found)], rows)
     )
     title = 'Which faults does the doctor find, and which right views does it pass?'
