@@ -104,10 +104,9 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Pre-empts the plan that runs and frees the model."""
+        """Pre-empts the plan that runs; the model is freed when its client has been told."""
         if self._rollouts is not None:
             self._rollouts.deactivate()
-        self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -143,6 +142,8 @@ class WorldModelNode(LifecycleNode):
         self._settings = parameters.read(self, Settings)
 
     def _on_period(self) -> None:
+        if self._lifecycle() == 'finalized':
+            self._release()
         if self._rollouts is not None:
             self._rollouts.refresh()
         self._reporter.publish_diagnostics()

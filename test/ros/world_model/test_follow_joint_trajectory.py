@@ -4,6 +4,8 @@ import importlib
 from importlib.util import find_spec
 
 from action_msgs.msg import GoalStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
 from rclpy.action import ActionClient
@@ -81,6 +83,11 @@ def code(controller, name):
     return getattr(controller.messages.Result, name)
 
 
+def change(client, transition):
+    request = ChangeState.Request(transition=Transition(id=transition))
+    assert client.call(ChangeState, '/world_model/change_state', request).success
+
+
 @pytest.mark.skipif(find_spec('control_msgs') is not None, reason='control_msgs is installed')
 def test_without_control_msgs_the_node_says_so_once_and_goes_on(node, client):
     assert client.imagine_one()['state'] == 'done'
@@ -139,7 +146,8 @@ def test_cancel_in_mid_chunk(client, new_controller, ros):
 def test_cancel_right_behind_the_goal(client, new_controller, ros):
     controller = new_controller()
     client.set(seed=BLOCKS)
-    for _ in range(10):
+    for _ in range(5):
+        client.send_scene()
         handle = controller.send(ros.make_trajectory())
         answer = handle.cancel_goal_async()
         client.wait(answer.done, 'an answer')
@@ -269,22 +277,28 @@ def test_reset_ends_a_goal(client, new_controller, ros):
 
 @needs_control_msgs
 def test_an_inactive_node_aborts_goals_and_says_so(client, new_controller, ros):
-    from lifecycle_msgs.msg import Transition
-    from lifecycle_msgs.srv import ChangeState
-
-    def change(transition):
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert client.call(ChangeState, '/world_model/change_state', request).success
-
     controller = new_controller()
     client.set(seed=BLOCKS)
     running = controller.send(ros.make_trajectory())
     client.wait(lambda: client.diagnostic_values().get('busy') == 'true', 'the model')
-    change(Transition.TRANSITION_DEACTIVATE)
+    change(client, Transition.TRANSITION_DEACTIVATE)
     assert 'the node was deactivated' in controller.result(running)[2]
     refused = controller.send(ros.make_trajectory())
     assert 'the node is inactive' in controller.result(refused)[2]
-    change(Transition.TRANSITION_ACTIVATE)
+    change(client, Transition.TRANSITION_ACTIVATE)
     client.set(seed=0)
     client.send_scene()
     assert controller.result(controller.send(ros.make_trajectory()))[1] == 0
+
+
+@needs_control_msgs
+def test_shutting_down_in_mid_rollout_ends_the_goal(client, new_controller, ros):
+    """The last one: the node is finalized after it."""
+    controller = new_controller()
+    client.set(seed=BLOCKS)
+    running = controller.send(ros.make_trajectory())
+    client.wait(lambda: client.diagnostic_values().get('busy') == 'true', 'the model')
+    change(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    status, _, text = controller.result(running)
+    assert status == GoalStatus.STATUS_ABORTED and 'the node was deactivated' in text
+    client.wait(lambda: client.diagnostic_values().get('lifecycle') == 'finalized', 'health')

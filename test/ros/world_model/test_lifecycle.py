@@ -137,6 +137,7 @@ def test_shutdown_in_mid_rollout_preempts_the_plan(start, client, ros):
     assert manager.state() == 'finalized'
     assert not manager.change(CONFIGURE)
     assert not manager.change(label='configure')
+    client.wait(lambda: not client.node.count_publishers(PREDICTED), 'the end of topics')
     client.wait(lambda: client.diagnostic_values().get('lifecycle') == 'finalized', 'health')
 
 
