@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.documents import Table
+from mtv_world_ros.documents import DASH, Table
 from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, curve
 from mtv_world_ros.evaluation.metrics.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD, summarise
@@ -23,6 +23,13 @@ BRACKETS = (
     f'Brackets: {METHOD}. J moving, persistence and shuffled actions: of the '
     'objects that really move.'
 )
+#: why a column is empty although objects that move were scored
+_NOT_MADE = {
+    'j_shuffled_moving': "no rollout was imagined with another episode's actions (`--actions`, "
+    'or there is no other episode)',
+    'j_ceiling_moving': 'recorded frames were not scored through the autoencoder (`--no-ceiling`)',
+    'j_self_moving': 'recorded frames were not scored themselves (`--no-ceiling`)',
+}
 #: what a set of episodes that the model was trained for is called beside zero-shot sets
 SEEN = 'seen'
 
@@ -159,6 +166,7 @@ class Summary:
             self._truth(),
             BRACKETS,
             tables.markdown_table([*by_view, ('all views', self.estimates(None))], 'view'),
+            self._why_dashes(),
             tables.markdown_table(sets, 'zero-shot set · view') if sets else '',
             tables.markdown_table(by_task, 'task · view'),
             tables.controls_table(by_view),
@@ -169,6 +177,32 @@ class Summary:
             '\n'.join(f'- {r.episode}: {note}' for r in self.results for note in r.notes),
         ]
         return '\n\n'.join(part for part in parts if part) + '\n'
+
+    def _why_dashes(self) -> str:
+        """Why numbers of objects are not there, a line each; empty where all are."""
+        missing = [
+            key for key in tables.COLUMNS if tables.cell(self.estimates(None).get(key)) == DASH
+        ]
+        named = [row for row in self._rows(None, ALL) if row.name]
+        scored = [row for row in named if np.isfinite(row.j)]
+        if not missing:
+            return ''
+        if not named:
+            return (
+                'Dashes: no object is named in any episode, so that none is scored. Name them '
+                'with `--describer`, or in the episodes.'
+            )
+        if not scored:
+            counts = ', '.join(f'{n} {word}' for word, n in self._statuses(None).items())
+            return f'Dashes: no named object could be scored in any stretch ({counts}).'
+        if not any(row.moving for row in scored):
+            return 'Dashes: no object that was scored really moves.'
+        lines = [
+            f'Dashes of {tables.COLUMNS[key]}: {_NOT_MADE[key]}.'
+            for key in missing
+            if key in _NOT_MADE
+        ]
+        return '\n'.join(lines)
 
     @property
     def num_true(self) -> int:
