@@ -132,7 +132,13 @@ class Robot:
         )
 
 
-def row(reports: list[dict[str, str]], pace: str, rate: float) -> list[str]:
+def cpu_s(pid: int) -> float:
+    """CPU time that a process has used [s], all threads."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def row(reports: list[dict[str, str]], pace: str, rate: float, node_cpu_s: float) -> list[str]:
     """One line of the table."""
     chunks = {r['rollout']: r for r in reports if r['state'] == 'chunk'}
     sent = {r['rollout']: r for r in reports if r['state'] == 'published'}
@@ -143,6 +149,7 @@ def row(reports: list[dict[str, str]], pace: str, rate: float) -> list[str]:
         return f'{np.median(values):.2f}' if values else '–'
 
     leads = [float(r['lead_s']) for r in chunks.values()]
+    early = sum(lead > PLAN_S / 2 for lead in leads)
     computed = sum(int(r.get('num_chunks', 0)) > 0 for r in reports if r['state'] in ENDS)
     return [
         pace,
@@ -154,6 +161,8 @@ def row(reports: list[dict[str, str]], pace: str, rate: float) -> list[str]:
         median('latency_s', chunks),
         median('lead_s', chunks),
         f'{min(leads):.2f}' if leads else '–',
+        f'{early} of {len(leads)}',
+        f'{node_cpu_s / len(chunks):.2f}' if chunks else '–',
         median('first_frame_s', sent),
         median('frame_lead_s', sent),
     ]
@@ -176,8 +185,9 @@ def measure(options: argparse.Namespace) -> list[list[str]]:
             robot.connect()
             robot.live(2 * PLAN_S, 1 / PLAN_S)  # the first ones take longer
             for rate in RATES:
+                before_s = cpu_s(process.pid)
                 robot.live(options.seconds, rate)
-                rows.append(row(robot.reports, pace, rate))
+                rows.append(row(robot.reports, pace, rate, cpu_s(process.pid) - before_s))
                 print(*rows[-1], sep=' | ', flush=True)
         finally:
             node.destroy_node()
@@ -203,13 +213,16 @@ def main() -> int:
     rclpy.init()
     rows = measure(options)
     header = ['pace', 'plans a second', 'plans', 'ended', 'with a chunk', 'with a verdict',
-              'plan to verdict [s]', 'lead [s]', 'least lead [s]', 'plan to first frame [s]',
-              'frames ahead [s]']  # fmt: skip
+              'plan to verdict [s]', 'lead [s]', 'least lead [s]', 'in the first half',
+              'CPU a chunk [s]', 'plan to first frame [s]', 'frames ahead [s]']  # fmt: skip
     load = os.getloadavg()
     body = (
         f'Plans of {PLAN_S:g} s on the bundled episode, {options.seconds:g} s a line, as the '
         'node reports them; medians. Lead: time from the verdict to the end of what it judges. '
-        'Frames ahead: time from publishing an image to its stamp.\n\n'
+        'In the first half: verdicts that were there before half of the plan was over. CPU a '
+        'chunk: CPU time of the whole node (all threads, images taken in, real frames looked at, '
+        'rollouts pre-empted) for each chunk computed. Frames ahead: time from publishing an '
+        'image to its stamp.\n\n'
         + page.table(header, rows)
         + f'\n\nLoad of the machine meanwhile (other work included): {load[1]:.1f} on '
         f'{os.cpu_count()} cores.'

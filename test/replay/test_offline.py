@@ -1,4 +1,5 @@
 from collections import Counter
+import re
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ import pytest
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode_reader import iter_messages, read_episode
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.replay.offline import replay_offline, ReplayLimits
 
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
@@ -40,6 +42,14 @@ def test_every_topic_of_the_node_is_recorded(predictions):
         assert counts[f'/world_model/{view}/mask/image_raw'] == 9
     assert counts['/world_model/predicted/joint_states'] == 9
     assert counts['/world_model/success'] == counts['/world_model/jaccard'] == 3
+
+
+def test_the_foxglove_layout_of_recordings_shows_what_is_recorded(predictions):
+    out, _ = predictions
+    recorded = {message.topic for message in iter_messages(out)}
+    text = share_path('config', 'viewers', 'foxglove_recording.json').read_text()
+    shown = set(re.findall(r'"(/[a-z_/]+)["\.]', text))
+    assert len(shown) >= 14 and shown <= recorded, shown - recorded
 
 
 def test_predictions_are_stamped_at_the_predicted_time(predictions):

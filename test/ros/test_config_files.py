@@ -2,7 +2,6 @@
 
 import ast
 from importlib.util import find_spec
-import json
 from pathlib import Path
 import re
 import runpy
@@ -61,24 +60,6 @@ def _valid(described):
     for limits in [*described.integer_range, *described.floating_point_range]:
         return f'{limits.from_value:.10g} … {limits.to_value:.10g}'
     return described.additional_constraints.removeprefix('one of: ')
-
-
-def _panels(layout):
-    if isinstance(layout, str):
-        return [layout]
-    assert layout['direction'] in ('row', 'column')
-    return _panels(layout['first']) + _panels(layout['second'])
-
-
-def test_viewer_layout_shows_topics_of_the_node():
-    layout = json.loads(share_path('config', 'foxglove_layout.json').read_text())
-    panels = layout['configById']
-    assert sorted(_panels(layout['layout'])) == sorted(panels)
-    images = [panel['imageMode'] for name, panel in panels.items() if name.startswith('Image!')]
-    assert len(images) == 6
-    for image in images:
-        stem = image['imageTopic'].split('/image_raw')[0]
-        assert image['calibrationTopic'] == f'{stem}/camera_info'
 
 
 def test_middleware_profile_enlarges_the_shared_memory():
