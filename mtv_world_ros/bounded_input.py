@@ -39,6 +39,7 @@ class Limits:
         image_bytes: of an image file in a message.
         image_pixels: of an image, before it is decoded.
         jpeg_scans: of a progressive JPEG; each costs a pass over all pixels.
+        video_bytes: of a video once it is decoded.
         chunk_bytes: of a bag's chunk once it is inflated, and of a message.
         joint_names: in a message.
         trajectory_points: in a message.
@@ -55,6 +56,7 @@ class Limits:
     image_bytes: int = 64 * 2**20
     image_pixels: int = 50_000_000
     jpeg_scans: int = 64
+    video_bytes: int = 2**32
     chunk_bytes: int = 2**28
     joint_names: int = 1_000
     trajectory_points: int = 20_000

@@ -12,6 +12,7 @@ import av
 import cv2
 import numpy as np
 
+from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import write_whole
@@ -251,7 +252,14 @@ def decode_video(data: bytes) -> ByteArray:
     """
     try:
         with av.open(io.BytesIO(data), 'r') as container:
-            frames = [frame.to_ndarray(format='rgb24') for frame in container.decode(video=0)]
-    except (av.FFmpegError, IndexError) as error:
+            frames = []
+            for frame in container.decode(video=0):
+                num_bytes = 3 * frame.width * frame.height * (len(frames) + 1)
+                check_limit('video_bytes', num_bytes, 'the video')
+                frames.append(frame.to_ndarray(format='rgb24'))
+            shapes = {frame.shape for frame in frames}
+            if len(shapes) > 1:
+                raise ValueError(f'its frames have the shapes {sorted(shapes)}')
+    except (av.FFmpegError, IndexError, ValueError) as error:  # names in it may be no UTF-8
         raise EpisodeError(f'{len(data)} bytes cannot be read as a video: {error}') from error
     return np.asarray(frames, np.uint8) if frames else np.zeros((0, 0, 0, 3), np.uint8)

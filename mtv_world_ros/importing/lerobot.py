@@ -16,7 +16,7 @@ from av.container import InputContainer
 import cv2
 import numpy as np
 
-from mtv_world_ros.bounded_input import parse_json, read_json, read_text
+from mtv_world_ros.bounded_input import check_limit, parse_json, read_json, read_text
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 
@@ -308,7 +308,7 @@ def frames_at(path: Path, times: FloatArray, tolerance_s: float) -> Iterator[Byt
             if not container.streams.video:
                 raise EpisodeError(f"'{path}' holds no video")
             yield from _matched(container, path, times, tolerance_s)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, ValueError) as error:  # names in it may be no UTF-8
         raise EpisodeError(f"video '{path}' cannot be read: {error}") from error
 
 
@@ -321,6 +321,7 @@ def _matched(
         container.seek(int((times[0] - tolerance_s) / base), stream=stream, backward=True)
     wanted, last = 0, float('nan')
     for frame in container.decode(stream):
+        check_limit('image_pixels', frame.width * frame.height, 'a frame')
         seconds = float('nan') if frame.time is None else float(frame.time)
         while wanted < len(times) and abs(seconds - times[wanted]) <= tolerance_s:
             yield np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)

@@ -159,6 +159,10 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     'JPEG of 20000x20000': ('image', lambda: jpeg_of(20_000, 20_000)),
     'JPEG of 65500x65500': ('image', lambda: jpeg_of(65_500, 65_500)),
     'JPEG cut short': ('image', cut_jpeg),
+    'video whose names are no UTF-8': (
+        'video',
+        lambda: KINDS['video'].samples()[0].replace(b'Lavf', b'\xd6\xd6\xd6\xd6'),
+    ),
     'chunk of 5 GB': ('bag', chunk_bomb),
     'nested answer': ('answer, msgpack', nested_answer),
     'vast answer': ('answer, msgpack', vast_answer),

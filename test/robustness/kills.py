@@ -3,7 +3,8 @@
 Nothing older than a second may be lost, whoever is left goes on, and whoever starts again works:
 a killed recording is recovered and read by rosbags, and the node that is started after a killed
 one answers a plan with one end. The processes are forked from one that has imported everything
-(so that starting hundreds is cheap), and are killed from 0 to `--longest` seconds after that.
+(so that starting hundreds is cheap), and are killed up to
+`--longest` seconds after their start, or after they are at work.
 Prints a table; the exit status is 1 if anything was lost, hung or ended with a traceback.
 """
 
@@ -16,7 +17,6 @@ import multiprocessing
 import os
 from pathlib import Path
 import shutil
-import signal
 import sys
 import time
 from typing import Any, NamedTuple
@@ -32,6 +32,8 @@ sys.path.insert(0, str(ROOT / 'test' / 'ros'))
 
 START_S = 60.0
 PERIOD_S = 0.01
+#: share of the kills that come while the process starts
+STARTING = 0.3
 
 
 def imported() -> dict[str, Callable[[], int]]:
@@ -87,6 +89,8 @@ class Kills:
     def __init__(self, out: Path, seed: int, longest_s: float) -> None:
         self._out, self._longest_s = out, longest_s
         self._rng = np.random.default_rng(seed)
+        here = Path(__file__).parent  # the fork server looks for its modules there
+        os.environ['PYTHONPATH'] = os.pathsep.join([str(here), str(ROOT)])
         self._context = multiprocessing.get_context('forkserver')
         self._context.set_forkserver_preload(['kills_preload'])
         self._client = ros().Client()
@@ -105,17 +109,18 @@ class Kills:
     def kill(self, name: str) -> Killed:
         """Starts and kills one of `VICTIMS`."""
         after_s = float(self._rng.uniform(0, self._longest_s))
-        prepare, words, check = VICTIMS[name]
+        is_starting = self._rng.random() < STARTING
+        prepare, words, is_ready, check = VICTIMS[name]
+        self._heard = 0
         prepare(self)
         log = self._out / f'{name}.log'
         process = self._start(name, words(self), log)
         self._sent.clear()
+        if not is_starting:
+            self._client.wait(lambda: is_ready(self, log) or process.exitcode is not None, name)
         self._client.spin_for(after_s)
-        problem = ''
-        if process.exitcode not in (None, 0) and name != 'player':
-            problem = f'it had ended with {process.exitcode}'
-        if process.pid is not None and process.exitcode is None:
-            os.kill(process.pid, signal.SIGKILL)
+        problem = '' if process.exitcode is None else f'it had ended with {process.exitcode}'
+        process.kill()
         killed_ns = time.time_ns()
         process.join(10)
         begin = time.monotonic()
@@ -189,7 +194,15 @@ class Kills:
         # a message is sent a little before it is recorded: the one at either end may be left out
         assert got >= len(sent) - 2, f'{got} of {len(sent)} messages older than 1 s'
 
+    def says(self, text: str, log: Path) -> bool:
+        """Whether the log has the text."""
+        return text in log.read_text(errors='replace')
+
     # player
+
+    def is_playing(self, log: Path) -> bool:
+        """Whether something was heard of it."""
+        return self._heard > 0
 
     def player_words(self) -> list[str]:
         """Plays to anybody, faster than it was recorded."""
@@ -210,9 +223,14 @@ class Kills:
 
     # world model
 
-    def forget_node(self) -> None:
-        """Sends a plan, if a node that was not killed is there to hear it."""
-        self._client.forget_node()
+    def begin_plan(self, log: Path) -> bool:
+        """Once the node is ready, sends a plan: the kill comes while it is imagined, or after."""
+        if not self.says('ready: ', log):
+            return False
+        self._client.connect_inputs(ros().INPUTS)
+        self._client.send_scene()
+        self._client.send_trajectory()
+        return True
 
     def node_words(self) -> list[str]:
         """The fake model."""
@@ -232,9 +250,8 @@ class Kills:
             self._client.send_trajectory()
             ended = self._client.next_end(since)
             assert ended['state'] == 'done', ended
-            self._client.send_trajectory()  # the kill comes to it, or after it
         finally:
-            os.kill(process.pid, signal.SIGKILL)
+            process.kill()
             process.join(10)
             self._client.forget_node()
 
@@ -243,12 +260,22 @@ def _nothing(*_: object) -> None:
     pass
 
 
-#: name -> what is done before, its command line, what is looked at afterwards
-VICTIMS: dict[str, tuple[Callable[..., None], Callable[..., list[str]], Callable[..., None]]] = {
-    'recorder': (Kills.clear_bags, Kills.recorder_words, Kills.check_recorder),
-    'player': (_nothing, Kills.player_words, Kills.check_player),
-    'policy': (_nothing, Kills.policy_words, _nothing),
-    'world_model': (_nothing, Kills.node_words, Kills.check_node),
+#: name -> what is done before, its command line, whether it is at work, what is looked at after
+VICTIMS: dict[str, tuple[Callable[..., Any], ...]] = {
+    'recorder': (
+        Kills.clear_bags,
+        Kills.recorder_words,
+        lambda kills, log: kills.says(': recording', log),
+        Kills.check_recorder,
+    ),
+    'player': (_nothing, Kills.player_words, Kills.is_playing, Kills.check_player),
+    'policy': (
+        _nothing,
+        Kills.policy_words,
+        lambda kills, log: kills.says('ready: ', log),
+        _nothing,
+    ),
+    'world_model': (_nothing, Kills.node_words, Kills.begin_plan, Kills.check_node),
 }
 
 
@@ -257,7 +284,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--kills', type=int, default=500, help='of all together')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--longest', type=float, default=3.0, help='latest moment [s]')
+    parser.add_argument('--longest', type=float, default=2.0, help='latest moment [s]')
     parser.add_argument('--only', nargs='+', choices=VICTIMS, default=list(VICTIMS))
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'kills')
     arguments = parser.parse_args()
