@@ -75,7 +75,7 @@ def _view_paths(arguments: argparse.Namespace) -> int:
         print(told, flush=True)
     for root, one in shown.items():
         rerun_log.log_any(stream, one, root)
-    stream.flush()
+    rerun_log.flush(stream, arguments.save)
     if arguments.save is not None:
         print(told)
     elif not arguments.native:

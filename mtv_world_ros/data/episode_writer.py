@@ -71,9 +71,12 @@ class EpisodeWriter(BagWriter):
         self.metadata: dict[str, str] = dict(metadata or {})
         self._jpeg_quality = jpeg_quality
         if cameras:
-            save_calibration(
-                self.folder / CALIBRATION_FILE, {camera.view: camera for camera in cameras}
-            )
+            by_view = {camera.view: camera for camera in cameras}
+            try:
+                save_calibration(self.folder / CALIBRATION_FILE, by_view)
+            except BaseException:
+                self.abort()  # nobody has this writer yet
+                raise
 
     def write_image(
         self, view: str, stamp_ns: int, rgb: ByteArray, *, compressed: bool = True

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.results import StoredRollout
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 from mtv_world_ros.viewing.streams import KINDS, Streams
@@ -186,6 +186,23 @@ def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_na
         stream.spawn(default_blueprint=blueprint)
         return 'opened a window'
     return f'open {serve(stream, blueprint, port)}'
+
+
+def flush(stream: Any, save: Path | None) -> None:
+    """Waits until the viewer or the file has what was logged.
+
+    Raises:
+        MtvWorldError: the file cannot be written; there is none then.
+    """
+    try:
+        stream.flush()
+    except RuntimeError as error:
+        if save is None:
+            raise
+        save.unlink(missing_ok=True)
+        raise MtvWorldError(
+            f"'{save}' cannot be written: {error}; is its disk full? Make room, or choose another"
+        ) from error
 
 
 def serve(stream: Any, blueprint: Any, port: int) -> str:

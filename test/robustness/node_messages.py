@@ -74,7 +74,7 @@ def changed_list(rng: np.random.Generator, values: list[Any], new: Callable[[], 
         elif how == 4:
             out = [out[k] for k in rng.permutation(len(out))]
         else:
-            out = out * int(rng.choice([0, 2, 2, 300]))
+            out = (out * int(rng.choice([0, 2, 2, 300])))[:30_000]
     return out
 
 
@@ -92,7 +92,7 @@ def _plan(rng: np.random.Generator, message: Any) -> None:
         message.joint_names = changed_list(rng, names, lambda: str(rng.choice(WORDS)))
     if rng.random() < 0.3:
         first = message.points[0]
-        message.points = changed_list(rng, list(message.points), lambda: first)[:30_000]
+        message.points = changed_list(rng, list(message.points), lambda: first)
     for point in [p for p in message.points[:8] if rng.random() < 0.3]:
         if rng.random() < 0.6:
             point.positions = array(

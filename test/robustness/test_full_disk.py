@@ -1,0 +1,77 @@
+"""Every command that writes, on a full disk: one line, status 1, and no half written result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import subprocess
+
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.files import share_path
+
+EPISODE = share_path('resource', 'demo_episode')
+URDF = share_path('config', 'robots', 'yam_bimanual.urdf')
+#: of the preset `small`, made tiny
+TINY = (
+    'transformer.num_attention_heads=2 transformer.attention_head_dim=12 transformer.ffn_dim=32 '
+    'transformer.num_layers=1 transformer.stem_widths=[8,16,16] transformer.frames_per_token=2 '
+    'transformer.freq_dim=16 video.num_frames=2 video.width=48 video.height=40 '
+    'optimizer.batch_size=1 optimizer.warmup_steps=1 optimizer.steps=2'
+)
+SETTINGS = [word for value in TINY.split() for word in ('--set', value)]
+
+#: command -> its words, of the folder on the full disk
+WRITERS: dict[str, Callable[[Path], list[str]]] = {
+    'doctor': lambda out: ['doctor', str(EPISODE), '--out', str(out / 'doctor')],
+    'robot': lambda out: ['robot', str(URDF), '--out', str(out / 'a.yaml')],
+    'robot picture': lambda out: ['robot', 'yam_bimanual', '--picture', str(out / 'a.png')],
+    'replay': lambda out: ['replay', str(EPISODE), '--offline', '--out', str(out / 'replay')],
+    'evaluate': lambda out: [
+        'evaluate', 'bundled', str(EPISODE.parent), '--out', str(out / 'evaluation')],
+    'train': lambda out: [
+        'train', str(EPISODE.parent), '--out', str(out / 'run'), '--dtype', 'float32',
+        '--threads', '1', *SETTINGS],
+    'export-dataset': lambda out: [
+        'export-dataset', str(EPISODE), '--out', str(out / 'dataset')],
+    'import-bag': lambda out: [
+        'import-bag', str(EPISODE), '--robot', 'yam_bimanual', '--out', str(out / 'episodes')],
+    'view': lambda out: ['view', str(EPISODE), '--save', str(out / 'a.rrd')],
+    'recover': lambda out: ['recover', str(EPISODE), '--out', str(out / 'bag')],
+    'collect': lambda out: [
+        'collect', '--task', 'stack_blocks_two', '--episodes', '1', '--out', str(out / 'set')],
+}  # fmt: skip
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 32 kB with nothing left."""
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    if os.geteuid() != 0:
+        pytest.skip('only root can mount a small disk')
+    mount = ['mount', '-t', 'tmpfs', '-o', 'size=32k', 'tmpfs', str(disk)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip('no small disk can be mounted here')
+    try:
+        (disk / 'others').write_bytes(bytes(32 * 1024))
+        yield disk
+    finally:
+        subprocess.run(['umount', '-l', str(disk)], check=True)
+
+
+@pytest.mark.parametrize('name', WRITERS)
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    name: str, full_disk: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(full_disk.parent)
+    status = main(WRITERS[name](full_disk))
+    said = capfd.readouterr().err.splitlines()
+    assert status == 1, said
+    assert 'Traceback (most recent call last):' not in said
+    assert said[-1].startswith('mtv-world: '), said
+    assert any(word in said[-1] for word in ('No space left', 'os error 28', 'disk full')), said
+    left = [path for path in full_disk.rglob('*') if path.is_file() and path.name != 'others']
+    assert not [path for path in left if path.name.endswith(('.part', '.mcap', '.npz', '.rrd'))]
