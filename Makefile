@@ -34,7 +34,8 @@ test: lint  ## the linters, then all tests (about 10 minutes)
 	$(BIN)/python -m pytest
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
-	$(BIN)/python test/robustness/fuzz.py
+	@mkdir -p out
+	$(BIN)/python test/robustness/fuzz.py --json out/fuzz.json
 
 kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour); prints a table
 	$(BIN)/python test/robustness/kills.py

@@ -42,6 +42,7 @@ DESCRIBES = {
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),
     'ros_publishing': ('mtv_world_ros/ros',),
+    'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
     'self_rollout': ('mtv_world_ros/training',),
     'serving': ('mtv_world_ros/model',),

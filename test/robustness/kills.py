@@ -146,6 +146,7 @@ class Kills:
         self._heard += 1
 
     def _start(self, name: str, words: list[str], log: Path) -> Any:
+        log.unlink(missing_ok=True)  # what the one before said says nothing of this one
         process = self._context.Process(target=run_forked, args=(name, words, str(log)))
         process.start()
         end = time.monotonic() + START_S

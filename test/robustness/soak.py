@@ -271,6 +271,7 @@ def main() -> int:
         'memory_growth_mb_per_1000': grown,
         'problems': soak.problems,
     }
+    (arguments.out / 'summary.json').write_text(json.dumps(summary, indent=1))
     print(json.dumps(summary, indent=1))
     return int(bool(soak.problems) or grown > MOST_GROWTH_MB)
 
