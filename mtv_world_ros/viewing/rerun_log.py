@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -177,10 +179,12 @@ def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_na
 
     Raises:
         ConfigError: a port is taken.
+        MtvWorldError: the file cannot be written.
     """
     if save is not None:
         save.parent.mkdir(parents=True, exist_ok=True)
-        stream.save(str(save), default_blueprint=blueprint)
+        with _disk_errors(save):
+            stream.save(str(save), default_blueprint=blueprint)
         return f'written: {save}'
     if is_native:
         stream.spawn(default_blueprint=blueprint)
@@ -194,8 +198,15 @@ def flush(stream: Any, save: Path | None) -> None:
     Raises:
         MtvWorldError: the file cannot be written; there is none then.
     """
-    try:
+    with _disk_errors(save):
         stream.flush()
+
+
+@contextmanager
+def _disk_errors(save: Path | None) -> Iterator[None]:
+    """Names the file that the viewer's library cannot write, and removes what there is of it."""
+    try:
+        yield
     except RuntimeError as error:
         if save is None:
             raise
