@@ -108,7 +108,7 @@ class Recording:
                 mujoco.mj_forward(model, data)
                 renderer.update_scene(data, model.camera(0).name)
                 frames.append(renderer.render())
-        return Track(self.stamps_ns[::every], np.stack(frames))
+        return Track(self.stamps_ns[::every], np.stack(frames))  # type: ignore[arg-type]
 
     def wrist_camera(self) -> CameraModel:
         """A camera beside the first arm's tool that looks about where the tool points."""
@@ -228,7 +228,7 @@ def main() -> None:
         'Estimated camera poses against the truth',
         f'python benchmark/camera_calibration.py --repeats {options.repeats} '
         f'--robots {options.robots} --minutes {options.minutes:g}',
-        f'{__doc__.split("    python")[0].strip()}\n\n{text}',
+        f'{(__doc__ or "").split("    python")[0].strip()}\n\n{text}',
         options,
         'no GPU',
     )

@@ -18,6 +18,14 @@ SLOW = "import time\nprint('importing', flush=True)\ntime.sleep(60)\n"
 EPISODE = ROOT / 'resource' / 'demo_episode'
 
 
+@pytest.fixture(autouse=True)
+def heed_sigint():
+    """A shell starts background jobs deaf to SIGINT, and they start theirs so."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def stopped(tmp_path: Path, slow: str, number: int, *words: str) -> tuple[int, list[str]]:
     """Status and stderr of a process that gets a signal while it imports the module `slow`."""
     (tmp_path / f'{slow}.py').write_text(SLOW)

@@ -78,7 +78,8 @@ def tools_in_view(camera: CameraModel, robot: RobotModel, positions: FloatArray)
     def is_within(seen_by: CameraModel, margin: float) -> BoolArray:
         pixels, _ = project(seen_by, poses, points)
         with np.errstate(invalid='ignore'):  # NaN: not in front of the camera
-            return (np.abs(pixels - (size - 1) / 2) <= (0.5 - margin) * size).all(axis=-1)
+            inside = np.abs(pixels - (size - 1) / 2) <= (0.5 - margin) * size
+        return np.asarray(inside.all(axis=-1))
 
     seen = is_within(camera, 0.0)
     pinhole = replace(camera, distortion_model='none', distortion=np.zeros(0))

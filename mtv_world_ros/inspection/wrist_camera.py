@@ -356,7 +356,7 @@ def _still_scene(rays: FloatArray, camera: CameraModel) -> tuple[np.ndarray, Flo
     if H is not None:
         rotations += list(cv2.decomposeHomographyMat(H, np.eye(3))[1])
     turns = nothing[1]
-    turns[: len(rotations)] = [_vector(np.asarray(R).T) for R in rotations]
+    turns[: len(rotations)] = [_vector(np.asarray(R, np.float64).T) for R in rotations]
     still = np.zeros(len(rays), bool)
     still[np.flatnonzero(moving)[inside.ravel() > 0]] = True
     return still, turns

@@ -5,7 +5,7 @@ Kinds whose name begins with `message` are ROS messages, see `node_messages`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from functools import cache, partial
 import importlib.util
@@ -204,16 +204,19 @@ def _read_answer(data: bytes, _: Path) -> Any:
     return unpack(data)
 
 
+def timed_actions(tensors: Iterable[Any]) -> bytes:
+    """Returns a list of timed actions as LeRobot's server sends them, made without LeRobot."""
+    out = b'\x80\x03]('
+    for tensor in tensors:
+        out += b'clerobot.async_inference.helpers\nTimedAction\n)\x81}X\x06\0\0\0action'
+        out += pickle.dumps(tensor, protocol=3)[2:-1] + b'sb'
+    return out + b'e.'
+
+
 def _pickles() -> list[bytes]:
-    """Lists of timed actions as LeRobot's server sends them, made without LeRobot."""
     import torch
 
-    out = b'\x80\x03]('
-    for value in range(3):
-        tensor = pickle.dumps(torch.full((4,), float(value)), protocol=3)[2:-1]
-        out += b'clerobot.async_inference.helpers\nTimedAction\n)\x81}X\x06\0\0\0action' + tensor
-        out += b'sb'
-    return [out + b'e.']
+    return [timed_actions(torch.full((4,), float(value)) for value in range(3))]
 
 
 def _read_pickle(data: bytes, _: Path) -> Any:

@@ -39,8 +39,8 @@ STARTING = 0.3
 
 def imported() -> dict[str, Callable[[], int]]:
     """What is run, by name; importing it takes seconds, which the fork server spends once."""
-    import fake_policy
-    import fake_world_model
+    import fake_policy  # type: ignore[import-not-found]
+    import fake_world_model  # type: ignore[import-not-found]
 
     from mtv_world_ros.ros.bags import player, recorder
     from mtv_world_ros.ros.policy import node as policy
@@ -66,7 +66,7 @@ def run_forked(name: str, words: list[str], log: str) -> None:
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     sys.argv = [name, *words]
-    main = imported()[name]
+    main: Any = imported()[name]
     sys.exit(main(words) if name in ('recorder', 'player') else main())
 
 

@@ -126,8 +126,11 @@ class VideoFrames:
                 packet = av.Packet(bytes(self._packets[number].data))
                 packet.pts = packet.dts = number
                 for frame in context.decode(packet):
-                    yield int(frame.pts or 0), frame.to_ndarray(format='rgb24')
+                    yield (
+                        int(frame.pts or 0),
+                        np.asarray(frame.to_ndarray(format='rgb24'), np.uint8),
+                    )
             for frame in context.decode(None):
-                yield int(frame.pts or 0), frame.to_ndarray(format='rgb24')
+                yield int(frame.pts or 0), np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)
         except av.FFmpegError as error:
             raise EpisodeError(f"'{self._topic}': a video packet is damaged ({error})") from error

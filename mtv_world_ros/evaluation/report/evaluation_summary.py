@@ -27,7 +27,8 @@ BRACKETS = (
 _NOT_MADE = {
     'j_shuffled_moving': "no rollout was imagined with another episode's actions (`--actions`, "
     'or there is no other episode)',
-    'j_ceiling_moving': 'recorded frames were not scored through the autoencoder (`--no-ceiling`)',
+    'j_ceiling_moving': 'no recorded frame went through an autoencoder (`--no-ceiling`, or the '
+    'model has none)',
     'j_self_moving': 'recorded frames were not scored themselves (`--no-ceiling`)',
 }
 #: what a set of episodes that the model was trained for is called beside zero-shot sets

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import sys
+from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
@@ -36,8 +37,8 @@ class WorldModelNode(LifecycleNode):
         parameters.declare(self, Settings)
         self._settings, self._load = parameters.read(self, Settings), load
         self.add_post_set_parameters_callback(self._on_parameters)
-        self._change_state = self._service_change_state.callback
-        self._service_change_state.callback = self._on_change_state
+        self._change_state: Any = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state  # type: ignore[assignment]
         self._rollouts: Rollouts | None = None
         self._error: Exception | None = None
         self._reporter = Reporter(self, self.settings, self._state, self._missing)

@@ -162,7 +162,7 @@ class ColourSegmenter:
                 near = cv2.findNonZero(cv2.inRange(lab, *self._boxes[index]))
                 if near is None:
                     continue
-                at = np.asarray(near).reshape(-1, 2) @ np.array([1, width])
+                at = np.asarray(near, np.intp).reshape(-1, 2) @ np.array([1, width])
                 values = lab.reshape(-1, 3).take(at, axis=0)
                 is_word = self._word_of_ab[values[:, 1], values[:, 2]] == index
                 if not is_word.all():
@@ -187,7 +187,7 @@ class ColourSegmenter:
         num_core = shape[0] * max(1, _TRACKING.min_area(shape) // 2)
         pixels = np.zeros(shape, np.bool_)
         if np.count_nonzero(saturation > floor) > num_core:
-            core = np.partition(saturation, -num_core)[-num_core]
+            core = float(np.partition(saturation, -num_core)[-num_core])
             strong = inside[saturation > _STRONG_SHARE * core]
             colour = _median(images.frames.reshape(-1, 3).take(strong, axis=0))
             floor = max(floor, _edge(colour, images.background, core))

@@ -200,7 +200,7 @@ def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray)
     if not patch.pixels.size:
         return False
     components = cv2.connectedComponentsWithStats(patch.pixels.view(np.uint8), connectivity=8)
-    labels, stats = components[1], np.asarray(components[2], np.int64)
+    labels, stats = np.asarray(components[1]), np.asarray(components[2], np.int64)
     areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     areas[0] = 0
     largest = config.max_area_share * mask.size

@@ -103,7 +103,7 @@ class Broadcaster:
     """Publishes TF as a robot does."""
 
     def __init__(self, client):
-        from tf2_msgs.msg import TFMessage
+        from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
 
         self.client, self.kind = client, TFMessage
         self.static = client.node.create_publisher(TFMessage, '/tf_static', LATCHED)
@@ -183,7 +183,7 @@ def test_tf_older_than_the_image(start, new_client, ros, cameras):
 
 @needs_tf2
 def test_frames_of_views_that_tf_lacks_are_published_latched(start, new_client, ros, cameras):
-    from tf2_msgs.msg import TFMessage
+    from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
 
     client = new_client
     start()

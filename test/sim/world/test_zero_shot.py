@@ -152,7 +152,9 @@ def test_moved_cameras_of_training_leave_the_angles_of_zero_shot_views_unseen(tm
     )
     turns = []
     for seed in range(200):
-        (spec,) = cameras_of(seed, config).cameras
+        cameras = cameras_of(seed, config).cameras
+        assert cameras is not None
+        (spec,) = cameras
         turns.append(abs(spec.azimuth - CAMERAS[0].azimuth))
     turns = np.array(turns)
     assert (turns > 0).mean() == pytest.approx(0.6, abs=0.1)
