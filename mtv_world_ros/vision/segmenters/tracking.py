@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, hypot
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -200,7 +200,8 @@ def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray)
     if not patch.pixels.size:
         return False
     components = cv2.connectedComponentsWithStats(patch.pixels.view(np.uint8), connectivity=8)
-    labels, stats = np.asarray(components[1]), np.asarray(components[2], np.int64)
+    labels: Any = components[1]
+    stats = np.asarray(components[2], np.int64)
     areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     areas[0] = 0
     largest = config.max_area_share * mask.size
