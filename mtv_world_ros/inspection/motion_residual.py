@@ -94,10 +94,8 @@ def measure_residual(
 
     For pairs of frames half a second apart, each link's silhouettes at both times are drawn; where
     they differ the image should have changed. The maps of all pairs are correlated with the
-    images' differences over shifts: for each link on its own, where it moves against what is not
-    the robot, and for the whole robot. Half of the result is the whole robot's, in the other half
-    links count alike, so that one whose drawn shape is wrong does not decide; a calibration error
-    moves all of them.
+    images' differences over shifts, for each link on its own. Links count alike, so that one
+    whose drawn shape is wrong does not decide; a calibration error moves all of them.
 
     Args:
         track: frames of a camera that stands still.
@@ -211,49 +209,36 @@ def _surface(
     robot: RobotModel,
     shapes: Sequence[LinkShape],
 ) -> FloatArray | None:
-    """(2R + 1, 2R + 1) correlation of links and robot over shifts; None where none moves."""
+    """(2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
     radius = _radius(small.width)
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
-    parts: dict[str, list[FloatArray]] = {}
-    for shape in shapes:
-        pixels = project_part(shape, poses[shape.link], small, T_base_camera)
-        parts.setdefault(shape.link, []).append(pixels)
-    robot_drawn = fill([pixels for link in parts.values() for pixels in link], small)
-    # where the robot stays in front of itself, a link's motion may not be seen
-    uncovered = [
-        cv2.absdiff(*pair) for pair in zip(robot_drawn[::2], robot_drawn[1::2], strict=True)
-    ]
-    for link in parts.values():
-        surface, count = _correlate(seen, fill(link, small), uncovered, radius)
+    for link in dict.fromkeys(shape.link for shape in shapes):
+        parts = [
+            project_part(part, poses[link], small, T_base_camera)
+            for part in shapes
+            if part.link == link
+        ]
+        surface, count = _correlate(seen, fill(parts, small), radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
-    if not weights:
-        return None
-    whole, _ = _correlate(seen, robot_drawn, uncovered, radius)
-    return (total / weights + whole) / 2
+    return total / weights if weights else None
 
 
 def _correlate(
-    seen: Sequence[FloatImage],
-    drawn: NDArray[np.uint8],
-    uncovered: Sequence[cv2.typing.MatLike],
-    radius: int,
+    seen: Sequence[FloatImage], drawn: NDArray[np.uint8], radius: int
 ) -> tuple[FloatArray, int]:
     """One link's normalised correlation over shifts, and the pairs in which it moves.
 
-    Only motion against what is not the robot counts: `uncovered` is where the robot is in one
-    image of a pair alone.
     Drawn motion that a shift moves out of the image counts for nothing, in the norm too: else
     a robot that is drawn too far inside would seem to be nearer than it is.
     """
     total, energy_drawn = np.zeros((2 * radius + 1,) * 2), np.zeros((2 * radius + 1,) * 2)
     energy_seen = 0.0
     count = 0
-    pairs = zip(seen, drawn[::2], drawn[1::2], uncovered, strict=True)
-    for change, before, after, against_rest in pairs:
-        differs = cv2.bitwise_and(cv2.absdiff(before, after), against_rest)
+    for change, before, after in zip(seen, drawn[::2], drawn[1::2], strict=True):
+        differs = cv2.absdiff(before, after)
         if cv2.countNonZero(differs) < _LEAST_AREA_PX:
             continue
         template, window = _cut(differs, change, radius)
