@@ -73,18 +73,19 @@ def ended_by_signals(name: str) -> Iterator[None]:
 def stopped_by_sigterm() -> Iterator[None]:
     """Within it SIGTERM raises `Stopped`, as SIGINT does KeyboardInterrupt: the command tidies up.
 
-    After `_TIDY_S` the process ends whatever it does, and at once at a second SIGTERM. Where
-    SIGTERM has a handler, that stays.
+    What still tidies up after `_TIDY_S` is ended, and at once at a second SIGTERM. Where SIGTERM
+    has a handler, that stays.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
 
+    timer = threading.Timer(_TIDY_S, os._exit, (128 + signal.SIGTERM,))
+    timer.daemon = True
+
     def stop(signum: int, _: FrameType | None) -> None:
         signal.signal(signum, signal.SIG_DFL)
-        timer = threading.Timer(_TIDY_S, os._exit, (128 + signum,))
-        timer.daemon = True
         timer.start()
         raise Stopped(signum)
 
@@ -92,5 +93,6 @@ def stopped_by_sigterm() -> Iterator[None]:
     try:
         yield
     finally:
+        timer.cancel()
         if signal.getsignal(signal.SIGTERM) is stop:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
