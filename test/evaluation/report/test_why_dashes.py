@@ -45,7 +45,7 @@ def tables_of(*rows: ScoreRow) -> str:
             (replace(ROW, j_shuffled=NAN, j_shuffled_frames=()),),
             "Dashes of shuffled actions: no rollout was imagined with another episode's actions",
         ),
-        ((replace(ROW, j_ceiling=NAN),), 'Dashes of ceiling: recorded frames were not scored'),
+        ((replace(ROW, j_ceiling=NAN),), 'Dashes of ceiling: no recorded frame went'),
     ],
 )
 def test_a_dash_has_its_reason(rows, why):
