@@ -33,21 +33,6 @@ class Manager:
 
 
 @pytest.fixture
-def start(tmp_path, ros):
-    """Starts the node with parameters; it must end cleanly at the test's end."""
-    started = []
-
-    def start(*parameters):
-        started.append(ros.start_node(tmp_path, 'pace:=burst', *parameters))
-        return started[-1]
-
-    yield start
-    for process in started:
-        assert process.stop() == 0
-        assert 'Traceback' not in process.output(), process.output()
-
-
-@pytest.fixture
 def client(ros):
     client = ros.Client()
     yield client

@@ -26,20 +26,6 @@ LOW, HIGH = 'low_optical_frame', 'high_optical_frame'
 
 
 @pytest.fixture
-def start(tmp_path, ros):
-    """Starts the node with parameters; it must end cleanly at the test's end."""
-    started = []
-
-    def start(*parameters):
-        started.append(ros.start_node(tmp_path, 'pace:=burst', *parameters))
-        return started[-1]
-
-    yield start
-    for process in started:
-        assert process.stop() == 0, process.output()
-
-
-@pytest.fixture
 def new_client(ros):
     client = ros.Client()
     yield client
