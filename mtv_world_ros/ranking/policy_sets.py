@@ -83,6 +83,18 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-flick-0.1',
         'expert-knock-0.01',
         'expert-knock-0.03',
+        # added after the third measurement, by somebody who had seen none of the three
+        'expert-loop-2',
+        'expert-smooth-1.3',
+        'expert-smooth-1.6',
+        'expert-spike-0.15',
+        'expert-spike-0.3',
+        'expert-zero-0.04',
+        'expert-zero-0.06',
+        'expert-weak-0.2',
+        'expert-weak-0.3',
+        'expert-undo-0.03',
+        'expert-undo-0.05',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

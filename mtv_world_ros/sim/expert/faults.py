@@ -81,6 +81,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'hasty': _kind('timing', 'test', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
     'soft': _kind('timing', 'test', 0.6, 1.5, 's', 'time constant with which the grippers follow'),
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
+    'loop': _kind('timing', 'test', 2.0, 4.0, 's', 'commands of this length are repeated once'),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -213,6 +214,17 @@ FAULTS: Mapping[str, FaultKind] = {
     'stall': _kind(
         'speed', 'test', 0.8, 3.0, 's', 'the arms stand still for a while, the grippers do not'
     ),
+    'smooth': _kind(
+        'speed', 'test', 1.5, 3.0, 's', 'the commands of the arms are averaged over this long'
+    ),
+    'spike': _kind(
+        'speed', 'test', 0.3, 1.0, 'rad', 'standard deviation of short outliers of every joint'
+    ),
+    # joint
+    'zero': _kind(
+        'joint', 'test', 0.04, 0.2, 'rad', 'standard deviation of a constant error of every joint'
+    ),
+    'weak': _kind('joint', 'test', 0.25, 0.5, '', 'share that lacks of the travel of one joint'),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -227,6 +239,14 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'clutch': _kind(
         'regrasp', 'test', 0.8, 1.0, '', 'share by which the fingers close again while it retreats'
+    ),
+    'undo': _kind(
+        'regrasp',
+        'test',
+        0.05,
+        0.15,
+        'm',
+        'it takes the object again and carries it back this far',
     ),
 }
 
@@ -383,6 +403,14 @@ def _near(name: str) -> str:
 
 #: between the draws that a slow error of the joints is interpolated from [s]
 _NOISE_KNOT_S = 0.5
+#: time in which an arm goes back to where it repeats its commands from [s]
+_BACK_S = 0.4
+#: time in which a constant error sets in [s]
+_SET_IN_S = 1.0
+#: outliers of a plan, and how long each lasts [s]
+_NUM_SPIKES, _SPIKE_S = 3, 0.4
+#: travel from which on an arm joint takes part in a plan [rad]
+_MOVES_RAD = 0.2
 
 
 def with_faults(
@@ -409,6 +437,7 @@ def with_faults(
         positions = _stall(
             positions, grippers, float(share), round(variant.size('stall') / period)
         )
+    positions = _controller_faults(positions, variant, robot, grippers, period, rng)
     positions = _at_speed(positions, 1 / (1 + variant.size('slow')))
     positions = _at_speed(positions, 1 + variant.size('fast'))
     times = np.arange(len(positions), dtype=np.float64) * period
@@ -433,6 +462,34 @@ def with_faults(
         positions=positions,
         velocities=np.gradient(positions, period, axis=0),
     )
+
+
+def _controller_faults(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    robot: RobotModel,
+    grippers: list[int],
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T', J): repeats, scales, smooths and offsets the commands (T, J), one each `period` [s].
+
+    Each fault draws from a generator of its own, so that another size draws the same.
+    """
+    if variant.size('loop'):
+        share = np.random.default_rng(rng.integers(2**32)).uniform(0.35, 0.75)
+        positions = _loop(positions, float(share), round(variant.size('loop') / period), period)
+    if variant.size('weak'):
+        own = np.random.default_rng(rng.integers(2**32))
+        positions = _weak(positions, grippers, variant.size('weak'), own)
+    positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
+    error = np.zeros_like(positions)
+    if variant.size('zero'):
+        error += _offset(*error.shape, variant.size('zero'), period, rng)
+    if variant.size('spike'):
+        error += _spikes(*error.shape, variant.size('spike'), period, rng)
+    error[:, grippers] = 0.0
+    return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
 
 
 def _delayed(positions: FloatArray, num: int) -> tuple[FloatArray, FloatArray]:
@@ -496,6 +553,62 @@ def _stall(positions: FloatArray, grippers: list[int], share: float, num: int) -
     whole, _ = _delayed(positions, num)
     arms[:, grippers] = whole[:, grippers]
     return arms
+
+
+def _loop(positions: FloatArray, share: float, num: int, period: float) -> FloatArray:
+    """(T + num, J): at a share of the plan, its last `num` samples are carried out once more.
+
+    The way back to where they begin is blended in.
+    """
+    end = int(share * len(positions))
+    begin = max(end - num, 0)
+    again = positions[begin:].copy()
+    back = min(round(_BACK_S / period), len(again))
+    blend = (np.arange(1, back + 1) / back)[:, None]
+    again[:back] = (1 - blend) * positions[end - 1] + blend * again[:back]
+    return np.concatenate([positions[:end], again])
+
+
+def _weak(
+    positions: FloatArray, grippers: list[int], lacking: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J): one of the arm joints that move moves only part of its way from the first row."""
+    travel = np.ptp(positions, axis=0)
+    travel[grippers] = 0.0
+    joint = int(rng.choice(np.flatnonzero(travel >= min(_MOVES_RAD, travel.max()))))
+    whole = positions.copy()
+    whole[:, joint] -= lacking * (whole[:, joint] - whole[0, joint])
+    return whole
+
+
+def _offset(
+    num: int, num_joints: int, deviation: float, period: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J) errors: the same from `_SET_IN_S` on; the plan begins where the arms are."""
+    drawn = np.random.default_rng(rng.integers(2**32)).normal(0.0, deviation, num_joints)
+    return np.minimum(np.arange(num) * period / _SET_IN_S, 1.0)[:, None] * drawn
+
+
+def _spikes(
+    num: int, num_joints: int, deviation: float, period: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J) errors: a few short triangles, anywhere in the plan; none between them."""
+    rng = np.random.default_rng(rng.integers(2**32))
+    middles = rng.uniform(0.1, 0.9, _NUM_SPIKES) * num
+    away = np.abs(np.arange(num)[:, None] - middles) * period / (_SPIKE_S / 2)
+    return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (_NUM_SPIKES, num_joints))
+
+
+def _smooth(positions: FloatArray, grippers: list[int], num: int) -> FloatArray:
+    """(T, J): the arms' commands are a moving average, `num` samples about each."""
+    if num < 2:
+        return positions
+    before = np.repeat(positions[:1], num // 2, axis=0)
+    after = np.repeat(positions[-1:], num - 1 - num // 2, axis=0)
+    padded = np.concatenate([before, positions, after])
+    whole = np.lib.stride_tricks.sliding_window_view(padded, num, axis=0).mean(axis=-1)
+    whole[:, grippers] = positions[:, grippers]
+    return whole
 
 
 def _at_speed(positions: FloatArray, speed: float) -> FloatArray:

@@ -346,6 +346,26 @@ def _regrasp(stops: Stops, size: float, side: _Side) -> Stops:
     return [*(replace(stop, phase='above') for stop in begin), *stops]
 
 
+def _undo(stops: Stops, size: float, side: _Side) -> Stops:
+    """Once it has let go, it closes, carries what it holds back, and lets go again."""
+    opened, rise = _first(stops, 'open'), _up(_TRY_LIFT_M)
+    released = stops[opened]
+    back = (stops[_first(stops, 'grasp')].position - released.position) * (1, 1, 0)
+    distance = float(np.linalg.norm(back))
+    way = size * (back / distance if distance > size else side.anywhere)
+    closed = replace(released, opening=0.0)
+    held = replace(closed, seconds=None)
+    again = [
+        closed,
+        held.moved(rise),
+        held.moved(way + rise),
+        held.moved(way),
+        released.moved(way),
+    ]
+    rest = _changed(stops[opened + 1 :], ('retreat',), lambda stop: stop.moved(way))
+    return [*stops[: opened + 1], *(replace(stop, phase='retreat') for stop in again), *rest]
+
+
 def _wander(stops: Stops, size: float, side: _Side) -> Stops:
     floor = min(stop.position[2] for stop in stops)
 
@@ -381,5 +401,6 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'elsewhere': _elsewhere,
     'retry': _retry,
     'regrasp': _regrasp,
+    'undo': _undo,
     'wander': _wander,
 }

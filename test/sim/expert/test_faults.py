@@ -58,6 +58,66 @@ def test_siblings_part_where_the_fault_begins(expert):
     assert differs[0] > 20
 
 
+def arm_columns(expert) -> list[int]:
+    grippers = [expert.robot.joint_names.index(tool.gripper_joint) for tool in expert.robot.tools]
+    return [j for j in range(len(expert.robot.joint_names)) if j not in grippers]
+
+
+def test_a_loop_carries_out_commands_of_its_length_once_more(expert):
+    expert_plan, loop = plan(expert, 'expert'), plan(expert, 'expert-loop-2')
+    assert len(loop) == len(expert_plan) + 100
+    np.testing.assert_allclose(loop[-50:], expert_plan[-50:])
+    first = int(np.argmax(np.abs(loop[: len(expert_plan)] - expert_plan).max(axis=1) > 1e-9))
+    # where the way back has been blended in, they are the commands of two seconds ago
+    np.testing.assert_allclose(loop[first + 30 : first + 90], expert_plan[first - 70 : first - 10])
+
+
+def test_smoothed_arms_cut_corners_and_the_grippers_stay(expert):
+    expert_plan, smooth = plan(expert, 'expert'), plan(expert, 'expert-smooth-1')
+    arms = arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    np.testing.assert_array_equal(smooth[:, grippers], expert_plan[:, grippers])
+    travel = [np.ptp(p[:, arms], axis=0).sum() for p in (smooth, expert_plan)]
+    assert 0.5 * travel[1] < travel[0] < travel[1]
+    np.testing.assert_allclose(smooth[100, arms], expert_plan[75:125, arms].mean(axis=0))
+
+
+def test_spikes_are_short_and_a_weak_joint_is_one(expert):
+    expert_plan = plan(expert, 'expert')
+    errors = [plan(expert, name) - expert_plan for name in ('expert-spike-0.3', 'expert-weak-0.1')]
+    touched = np.abs(errors[0]).max(axis=1) > 1e-9
+    # three of 0.4 s at 50 Hz at most
+    assert 0 < touched.sum() <= 60
+    joints = np.flatnonzero(np.abs(errors[1]).max(axis=0) > 1e-9)
+    assert len(joints) == 1 and joints[0] in arm_columns(expert)
+    joint = int(joints[0])
+    away = expert_plan[:, joint] - expert_plan[0, joint]
+    np.testing.assert_allclose(errors[1][:, joint], -0.1 * away, atol=1e-12)
+
+
+def test_a_wrong_zero_is_constant_once_it_has_set_in(expert):
+    error = plan(expert, 'expert-zero-0.02') - plan(expert, 'expert')
+    assert np.abs(error[0]).max() == 0 and np.ptp(error[50:], axis=0).max() < 1e-9
+    assert (np.abs(error[-1, arm_columns(expert)]) > 1e-4).all()
+
+
+def heights_where_it_lets_go(expert, name: str) -> list[float]:
+    """Tool heights [m] at which the gripper of the arm that moves opens."""
+    positions = plan(expert, name)
+    openings = expert.robot.gripper_openings(positions)
+    arm = int(np.argmax(np.ptp(openings, axis=1)))
+    heights = expert.robot.tool_poses(positions)[arm][:, 2, 3]
+    is_open = openings[arm] > 0.05
+    opens = np.flatnonzero(is_open[1:] & ~is_open[:-1])
+    return [float(heights[row]) for row in opens]
+
+
+def test_what_is_undone_is_let_go_twice(expert):
+    (height,) = heights_where_it_lets_go(expert, 'expert')
+    undone = heights_where_it_lets_go(expert, 'expert-undo-0.05')
+    assert undone == pytest.approx([height, height], abs=2e-3)
+
+
 def test_random_policies_are_of_the_kinds_asked_for():
     rng = np.random.default_rng(0)
     drawn = [draw_variant(kinds_of('calibrate'), rng) for _ in range(60)]
