@@ -5,8 +5,10 @@ N points, H W pixels. A box is (top, bottom, left, right), bottom and right excl
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,13 +26,23 @@ Box = tuple[int, int, int, int]
 NO_BOX: Box = (0, 0, 0, 0)
 
 
+def is_empty(box: Box) -> bool:
+    """Whether a box contains no pixel."""
+    return box[0] >= box[1] or box[2] >= box[3]
+
+
 def union(a: Box, b: Box) -> Box:
     """Returns the smallest box that contains both; an empty box is ignored."""
-    if a[0] >= a[1] or a[2] >= a[3]:
+    if is_empty(a):
         return b
-    if b[0] >= b[1] or b[2] >= b[3]:
+    if is_empty(b):
         return a
     return min(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), max(a[3], b[3])
+
+
+def intersection(a: Box, b: Box) -> Box:
+    """Returns the box that both contain; without overlap an empty one."""
+    return max(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), min(a[3], b[3])
 
 
 def region(image: np.ndarray, box: Box) -> np.ndarray:
@@ -54,19 +66,16 @@ class Stamps:
     down: GlowArray
     origins: list[tuple[int, int]]
 
-    def draw(self, image: GlowArray, n: int, brightness: float) -> Box:
-        """Draws stamp n onto an (H, W) image by maximum; returns the box that it changed."""
-        top, bottom, left, right = self.boxes[n]
-        if top >= bottom or left >= right:
-            return NO_BOX
-        x, y = self.origins[n]
-        glow = np.multiply.outer(
-            self.down[n, top - y : bottom - y] * np.float32(brightness),
-            self.across[n, left - x : right - x],
-        )
-        part = image[top:bottom, left:right]
-        np.maximum(part, glow, out=part)
-        return self.boxes[n]
+    def glows(
+        self, numbers: NDArray[np.intp], brightness: FloatArray
+    ) -> Iterator[tuple[Box, GlowArray]]:
+        """Yields box and (h, w) glow inside it of stamps, each with its brightness."""
+        dimmed = self.down[numbers] * brightness.astype(np.float32)[:, None]
+        for n, down in zip(numbers.tolist(), dimmed, strict=True):
+            box = top, bottom, left, right = self.boxes[n]
+            x, y = self.origins[n]
+            across = self.across[n, left - x : right - x]
+            yield box, np.multiply.outer(down[top - y : bottom - y], across)
 
 
 def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int) -> Stamps:
@@ -116,9 +125,15 @@ class Trail:
         region(self.image, self.box)[...] = 0
         self.box = NO_BOX
 
-    def add(self, stamps: Stamps, ages_s: FloatArray, first: int, stop: int) -> None:
-        """Adds stamps first .. stop - 1, whose ages are `ages_s[first:stop]`."""
-        brightness = 0.5 ** (ages_s[first:stop] / self._half_life_s)
-        for n in np.flatnonzero(brightness >= FAINTEST):
-            box = stamps.draw(self.image, first + int(n), float(brightness[n]))
-            self.box = union(self.box, box)
+    def brightness(self, ages_s: FloatArray) -> FloatArray:
+        """Returns how bright points of (N,) ages are; 0 where that is below one grey level."""
+        brightness = 0.5 ** (ages_s / self._half_life_s)
+        return np.where(brightness >= FAINTEST, brightness, 0.0)
+
+    def add(self, glows: Iterable[tuple[Box, GlowArray]]) -> None:
+        """Adds points, each as a box inside the image and the (h, w) glow in it."""
+        for box, glow in glows:
+            if not is_empty(box):
+                part = region(self.image, box)
+                cv2.max(part, glow, part)
+                self.box = union(self.box, box)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import colorsys
 from dataclasses import dataclass
+from itertools import islice
 from typing import Annotated, ClassVar
 
 import cv2
@@ -29,10 +30,14 @@ from mtv_world_ros.rendering.glow import (
     Box,
     FAINTEST,
     GlowArray,
+    intersection,
+    is_empty,
     make_stamps,
+    NO_BOX,
     region,
     Stamps,
     Trail,
+    union,
 )
 
 #: drawn length of a finger [m]
@@ -139,13 +144,13 @@ def render_trajectory_video(
     motion = tool_motion(robot, positions, times, config.points_per_frame, config.max_gap_m)
     arms = () if config.link_width_m is None else robot.arm_points(positions)
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
-    frames = np.empty(shape, np.uint8)
+    frames = np.zeros(shape, np.uint8)
     for view, camera in enumerate(cameras):
         masks = () if object_masks is None or objects is not None else object_masks[view]
-        frames[view] = _canvas(camera, masks, config)
+        fills = _fills(camera, masks, config)
         poses = camera_poses(camera, robot, positions)
         shown = None if objects is None else objects[view]
-        _draw_view(frames[view], camera, poses, arms, motion, config, shown)
+        _draw_view(frames[view], fills, camera, poses, arms, motion, config, shown)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
@@ -183,18 +188,22 @@ def _check(
         )
 
 
-def _canvas(
+def _fills(
     camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
-) -> ByteArray:
-    """(H, W, 3) black with the objects' fills."""
+) -> tuple[Box, ByteArray]:
+    """Returns the box of all objects in a view and its (h, w, 3) fills on black."""
     canvas = np.zeros((camera.height, camera.width, 3), np.uint8)
+    box = NO_BOX
     for index, mask in enumerate(masks):
         canvas[mask] = np.rint(255 * object_colour(index, config.object_fill))
-    return canvas
+        left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+        box = union(box, (top, top + height, left, left + width))
+    return box, region(canvas, box)
 
 
 def _draw_view(
     frames: ByteArray,
+    fills: tuple[Box, ByteArray],
     camera: CameraModel,
     poses: FloatArray,
     arms: Sequence[FloatArray],
@@ -202,12 +211,14 @@ def _draw_view(
     config: TrajectoryVideoConfig,
     objects: ByteArray | None,
 ) -> None:
-    """Draws all arms onto the (T, H, W, 3) frames of one view; links where `arms` has points."""
+    """Draws one view onto black (T, H, W, 3) frames; links where `arms` has points."""
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
     core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
     cores = [
-        make_stamps(heads[arm], core_sigmas[arm], camera.width, camera.height)
+        make_stamps(heads[arm], core_sigmas[arm], camera.width, camera.height).glows(
+            np.arange(len(frames)), np.maximum(motion.closed[arm], 0)
+        )
         for arm in range(num_arms)
     ]
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
@@ -215,31 +226,41 @@ def _draw_view(
     paints = [_Paint(colour) for colour in colours]
     links = _lines(camera, poses, arms, config.link_width_m)
     fingers = _lines(camera, poses, motion.fingers, config.finger_width_m)
-    white, core = _Paint(_WHITE), np.zeros((camera.height, camera.width), np.float32)
+    white = _Paint(_WHITE)
     # far arms first; one that is behind the camera cannot hide another
-    orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable')
-    for k, trail_images in enumerate(zip(*trails, strict=True)):
-        if links is not None:
-            for arm in orders[:, k]:
-                links.draw(frames[k], arm, k, _LINK_SHARE * colours[arm])
-        for arm in orders[:, k]:
-            glow, box = trail_images[arm]
-            paints[arm].lay(frames[k], glow, box)
+    orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable').T.tolist()
+    for image in frames:
+        region(image, fills[0])[...] = fills[1]
+    painted = fills[0] if links is None else (0, camera.height, 0, camera.width)
+    for k, (image, order, glows) in enumerate(
+        zip(frames, orders, zip(*trails, strict=True), strict=True)
+    ):
+        for arm in order:
+            _draw_links(links, image, arm, k, colours[arm])
+        drawn = [painted]
+        for arm in order:
+            box, glow = glows[arm]
+            paints[arm].lay(image, box, glow, drawn)
             if config.show_gripper:
-                box = cores[arm].draw(core, k, motion.closed[arm, k])
-                white.lay(frames[k], core, box)
-                region(core, box)[...] = 0
-        for arm in orders[:, k]:
-            _draw_fingers(fingers, frames[k], arm, k)
+                white.lay(image, *next(cores[arm]), drawn)
+        for arm in order:
+            _draw_fingers(fingers, image, arm, k)
         if objects is not None:
             cover = 255 - objects[k][..., 3:].astype(np.uint16)
-            frames[k] = objects[k][..., :3] + (frames[k] * cover // 255).astype(np.uint8)
+            image[...] = objects[k][..., :3] + (image * cover // 255).astype(np.uint8)
 
 
 def _lines(
     camera: CameraModel, poses: FloatArray, points: Sequence[FloatArray], width_m: float | None
 ) -> ArmLinks | None:
     return None if width_m is None else ArmLinks(camera, poses, points, width_m)
+
+
+def _draw_links(
+    links: ArmLinks | None, image: ByteArray, arm: int, frame: int, colour: FloatArray
+) -> None:
+    if links is not None:
+        links.draw(image, arm, frame, _LINK_SHARE * colour)
 
 
 def _draw_fingers(fingers: ArmLinks | None, image: ByteArray, arm: int, frame: int) -> None:
@@ -261,30 +282,36 @@ def _trail_frames(
     motion: ToolMotion,
     arm: int,
     config: TrajectoryVideoConfig,
-) -> Iterator[tuple[GlowArray, Box]]:
-    """Yields the arm's trail image at each frame and the box outside which it is 0.
+) -> Iterator[tuple[Box, GlowArray]]:
+    """Yields the box outside of which the arm's trail is dark, and the trail in it, by frame.
 
     A camera that stands still keeps what is drawn and lets it fade; for one that moves, all
     points that are not too old are projected anew.
     """
     trail = Trail(camera.width, camera.height, config.half_life_s)
-    fixed = bool((poses == poses[0]).all())
+    times, shown_times = motion.times, motion.times[motion.shown_at]
+    if (poses == poses[0]).all():
+        first_shown = np.searchsorted(motion.shown_at, np.arange(len(times)))
+        brightness = trail.brightness(shown_times[first_shown] - times)
+        shown = np.flatnonzero(brightness)
+        stamps = _stamps(camera, poses[0], motion.points[arm], config)
+        glows = stamps.glows(shown, brightness[shown])
+        num_new = np.bincount(first_shown[shown], minlength=len(poses))
+        gaps_s = np.diff(shown_times, prepend=times[0])
+        for gap_s, num in zip(gaps_s.tolist(), num_new.tolist(), strict=True):
+            trail.fade(gap_s)
+            trail.add(islice(glows, num))
+            yield trail.box, region(trail.image, trail.box)
+        return
     memory_s = config.half_life_s * np.log2(1 / FAINTEST)
-    points, times = motion.points[arm], motion.times
-    stamps = _stamps(camera, poses[0], points, config) if fixed else None
-    start, last = 0, times[0]
-    for frame, newest in enumerate(motion.shown_at):
-        now = times[newest]
-        if stamps is not None:
-            trail.fade(float(now - last))
-            trail.add(stamps, now - times, start, newest + 1)
-            start, last = newest + 1, now
-        else:
-            trail.clear()
-            kept = slice(int(np.searchsorted(times, now - memory_s)), newest + 1)
-            anew = _stamps(camera, poses[frame], points[kept], config)
-            trail.add(anew, now - times[kept], 0, len(times[kept]))
-        yield trail.image, trail.box
+    for pose, newest, now in zip(poses, motion.shown_at, shown_times, strict=True):
+        trail.clear()
+        kept = slice(int(np.searchsorted(times, now - memory_s)), newest + 1)
+        brightness = trail.brightness(now - times[kept])
+        shown = np.flatnonzero(brightness)
+        stamps = _stamps(camera, pose, motion.points[arm, kept], config)
+        trail.add(stamps.glows(shown, brightness[shown]))
+        yield trail.box, region(trail.image, trail.box)
 
 
 def _stamps(
@@ -300,19 +327,33 @@ class _Paint:
     def __init__(self, colour: FloatArray) -> None:
         levels = np.arange(256)[:, None]
         self._colour = np.rint(levels * colour).astype(np.uint8)[:, None]
-        self._rest = np.repeat(255 - levels, 3, axis=1).astype(np.uint8)[:, None]
 
-    def lay(self, image: ByteArray, glow: GlowArray, box: Box) -> None:
-        """Blends the colour into an (H, W, 3) image where the (H, W) glow is above 0."""
-        part = region(image, box)
-        if part.size == 0:
+    def lay(self, image: ByteArray, box: Box, glow: GlowArray, drawn: list[Box]) -> None:
+        """Blends the colour into an (H, W, 3) image.
+
+        Args:
+            image: drawn upon.
+            box: inside the image.
+            glow: (h, w) of the box, in 0 .. 1.
+            drawn: boxes outside of which the image is black; this one is added.
+        """
+        if is_empty(box):
             return
-        levels = cv2.convertScaleAbs(region(glow, box), alpha=255)
-        painted = cv2.applyColorMap(levels, self._colour)
-        if part.any():
-            rest = cv2.applyColorMap(levels, self._rest)
-            painted = cv2.add(painted, cv2.multiply(part, rest, scale=1 / 255))
-        part[...] = painted
+        under = NO_BOX
+        for other in reversed(drawn):
+            under = union(under, intersection(box, other))
+            if under == box:
+                break
+        drawn.append(box)
+        levels = cv2.convertScaleAbs(glow, alpha=255)
+        covered = region(image, under)
+        before = covered.copy()
+        cv2.applyColorMap(levels, self._colour, region(image, box))
+        if cv2.countNonZero(before.reshape(-1)):
+            top, _, left, _ = box
+            part = (under[0] - top, under[1] - top, under[2] - left, under[3] - left)
+            rest = cv2.cvtColor(cv2.bitwise_not(region(levels, part)), cv2.COLOR_GRAY2BGR)
+            cv2.add(covered, cv2.multiply(before, rest, scale=1 / 255), covered)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
