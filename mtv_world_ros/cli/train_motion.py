@@ -34,6 +34,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--steps', type=int, default=4000)
     parser.add_argument('--batch-size', type=int, default=64)
     parser.add_argument('--learning-rate', type=float, default=2e-3)
+    parser.add_argument(
+        '--width',
+        type=int,
+        help="of the network (128, or that of --init); a wider one than --init's goes on from the "
+        'same function',
+    )
+    parser.add_argument(
+        '--hidden',
+        type=int,
+        help='numbers that an object remembers from step to step (48, or as --init); likewise',
+    )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument(
         '--compile',
@@ -86,6 +97,8 @@ def _train(arguments: argparse.Namespace) -> int:
             forced_share=0.0 if init else 0.35,
             seed=arguments.seed,
             compile=arguments.compile,
+            width=arguments.width,
+            hidden=arguments.hidden,
         ),
         init=init,
     )

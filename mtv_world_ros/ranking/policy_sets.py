@@ -27,6 +27,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-grip-0.6',
         'expert-play-2',
         'expert-odd-3',
+        'expert-visit-1',
     ),
     'calibrate': (
         'expert',

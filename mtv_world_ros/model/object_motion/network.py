@@ -13,7 +13,9 @@ Shape letters: B batch, O objects, A tools, T steps, D width.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import nn, Tensor
@@ -25,6 +27,8 @@ _SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
 _NEAR = 100.0  # 1 / 1 cm: clearances enter in this unit, cut off at 3
 #: clearances of a tool and an object, and of two objects
 _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
+#: numbers that describe an object's shape, as learned
+_SHAPE = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,18 +144,33 @@ class ObjectMotionNetwork(nn.Module):
         num_features: F times V, numbers that describe an object.
         width: D.
         hidden: numbers that an object remembers from step to step.
+        fingertips: it is told how high either fingertip is over an object's bottom and top;
+            differs where a tool leans.
     """
 
-    def __init__(self, num_features: int = 18, width: int = 128, hidden: int = 48) -> None:
+    def __init__(
+        self,
+        num_features: int = 18,
+        width: int = 128,
+        hidden: int = 48,
+        *,
+        fingertips: bool = False,
+    ) -> None:
         super().__init__()
-        self.config = {'num_features': num_features, 'width': width, 'hidden': hidden}
-        self.hidden = hidden
-        shape = 32
+        self.config = {
+            'num_features': num_features,
+            'width': width,
+            'hidden': hidden,
+            'fingertips': fingertips,
+        }
+        self.width, self.hidden, self.fingertips = width, hidden, fingertips
+        shape = _SHAPE
         self.shape = _mlp(num_features + 1, width, shape)
         # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
         # clearances now and next
         given = 22 + 2 * _NUM_TOOL_CLEARANCES
-        self.tool_edge = _mlp(given + shape + hidden, width, width, width)
+        tips = 8 if fingertips else 0
+        self.tool_edge = _mlp(given + shape + hidden + tips, width, width, width)
         # offset (3) | velocities (6) | rotation of the other (6) | clearances
         given = 15 + _NUM_OBJECT_CLEARANCES
         self.object_edge = _mlp(given + 2 * shape + hidden, width, width)
@@ -168,6 +187,40 @@ class ObjectMotionNetwork(nn.Module):
             nn.init.zeros_(layer.bias)
         nn.init.constant_(self.stay.bias, 2.0)
         nn.init.constant_(self.scale.bias, -6.0)
+
+    def widened(self, width: int, hidden: int) -> ObjectMotionNetwork:
+        """Returns a wider network with fingertips that computes the same, and can learn more.
+
+        What is new hears everything and is not listened to at first (Net2Net: Chen et al. 2016).
+
+        Raises:
+            ValueError: it would be narrower.
+        """
+        if width < self.width or hidden < self.hidden:
+            raise ValueError(
+                f'the network is {self.width} wide and remembers {self.hidden} numbers; it cannot '
+                f'shrink to {width} and {hidden}'
+            )
+        wider = ObjectMotionNetwork(self.config['num_features'], width, hidden, fingertips=True)
+        w, h = (self.width, width), (self.hidden, hidden)
+        tips = (8 if self.fingertips else 0, 8)
+        old, new = self.state_dict(), wider.state_dict()
+        known = self.tool_edge[0].in_features - h[0] - tips[0]
+        blocks = {  # of the columns, (old, new), in the order in which `step` gives them
+            'tool_edge.0.weight': [(known, known), h, tips],
+            'node.0.weight': [(14 + _SHAPE, 14 + _SHAPE), h, w, w],
+        }
+        for name, value in new.items():
+            same = [(n, m) for n, m in zip(old[name].shape, value.shape, strict=True)]
+            rows = [h] * 3 if name.startswith('memory') else same[:1]
+            columns = blocks.get(name, same[-1:])
+            kept = torch.tensor(_kept(rows))
+            if value.ndim == 1:
+                value[kept] = old[name]
+            else:
+                value[kept] = 0.0
+                value[kept[:, None], torch.tensor(_kept(columns))] = old[name]
+        return wider
 
     def forward(
         self,
@@ -341,6 +394,11 @@ class ObjectMotionNetwork(nn.Module):
             _tool_clearances(after, gaps[:, 2], extents, now),
             own[:, :, None].expand(-1, -1, num_tools, -1),
         ]
+        if self.fingertips:
+            inputs += [
+                _fingertip_heights(here, gaps[:, 1], extents, now),
+                _fingertip_heights(after, gaps[:, 2], extents, now),
+            ]
         edge = self.tool_edge(torch.cat(inputs, dim=-1))
         push = self.push(edge)
         frame = here[:, None, :, :3, :3]
@@ -373,6 +431,12 @@ class ObjectMotionNetwork(nn.Module):
         return (edge * pairs[..., None]).sum(2)
 
 
+def _kept(blocks: Sequence[tuple[int, int]]) -> list[int]:
+    """Where old entries go when each of the blocks (old size, new size) grows at its end."""
+    starts = accumulate((new for _, new in blocks), initial=0)
+    return [start + k for start, (old, _) in zip(starts, blocks, strict=False) for k in range(old)]
+
+
 def _near(clearance: Tensor) -> Tensor:
     return (clearance * _NEAR).clamp(-3, 3)
 
@@ -401,6 +465,15 @@ def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory
         above - extents.low[..., None],
     ]
     return _near(torch.stack(rows, -1))
+
+
+def _fingertip_heights(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory) -> Tensor:
+    """(B, O, A, 4) how far either tip is above an object's bottom, and above its top."""
+    rise = tools[..., 2, 1] * gaps
+    tips = tools[..., 2, 3][..., None] + torch.stack([rise, -rise], -1)  # (B, A, 2)
+    bottom, top = (now.points[..., 2] + e for e in (extents.low, extents.high))
+    over = [tips[:, None] - level[..., None, None] for level in (bottom, top)]
+    return _near(torch.cat(over, -1))
 
 
 def _object_clearances(offset: Tensor, extents: _Extents, now: Memory) -> Tensor:

@@ -235,7 +235,8 @@ class Expert:
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = self._stops(pick, move, now, goal, rng)
             if faults is not None and number == faults.move_of(len(task.moves)):
-                stops = faults.applied(stops, pick.yaw)
+                objects = [np.asarray(item.position) for item in now.values()]
+                stops = faults.applied(stops, pick.yaw, objects)
             rows = self._follow(pick.arm, stops, rng, alone=len(task.moves) == 1)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
             start = max(1, busy - overlap)

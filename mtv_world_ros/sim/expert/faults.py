@@ -170,6 +170,15 @@ FAULTS: Mapping[str, FaultKind] = {
         'number of runs of one to three way points with another opening, place or turn, or a '
         'detour, drawn at random',
     ),
+    'visit': _kind(
+        'collision',
+        'train',
+        1,
+        4,
+        '',
+        'number of visits to any object of the scene, through it or past it, drawn at random: '
+        'when, from where, how low, open or shut, turned and leaning',
+    ),
     'knock': _kind(
         'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push what is at the goal before it'
     ),

@@ -23,6 +23,12 @@ _MOST_STOPS = 40
 _PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
 #: an odd way point: standard deviations of its place [m], yaw and lean [rad]; the longest run
 _ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
+#: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
+#: high over it, how much it rises before and after [m]; standard deviations beside the centre [m],
+#: of yaw and lean [rad]
+_VISIT_FROM_M, _VISIT_TO_M = (0.0, 0.08), (-0.02, 0.06)
+_VISIT_HEIGHT_M, _VISIT_RISE_M = (-0.03, 0.05), (0.03, 0.1)
+_VISIT_BESIDE_M, _VISIT_YAW_RAD, _VISIT_LEAN_RAD = 0.012, 0.6, 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,22 +82,31 @@ class WayPointFaults:
         """Returns the number of the move that goes wrong."""
         return int(self._move * num_moves)
 
-    def applied(self, stops: Stops, yaw: float) -> Stops:
+    def applied(self, stops: Stops, yaw: float, objects: Sequence[FloatArray]) -> Stops:
         """Returns the way points of a move with all faults, in the catalogue's order.
 
         Args:
             stops: of the expert.
             yaw: of its grasp [rad]; the fingers travel along it.
+            objects: (3,) centre of every object of the scene [m].
         """
         for kind, size in self._variant.sizes:
             edit = _EDITS.get(kind)
             if edit is not None:
-                side = _Side(yaw, self._sign, self._angle, self._draws, self._openings, self._play)
+                side = _Side(
+                    yaw=yaw,
+                    sign=self._sign,
+                    angle=self._angle,
+                    draws=self._draws,
+                    openings=self._openings,
+                    play=self._play,
+                    objects=objects,
+                )
                 stops = edit(stops, size, side)
         return stops
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Side:
     """To which side a fault goes."""
 
@@ -101,6 +116,7 @@ class _Side:
     draws: FloatArray
     openings: FloatArray
     play: np.random.Generator
+    objects: Sequence[FloatArray]
 
     @property
     def along(self) -> FloatArray:
@@ -320,6 +336,35 @@ def _play(stops: Stops, size: float, side: _Side) -> Stops:
     return stops
 
 
+def _visit(stops: Stops, size: float, side: _Side) -> Stops:
+    """Whatever the arm is about, it goes to an object first and through it or past it."""
+    rng, floor = side.play, min(stop.position[2] for stop in stops)
+    for _ in range(round(size)):
+        at = int(rng.integers(len(stops)))
+        x, y, z = side.objects[rng.integers(len(side.objects))]
+        angle = rng.uniform(0.0, 2 * np.pi)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        past = np.array([x, y]) + rng.normal(0.0, _VISIT_BESIDE_M, 2)
+        height = max(floor, z + rng.uniform(*_VISIT_HEIGHT_M))
+        begin = np.array([*(past - rng.uniform(*_VISIT_FROM_M) * way), height])
+        end = np.array([*(past + rng.uniform(*_VISIT_TO_M) * way), height])
+        arrives = WayPoint(
+            phase='above',
+            position=begin,
+            yaw=float(rng.normal(0.0, _VISIT_YAW_RAD)),
+            # half of them with the opening that the gripper has
+            opening=float(rng.uniform()) if rng.random() < 0.5 else stops[at].opening,
+            lean=float(rng.normal(0.0, _VISIT_LEAN_RAD)) if rng.random() < 0.5 else 0.0,
+        )
+        leaves = replace(arrives, position=end)
+        if rng.random() < 0.5:
+            leaves = replace(leaves, opening=float(rng.uniform()))
+        before, after = (_up(rng.uniform(*_VISIT_RISE_M)) for _ in range(2))
+        visit = [arrives.moved(before), arrives, leaves, leaves.moved(after)]
+        stops = [*stops[:at], *visit, *stops[at:]]
+    return stops
+
+
 def _elsewhere(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _PLACE, lambda stop: stop.moved(size * side.anywhere))
 
@@ -393,6 +438,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'blink': _blink,
     'play': _play,
     'odd': _odd,
+    'visit': _visit,
     'knock': _knock,
     'brush': _brush,
     'low_carry': _low_carry,

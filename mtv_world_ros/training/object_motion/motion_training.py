@@ -34,6 +34,8 @@ _PLACE_NOISE_M = 0.001
 #: relative one of their features
 _SHAPE_NOISE = 0.02
 _EMA_DECAY = 0.999
+#: of a network that begins anew
+_WIDTH, _HIDDEN = 128, 48
 #: steps between two savings, and of a row of the curve
 _SAVE_EVERY, _CURVE_EVERY = 500, 100
 #: an object has moved if it went further than this [m]
@@ -52,6 +54,9 @@ class MotionTraining:
             after it windows run free from their first step.
         seed: of weights and windows.
         compile: with torch.compile, which needs a C++ compiler and is 1.8 times as fast.
+        width: D of the network; what it goes on from is widened and computes the same at first;
+            None = as it is, or 128.
+        hidden: numbers that an object remembers from step to step; likewise, or 48.
     """
 
     steps: int = 4000
@@ -60,6 +65,8 @@ class MotionTraining:
     forced_share: float = 0.35
     seed: int = 0
     compile: bool = False
+    width: int | None = None
+    hidden: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,14 +118,14 @@ def train_motion(
         init: network to go on from.
 
     Raises:
-        TrainingError: the folder is there already, or the loss is not finite.
+        TrainingError: the folder is there already, `init` is wider than wanted, or the loss is not
+            finite.
     """
     folder = Path(out) / OBJECT_MOTION_FOLDER
     if folder.exists():
         raise TrainingError(f"'{folder}' exists; choose another --out, or remove it")
     torch.manual_seed(config.seed)
-    num_views = tracks[0].features.shape[1]
-    network = init or ObjectMotionNetwork(num_features=num_features(num_views))
+    network = _network(init, num_features(tracks[0].features.shape[1]), config)
     averaged = torch.optim.swa_utils.AveragedModel(
         network, avg_fn=lambda old, new, n: old.lerp(new, 1 - min(_EMA_DECAY, _warm(int(n))))
     )
@@ -134,6 +141,18 @@ def train_motion(
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
         _save(_network_of(averaged), folder, losses)
     return _network_of(averaged).eval()
+
+
+def _network(
+    init: ObjectMotionNetwork | None, count: int, config: MotionTraining
+) -> ObjectMotionNetwork:
+    if init is None:
+        width, hidden = config.width or _WIDTH, config.hidden or _HIDDEN
+        return ObjectMotionNetwork(count, width, hidden, fingertips=True)
+    try:
+        return init.widened(config.width or init.width, config.hidden or init.hidden)
+    except ValueError as error:
+        raise TrainingError(f'--init: {error}; set --width and --hidden') from error
 
 
 def _network_of(averaged: torch.optim.swa_utils.AveragedModel) -> ObjectMotionNetwork:

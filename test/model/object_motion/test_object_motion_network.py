@@ -63,6 +63,39 @@ def test_two_calls_one_after_the_other_are_one_call(network):
     torch.testing.assert_close(second.rotations, whole.rotations[:, 5:])
 
 
+@pytest.mark.parametrize(('width', 'hidden'), [(32, 16), (48, 20)])
+def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
+    network, width, hidden
+):
+    given = scene(3, 3)
+    wider = network.widened(width, hidden).widened(width + 8, hidden).eval()
+    with torch.inference_mode():
+        before, after = network(given), wider(given)
+    for name in ('points', 'rotations', 'held', 'spread'):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name))
+    leaning = given.tools.clone()
+    leaning[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
+    leaning[..., :3, 3] *= 0.1  # further away than 3 cm heights are cut off
+    heard: list[torch.Tensor] = []
+    wider.tool_edge.register_forward_pre_hook(lambda _, args: heard.append(args[0][..., -8:]))
+    wider(
+        replace(
+            given,
+            points=0.1 * given.points,
+            features=0.1 * given.features,
+            tools=leaning,
+            gaps=torch.full_like(given.gaps, 0.01),
+        )
+    )
+    rise = heard[0][..., 0] - heard[0][..., 1]
+    inside = heard[0].abs().amax(-1) < 3
+    assert inside.any()
+    # 1 cm along a finger's travel that leans by sine .6, up and down; in cm
+    torch.testing.assert_close(rise[inside], torch.full_like(rise[inside], 1.2))
+    with pytest.raises(ValueError, match='is 32 wide .* cannot shrink to 16'):
+        network.widened(16, 16)
+
+
 def test_padding_changes_nothing_and_rotations_stay_rotations(network):
     given = scene(2, 2)
     padded = replace(

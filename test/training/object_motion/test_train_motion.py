@@ -97,8 +97,11 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
     after, _ = end_errors(network, tracks)
     loaded = load_network(tmp_path / 'b' / 'object_motion')
     np.testing.assert_allclose(end_errors(loaded, tracks)[0], after, atol=1e-6)
+    assert (loaded.width, loaded.hidden) == (24, 8)
     with pytest.raises(TrainingError, match='exists; choose another --out'):
         train_motion(tracks, tmp_path / 'b', config)
+    with pytest.raises(TrainingError, match='--init: the network is 24 wide .* set --width'):
+        train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
 def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
