@@ -63,7 +63,9 @@ _SUSPICIOUS, _BROKEN = 0.012, 0.03
 _RODS_FACTOR = 6.0
 #: correlation of drawn and seen motion below which they are unrelated
 _MIN_MATCH = 0.12
-#: gain in that correlation, as a share, from which another roll or focal length is taken for right
+#: gain in that correlation, as a share, from which another place is taken for right
+_BETTER_PLACE = 0.05
+#: the same, of another roll or focal length
 _BETTER_MATCH = 0.1
 #: delay of the images against the joint states from which on it matters [s]
 _MAX_LAG_S = 0.1
@@ -190,6 +192,8 @@ class Inspector:
             f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset (`mtv-world '
             'calibrate-camera` estimates the pose)'
         )
+        if residual.match <= residual.match_here * (1 + _BETTER_PLACE):
+            return []
         border = max(abs(x), abs(y)) >= REACH * camera.width - 1
         if border or distance > self._broken * camera.width:
             return [broken(text)]
@@ -198,7 +202,7 @@ class Inspector:
     def _better_fit(self, residual: MotionResidual) -> list[Finding]:
         """A roll or a focal length with which the drawn robot fits clearly better."""
         name, match = residual.best_change
-        if not self.shape.is_known or match <= residual.match * (1 + _BETTER_MATCH):
+        if not self.shape.is_known or not match > residual.match * (1 + _BETTER_MATCH):
             return []
         text = (
             f'the drawn robot fits the moving pixels better with {name} (match {match:.2f}, as it '

@@ -26,8 +26,10 @@ FloatImage = NDArray[np.float32]
 _LEAST_AREA_PX = 20
 #: share of the drawn motion that must stay in the image under a shift
 _LEAST_INSIDE = 0.5
-#: images are shrunk to this width [px]
-_WIDTH = 384
+#: share of the most motion seen over all shifts that counts at least, where less is seen
+_LEAST_ENERGY = 0.25
+#: images are shrunk to this width, for delays and changes of the camera to the second [px]
+_WIDTH, _COARSE = 384, 192
 #: time between the two frames of a pair [s]
 _STEP_S = 0.5
 #: search radius, as a share of the image width
@@ -66,6 +68,7 @@ class MotionResidual:
         shift_px: (x, y) from the drawn robot to the moving pixels, in pixels of the recorded
             images; NaN where it could not be measured.
         match: mean correlation of drawn and seen motion there, -1 .. 1.
+        match_here: the same where the robot is drawn.
         contrast: by how many standard deviations that stands out from other shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
         best_change: change of the camera that fits best among those tried, and its match.
@@ -75,6 +78,7 @@ class MotionResidual:
 
     shift_px: tuple[float, float] = (float('nan'), float('nan'))
     match: float = float('nan')
+    match_here: float = float('nan')
     contrast: float = float('nan')
     lag_s: float = float('nan')
     best_change: tuple[str, float] = ('', float('nan'))
@@ -93,9 +97,10 @@ def measure_residual(
     """Compares the motion that joint states and calibration predict with the one in the images.
 
     For pairs of frames half a second apart, each link's silhouettes at both times are drawn; where
-    they differ the image should have changed. The maps of all pairs are correlated with the
-    images' differences over shifts, for each link on its own. Links count alike, so that one
-    whose drawn shape is wrong does not decide; a calibration error moves all of them.
+    they differ the image should have changed, unless the robot covers the place in both. The maps
+    of all pairs are correlated with the images' differences over shifts, for each link on its
+    own. Links count alike, so that one whose drawn shape is wrong does not decide; a calibration
+    error moves all of them.
 
     Args:
         track: frames of a camera that stands still.
@@ -115,29 +120,29 @@ def measure_residual(
         return MotionResidual(
             reason=f'no two frames {_STEP_S:g} s apart with joint states and motion'
         )
-    small = shrunk(camera, _WIDTH)
-    seen = _seen_motion(track, pairs, small)
+    small, coarse = shrunk(camera, _WIDTH), shrunk(camera, _COARSE)
+    some = pairs[::3]
+    seen = _seen_motion(track, some, coarse)
 
-    def surface(
-        part: slice, lag_s: float = 0.0, drawn_by: CameraModel = small
-    ) -> FloatArray | None:
-        stamps_ns = track.stamps_ns[pairs[part]].ravel() - round(lag_s * 1e9)
-        return _surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes)
+    def match(drawn_by: CameraModel, lag_s: float = 0.0) -> float:
+        stamps_ns = track.stamps_ns[some].ravel() - round(lag_s * 1e9)
+        return _top(_surface(seen, joints.at(stamps_ns), drawn_by, robot, shapes))
 
-    now = surface(slice(None))
+    positions = joints.at(track.stamps_ns[pairs].ravel())
+    now = _surface(_seen_motion(track, pairs, small), positions, small, robot, shapes)
     if now is None:
         return MotionResidual(reason='no link moves within the image')
     shift = _peak(now) * camera.width / small.width
     spread = float(now.std())
-    third = slice(None, None, 3)
-    changes = {name: _top(surface(third, 0.0, c)) for name, c in _changes(small, search).items()}
-    gain = float(now.max()) - _top(surface(third))
+    changes = {name: match(changed) for name, changed in _changes(coarse, search).items()}
+    gain = float(now.max()) - match(coarse)
     best = max(changes, key=changes.__getitem__, default='')
     return MotionResidual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
+        match_here=float(now[len(now) // 2, len(now) // 2]),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
-        lag_s=_best_lag([(lag, surface(third, lag)) for lag in search.lags_s]),
+        lag_s=max(search.lags_s, key=lambda lag_s: match(coarse, lag_s)),
         best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
     )
@@ -213,65 +218,98 @@ def _surface(
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
     radius = _radius(small.width)
+    parts: dict[str, list[FloatArray]] = {}
+    for shape in shapes:
+        pixels = project_part(shape, poses[shape.link], small, T_base_camera)
+        parts.setdefault(shape.link, []).append(pixels)
+    whole = fill([pixels for link in parts.values() for pixels in link], small)
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
-    for link in dict.fromkeys(shape.link for shape in shapes):
-        parts = [
-            project_part(part, poses[link], small, T_base_camera)
-            for part in shapes
-            if part.link == link
-        ]
-        surface, count = _correlate(seen, fill(parts, small), radius)
+    for link in parts.values():
+        surface, count = _correlate(seen, fill(link, small), whole, radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
     return total / weights if weights else None
 
 
 def _correlate(
-    seen: Sequence[FloatImage], drawn: NDArray[np.uint8], radius: int
+    seen: Sequence[FloatImage],
+    drawn: NDArray[np.uint8],
+    whole: NDArray[np.uint8],
+    radius: int,
 ) -> tuple[FloatArray, int]:
     """One link's normalised correlation over shifts, and the pairs in which it moves.
 
-    Drawn motion that a shift moves out of the image counts for nothing, in the norm too: else
-    a robot that is drawn too far inside would seem to be nearer than it is.
+    Only pixels that tell are compared: those that the link leaves or enters and the rest of the
+    robot does not cover, which should change, and those without the robot in both frames, which
+    should not. Where the robot stays in front of itself, or another link moves, a change says
+    nothing about this link.
+
+    Args:
+        seen: change of each pixel, a pair of frames each, with a rim.
+        drawn: (2 P, H, W) silhouettes of the link in the frames of the pairs.
+        whole: (2 P, H, W) those of the robot.
+        radius: of the search [px].
     """
-    total, energy_drawn = np.zeros((2 * radius + 1,) * 2), np.zeros((2 * radius + 1,) * 2)
-    energy_seen = 0.0
+    size = (2 * radius + 1,) * 2
+    total, energy_seen, energy_drawn = np.zeros(size), np.zeros(size), np.zeros(size)
     count = 0
-    for change, before, after in zip(seen, drawn[::2], drawn[1::2], strict=True):
-        differs = cv2.absdiff(before, after)
+    for change, link, robot in zip(seen, _pairwise(drawn), _pairwise(whole), strict=True):
+        differs = (link[0] ^ link[1]) & (robot[0] ^ robot[1])
         if cv2.countNonZero(differs) < _LEAST_AREA_PX:
             continue
-        template, window = _cut(differs, change, radius)
-        inside = np.isfinite(window).astype(np.float32)
-        window = np.nan_to_num(window - np.nanmean(window))
-        total += cv2.matchTemplate(window, template, cv2.TM_CCORR)
-        energy_seen += cv2.norm(window, cv2.NORM_L2SQR) * template.size / float(inside.sum())
-        energy_drawn += cv2.matchTemplate(inside, template**2, cv2.TM_CCORR)
+        telling = differs | (1 - (robot[0] | robot[1]))
+        products = _products(differs, telling, change, radius)
+        total += products[0]
+        energy_seen += products[1]
+        energy_drawn += products[2]
         count += 1
     if count == 0:
         return total, 0
     enough = energy_drawn > _LEAST_INSIDE * energy_drawn.max()
-    norm = np.sqrt(energy_seen * energy_drawn.clip(0) + 1e-12)
-    return np.where(enough, total / norm, 0.0), count
+    norm = energy_seen.clip(_LEAST_ENERGY * energy_seen.max()) * energy_drawn.clip(0)
+    return np.where(enough, total / np.sqrt(norm + 1e-12), 0.0), count
 
 
-def _cut(
-    differs: NDArray[np.uint8] | cv2.typing.MatLike, change: FloatImage, radius: int
-) -> tuple[FloatImage, FloatImage]:
-    """The drawn motion's surroundings, mean removed, and the window of `change` to search."""
+def _pairwise(silhouettes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(P, 2, H, W) of (2 P, H, W)."""
+    return silhouettes.reshape(-1, 2, *silhouettes.shape[1:])
+
+
+def _products(
+    differs: NDArray[np.uint8], telling: NDArray[np.uint8], change: FloatImage, radius: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Covariance of drawn and seen motion over shifts, and the variance of each, as sums.
+
+    Over the telling pixels around the drawn motion that a shift leaves in the image: else a robot
+    that is drawn too far inside would seem to be nearer than it is.
+    """
     rim = round(5 * _BLUR_PX)
     left, top, width, height = cv2.boundingRect(differs)
     right, bottom = left + width + rim, top + height + rim
     left, top = max(left - rim, 0), max(top - rim, 0)
-    part = np.asarray(differs[top:bottom, left:right], np.float32)
-    template = cv2.GaussianBlur(part, (0, 0), _BLUR_PX)
-    height, width = template.shape
+    weight = telling[top:bottom, left:right].astype(np.float32)
+    motion = differs[top:bottom, left:right].astype(np.float32)
+    motion = weight * cv2.GaussianBlur(motion, (0, 0), _BLUR_PX)
+    height, width = weight.shape
     window = change[top : top + height + 2 * radius, left : left + width + 2 * radius]
-    return _centred(template), window
+    inside = np.isfinite(window)
+    window = np.where(inside, window, np.float32(0))
+    if inside.all():
+        area, drawn, drawn_squares = (np.float64(x.sum()) for x in (weight, motion, motion**2))
+    else:
+        masks = inside.astype(np.float32)
+        area, drawn, drawn_squares = (_over_shifts(masks, x) for x in (weight, motion, motion**2))
+    area = np.maximum(area, 1.0)
+    there = _over_shifts(window, weight)
+    return (
+        _over_shifts(window, motion) - drawn * there / area,
+        _over_shifts(window**2, weight) - there**2 / area,
+        np.broadcast_to(drawn_squares - drawn**2 / area, there.shape),
+    )
 
 
-def _centred(image: NDArray[np.floating] | cv2.typing.MatLike) -> FloatImage:
-    return np.asarray(image - np.float32(cv2.mean(image)[0]), np.float32)
+def _over_shifts(window: FloatImage, template: FloatImage) -> FloatArray:
+    return np.asarray(cv2.matchTemplate(window, template, cv2.TM_CCORR), np.float64)
 
 
 def _peak(surface: FloatArray) -> FloatArray:
@@ -289,8 +327,3 @@ def _refined(line: FloatArray, at: int) -> float:
     before, top, after = line[at - 1 : at + 2]
     bend = float(before - 2 * top + after)
     return at + 0.5 * float(before - after) / bend if bend < 0 else float(at)
-
-
-def _best_lag(surfaces: Sequence[tuple[float, FloatArray | None]]) -> float:
-    peaks = {lag: _top(surface) for lag, surface in surfaces}
-    return max(peaks, key=peaks.__getitem__)
