@@ -153,6 +153,9 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
         episodes=_numbers(arguments.episodes),
         progress=lambda numbers: tqdm(numbers, unit='ep'),
     )
+    for number, lines in summary.warnings.items():
+        for line in lines:
+            print(f'episode {number}: {line}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for number, reason in summary.failed.items():
         print(f'episode {number}: {reason}', file=sys.stderr)

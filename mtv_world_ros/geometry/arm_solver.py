@@ -1,4 +1,4 @@
-"""Differential inverse kinematics of top-down tool poses on the robot's Pinocchio model."""
+"""Inverse kinematics of an arm on the robot's Pinocchio model, by damped least squares."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.errors import TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel, Tool
-from mtv_world_ros.geometry.transforms import rotation
 
 #: of damped least squares: added to the diagonal of J^T J
 _DAMPING = 1e-5
@@ -18,20 +17,6 @@ _TOLERANCE_M, _TOLERANCE_RAD = 3e-4, 2e-3
 _NUM_ITERATIONS = 60
 #: distance kept from the joint limits [rad]
 _LIMIT_MARGIN = 0.005
-
-
-def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
-    """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
-
-    The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
-    along the base's x. `lean` [rad] swings the tool about its own x, in the plane of the travel.
-    """
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    pose = np.eye(4)
-    down = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
-    pose[:3, :3] = down @ rotation((np.sin(lean / 2), 0.0, 0.0, np.cos(lean / 2)))
-    pose[:3, 3] = position
-    return pose
 
 
 class ArmSolver:
@@ -49,7 +34,7 @@ class ArmSolver:
     def __init__(self, robot: RobotModel, tool: Tool, rest: FloatArray | None = None) -> None:
         self._model = robot.pinocchio_model
         self._data = self._model.createData()
-        self._frame = self._model.getFrameId(tool.link)
+        self._frame = self._model.getFrameId(tool.link, pin.FrameType.BODY)
         self._tool = pin.SE3(np.asarray(tool.T_link_tool, dtype=float))
         chain = self._model.supports[self._model.frames[self._frame].parentJoint]
         carrying = {self._model.names[joint] for joint in chain}
@@ -58,23 +43,30 @@ class ArmSolver:
         joints = [
             self._model.joints[self._model.getJointId(robot.joint_names[i])] for i in self.indices
         ]
-        self._q_at = np.array([joint.idx_q for joint in joints])
+        self._q_at = [(joint.idx_q, joint.nq) for joint in joints]
         self._v_at = np.array([joint.idx_v for joint in joints])
         self._lower = np.asarray(robot.lower)[self.indices] + _LIMIT_MARGIN
         self._upper = np.asarray(robot.upper)[self.indices] - _LIMIT_MARGIN
         self._neutral = pin.neutral(self._model)
+        pin.forwardKinematics(self._model, self._data, self._neutral)
+        base = self._model.getFrameId(robot.base_link, pin.FrameType.BODY)
+        self._base = pin.updateFramePlacement(self._model, self._data, base)
 
     def solve(self, pose: FloatArray, start: FloatArray) -> FloatArray:
         """Returns the arm's joints (n,) [rad] that bring the tool to `pose` (4, 4).
 
+        Args:
+            pose: of the tool in the robot's base link.
+            start: (n,) joints to start from [rad].
+
         Raises:
-            SimulatorError: the pose is out of reach from `start`.
+            TrajectoryError: the pose is out of reach from `start`.
         """
-        goal = pin.SE3(np.asarray(pose))
-        q, joints = self._neutral.copy(), np.clip(start, self._lower, self._upper)
+        goal = self._base * pin.SE3(np.asarray(pose))
+        joints = np.clip(start, self._lower, self._upper)
         rest, slack = (joints if self._rest is None else self._rest), np.zeros(len(joints))
         for _ in range(_NUM_ITERATIONS):
-            q[self._q_at] = joints
+            q = self._configuration(joints)
             pin.computeJointJacobians(self._model, self._data, q)
             pin.updateFramePlacement(self._model, self._data, self._frame)
             placement = self._data.oMf[self._frame] * self._tool
@@ -99,7 +91,14 @@ class ArmSolver:
             step = np.linalg.solve(normal, jacobian.T @ error) + slack
             joints = np.clip(joints + np.clip(step, -0.5, 0.5), self._lower, self._upper)
         x, y, z = pose[:3, 3]
-        raise SimulatorError(f'tool pose at ({x:.3f}, {y:.3f}, {z:.3f}) m is out of reach')
+        raise TrajectoryError(f'tool pose at ({x:.3f}, {y:.3f}, {z:.3f}) m is out of reach')
+
+    def _configuration(self, joints: FloatArray) -> FloatArray:
+        """Pinocchio's (nq,); joints that turn without end are given by cosine and sine."""
+        q = self._neutral.copy()
+        for (at, count), value in zip(self._q_at, joints, strict=True):
+            q[at : at + count] = value if count == 1 else (np.cos(value), np.sin(value))
+        return q
 
 
 def _slack(jacobian: FloatArray, wanted: FloatArray) -> FloatArray:

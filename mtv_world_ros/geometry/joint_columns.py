@@ -122,19 +122,23 @@ class JointTable(Schema):
             self._columns, self._joint_names = self._of(robot), robot.joint_names
         return self
 
+    def _needed(self, robot: RobotModel) -> Sequence[str]:
+        """Joints that must have a column."""
+        return () if self.allow_missing else robot.joint_names
+
     def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
-        known = robot.joint_names
+        known, needed = robot.joint_names, self._needed(robot)
         entries = self.joints
         if entries is None:
-            entries = {joint: ColumnEntry(column=joint) for joint in known}
+            entries = {joint: ColumnEntry(column=joint) for joint in needed or known}
         for joint in entries:
             if joint not in known:
                 raise ValueError(
                     f"joints: unknown key '{joint}'{nearest(joint, known)}; known are "
                     f'{", ".join(known)}'
                 )
-        missing = [joint for joint in known if joint not in entries]
-        if missing and not self.allow_missing:
+        missing = [joint for joint in needed if joint not in entries]
+        if missing:
             raise ValueError(
                 f"joints {missing} of robot '{robot.name}' are missing; name their columns, or "
                 'give `{constant: 0.0}` for one that the dataset does not have'
@@ -160,7 +164,10 @@ def to_positions(
     for index, joint in enumerate(joints):
         column = 0.0
         if joint.column is not None:
-            column = values[:, _column(joint, names, values.shape[1], feature)]
+            at = column_number(
+                joint.column, names, values.shape[1], feature, f"joint '{joint.joint}'"
+            )
+            column = values[:, at]
         positions[:, index] = joint.factor * column + joint.offset
     return positions
 
@@ -184,7 +191,8 @@ def to_columns(
     )
     values = np.full(count, np.nan)
     for joint in used:
-        column = _column(joint, names, count, 'state')
+        assert joint.column is not None
+        column = column_number(joint.column, names, count, 'state', f"joint '{joint.joint}'")
         values[column] = (positions[joint.joint] - joint.offset) / joint.factor
     empty = np.flatnonzero(np.isnan(values))
     if len(empty):
@@ -192,16 +200,20 @@ def to_columns(
     return values
 
 
-def _column(joint: JointColumn, names: Sequence[str], count: int, feature: str) -> int:
-    column = joint.column
+def column_number(
+    column: str | int, names: Sequence[str], count: int, feature: str, what: str
+) -> int:
+    """Returns which of a feature's `count` columns a name or number is.
+
+    Raises:
+        ConfigError: it has none; the text says what needs it.
+    """
     if isinstance(column, int):
         if 0 <= column < count:
             return column
         raise ConfigError(
-            f"joint '{joint.joint}': feature '{feature}' has no column {column}; it has {count}, "
-            'counted from 0'
+            f"{what}: feature '{feature}' has no column {column}; it has {count}, counted from 0"
         )
-    assert column is not None
     if column in names:
         return list(names).index(column)
     known = (
@@ -210,6 +222,5 @@ def _column(joint: JointColumn, names: Sequence[str], count: int, feature: str) 
         else 'its columns have no names: give numbers'
     )
     raise ConfigError(
-        f"joint '{joint.joint}': feature '{feature}' has no column '{column}'"
-        f'{nearest(column, names)}; {known}'
+        f"{what}: feature '{feature}' has no column '{column}'{nearest(column, names)}; {known}"
     )

@@ -27,11 +27,8 @@ from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML, save_robot
 from mtv_world_ros.geometry.robot_guess import guess_robot
-from mtv_world_ros.importing.convert import import_each, ImportSummary, MAPPING_KEY
+from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
 from mtv_world_ros.importing.mapping import digest_of
-
-#: a command this many times faster than the joint's limit is a jump
-_JUMP = 2.0
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
@@ -166,7 +163,7 @@ def convert_bag(
         camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
-    warnings = [*episode.warnings, *_jumps(commands, robot)]
+    warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
     with EpisodeWriter(
         out,
         task=mapping.task or episode.info.task,
@@ -224,20 +221,6 @@ def _check(robot: RobotModel, positions: FloatArray, mapping: BagMapping, what: 
             f"{what}: {error}; are the joints' names, units and the gripper's range those of the "
             'robot? (limit_tolerance in the mapping says how far outside is accepted)'
         ) from error
-
-
-def _jumps(commands: Sequence[tuple[int, JointTrajectory]], robot: RobotModel) -> list[str]:
-    """Joints whose commands are faster than they can move, and how often."""
-    counts = np.zeros(len(robot.joint_names), int)
-    for _, trajectory in commands:
-        if len(trajectory.times) > 1:
-            speeds = np.diff(trajectory.positions, axis=0) / np.diff(trajectory.times)[:, None]
-            counts += (np.abs(speeds) > _JUMP * robot.velocity_limits).sum(axis=0)
-    return [
-        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times its speed limit)"
-        for name, count in zip(robot.joint_names, counts, strict=True)
-        if count
-    ]
 
 
 def _in_order(

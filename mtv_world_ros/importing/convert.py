@@ -16,7 +16,7 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTr
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.joint_columns import to_positions
-from mtv_world_ros.geometry.robot import check_positions
+from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.importing.camera_parameters import camera_model
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, load_mapping, Stream
@@ -106,8 +106,7 @@ def import_dataset(
         )
 
     def convert(number: int, path: Path) -> tuple[str, ...]:
-        convert_episode(source, source.episodes[number], chosen, path)
-        return ()
+        return convert_episode(source, source.episodes[number], chosen, path)
 
     return import_each(
         progress(wanted), chosen.key, lambda number: out / f'episode_{number:06d}', convert
@@ -134,11 +133,14 @@ MAPPING_KEY = 'import_mapping'
 
 def convert_episode(
     dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping, out: Path
-) -> None:
+) -> tuple[str, ...]:
     """Writes the episode's folder `out`, which appears when it is complete.
 
     Row k has the state and the images of its time; its action is the target that is reached
     `delay_frames` later. Times are the dataset's own.
+
+    Returns:
+        What was odd and how it was handled.
 
     Raises:
         MtvWorldError: the episode cannot be converted; nothing is left behind.
@@ -147,10 +149,8 @@ def convert_episode(
     times = rows['timestamp'].ravel()
     if len(times) < 2 or (np.diff(times) <= 0).any() or not np.isfinite(times).all():
         raise EpisodeError(f'its {len(times)} timestamps do not increase')
-    measured = _positions(dataset, rows, mapping.state, mapping, 'state')
-    commanded = measured
-    if mapping.action is not None:
-        commanded = _positions(dataset, rows, mapping.action, mapping, 'action')
+    measured = _measured(dataset, rows, mapping)
+    commanded, odd = _commanded(dataset, rows, mapping, measured)
     videos = {
         view: dataset.frames(entry, source.feature, times)
         for view, source in mapping.views.items()
@@ -176,7 +176,9 @@ def convert_episode(
         stack.enter_context(writer)
         writer.outcome = _outcome(rows, mapping)
         stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
-        _write_commands(writer, stamps, times, commanded, mapping, dataset.fps)
+        commands = _commands(times, commanded, mapping, dataset.fps)
+        for row, trajectory in commands:
+            writer.write_trajectory(stamps[row], trajectory)
         for k, stamp_ns in enumerate(stamps):
             if k == 0 or texts[k] != texts[k - 1]:
                 writer.write_instruction(stamp_ns, texts[k])
@@ -186,6 +188,7 @@ def convert_episode(
                 frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
                 writer.write_camera_info(view, stamp_ns, camera)
                 writer.write_image(view, stamp_ns, frame)
+    return *odd, *jumps([trajectory for _, trajectory in commands], mapping.robot)
 
 
 def _read_rows(
@@ -200,16 +203,38 @@ def _read_rows(
     return dataset.rows(entry, list(dict.fromkeys(names)))
 
 
-def _positions(
+def _measured(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
+) -> FloatArray:
+    """(T, J)."""
+    stream = mapping.state
+    names = dataset.column_names(stream.feature)
+    positions = to_positions(_table(rows, stream), names, stream.columns, stream.feature)
+    _check(positions, stream, mapping, 'state')
+    return positions
+
+
+def _commanded(
     dataset: LeRobotDataset,
     rows: dict[str, FloatArray],
-    stream: Stream,
     mapping: DatasetMapping,
-    what: str,
-) -> FloatArray:
-    values = rows[stream.feature].reshape(len(rows['timestamp']), -1)
+    measured: FloatArray,
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """(T, J) targets beside the rows, and what was odd."""
+    stream = mapping.action
+    if stream is None:
+        return measured, ()
     names = dataset.column_names(stream.feature)
-    positions = to_positions(values, names, stream.columns, stream.feature)
+    positions, odd = stream.commanded(_table(rows, stream), names, measured, mapping.robot)
+    _check(positions, stream, mapping, 'action')
+    return positions, odd
+
+
+def _table(rows: dict[str, FloatArray], stream: Stream) -> FloatArray:
+    return rows[stream.feature].reshape(len(rows['timestamp']), -1)
+
+
+def _check(positions: FloatArray, stream: Stream, mapping: DatasetMapping, what: str) -> None:
     try:
         check_positions(mapping.robot, positions, tolerance=mapping.limit_tolerance)
     except TrajectoryError as error:
@@ -217,7 +242,6 @@ def _positions(
             f"{what} '{stream.feature}': {error}; are unit, sign, offset and gripper range in "
             'the mapping right? (limit_tolerance there says how far outside is accepted)'
         ) from error
-    return positions
 
 
 def _cameras(
@@ -256,27 +280,41 @@ def _outcome(rows: dict[str, FloatArray], mapping: DatasetMapping) -> str:
     return 'success' if (rows[mapping.outcome_feature] > 0).any() else 'failure'
 
 
-def _write_commands(
-    writer: EpisodeWriter,
-    stamps: Sequence[int],
-    times: FloatArray,
-    positions: FloatArray,
-    mapping: DatasetMapping,
-    fps: float,
-) -> None:
-    """Writes trajectory messages of `chunk_s`, each stamped at its first row."""
+def _commands(
+    times: FloatArray, positions: FloatArray, mapping: DatasetMapping, fps: float
+) -> list[tuple[int, JointTrajectory]]:
+    """Trajectories of `chunk_s`, each with its first row."""
     if mapping.action is None:  # the measured positions of the rows that follow
         reached, targets = times[1:], positions[1:]
     else:
         reached, targets = times + mapping.action.delay_frames / fps, positions
     size = max(1, round(mapping.chunk_s * fps))
+    names, found = mapping.robot.joint_names, []
     for first in range(0, len(targets), size):
         chunk = slice(first, first + size)
-        relative = reached[chunk] - times[first]
         trajectory = JointTrajectory(
-            joint_names=mapping.robot.joint_names, times=relative, positions=targets[chunk]
+            joint_names=names, times=reached[chunk] - times[first], positions=targets[chunk]
         )
-        writer.write_trajectory(stamps[first], trajectory)
+        found.append((first, trajectory))
+    return found
+
+
+#: a command this many times faster than the joint's limit is a jump
+_JUMP = 2.0
+
+
+def jumps(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
+    """Returns joints whose commands are faster than they can move, and how often."""
+    counts = np.zeros(len(robot.joint_names), int)
+    for trajectory in commands:
+        if len(trajectory.times) > 1:
+            speeds = np.diff(trajectory.positions, axis=0) / np.diff(trajectory.times)[:, None]
+            counts += (np.abs(speeds) > _JUMP * robot.velocity_limits).sum(axis=0)
+    return [
+        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times its speed limit)"
+        for name, count in zip(robot.joint_names, counts, strict=True)
+        if count
+    ]
 
 
 def _next_frame(frames: Iterator[ByteArray], view: str, row: int) -> ByteArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import hashlib
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,11 +18,14 @@ from pydantic import (
 
 from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
 from mtv_world_ros.data.episode import check_outcome
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import nearest
 from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.joint_columns import JointEntries, JointTable
+from mtv_world_ros.geometry.joint_columns import JointEntries, JointTable, to_positions
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.importing.camera_parameters import CameraSource
+from mtv_world_ros.importing.tool_actions import add_tool_poses, led_joints, ToolPoses
 
 
 class Stream(JointTable):
@@ -32,13 +36,60 @@ class Stream(JointTable):
 
 
 class ActionStream(Stream):
-    """Joint values that are commanded."""
+    """What is commanded: joint values, differences of them, or poses of tools."""
 
     delay_frames: float = Field(
         default=1.0,
         ge=0,
         description='an action is reached this many frames after the one it stands beside',
     )
+    differences: ListOf[str] = Field(
+        default=(), description='joints whose values are added to the measured ones of their row'
+    )
+    tools: dict[str, ToolPoses] = Field(
+        default_factory=dict, description='poses of the tools of arms, in place of their joints'
+    )
+
+    def _needed(self, robot: RobotModel) -> Sequence[str]:
+        led = led_joints(self.tools, robot)
+        both = sorted(led & set(self.joints or ()))
+        if both:
+            raise ValueError(f'joints {both} follow from the poses of `tools`; give one of both')
+        for joint in self.differences:
+            if joint in led or joint not in robot.joint_names:
+                known = [name for name in robot.joint_names if name not in led]
+                raise ValueError(
+                    f"differences: '{joint}' is not among {known}{nearest(joint, known)}"
+                )
+        return [joint for joint in robot.joint_names if joint not in led]
+
+    def commanded(
+        self, values: FloatArray, names: Sequence[str], measured: FloatArray, robot: RobotModel
+    ) -> tuple[FloatArray, tuple[str, ...]]:
+        """Returns (T, J) positions of a feature's values (T, C), and what was odd.
+
+        Args:
+            values: as in the dataset.
+            names: of the columns; empty where the dataset does not name them.
+            measured: (T, J) positions of the same rows.
+            robot: the robot.
+
+        Raises:
+            ConfigError: a column is not there.
+            EpisodeError: most poses of a tool are out of reach.
+        """
+        positions = measured.copy()
+        at = [robot.joint_names.index(column.joint) for column in self.columns]
+        positions[:, at] = to_positions(values, names, self.columns, self.feature)
+        added = [robot.joint_names.index(joint) for joint in self.differences]
+        positions[:, added] += measured[:, added]
+        odd = [
+            add_tool_poses(
+                positions, measured, robot, arm, poses, poses.wanted(values, names, self.feature)
+            )
+            for arm, poses in self.tools.items()
+        ]
+        return positions, tuple(filter(None, odd))
 
 
 def _load_robot(name: str, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
@@ -71,7 +122,7 @@ class DatasetMapping(Schema):
     )
     state: Stream = Field(description='measured joint positions')
     action: Annotated[ActionStream | None, BeforeValidator(_not_from_state)] = Field(
-        description='commanded ones; `state` = the measured ones of the frames that follow'
+        description='commands; `state` = the measured positions of the frames that follow'
     )
     task: str = Field(default='', description='name of the task; empty = none')
     instruction: str = Field(

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import SimulatorError, TrajectoryError
+from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.sim.expert.kinematics import ArmSolver, top_down
+from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
@@ -166,6 +168,20 @@ class ExpertConfig:
     motions_s: tuple[float, float] = (4.8, 5.2)
     overlap_s: float = 2.2
     picking: PickingConfig = PickingConfig()
+
+
+def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
+    """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
+
+    The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
+    along the base's x. `lean` [rad] swings the tool about its own x, in the plane of the travel.
+    """
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    down = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
+    pose[:3, :3] = down @ rotation((np.sin(lean / 2), 0.0, 0.0, np.cos(lean / 2)))
+    pose[:3, 3] = position
+    return pose
 
 
 def home_positions(robot: RobotModel) -> FloatArray:
@@ -378,7 +394,10 @@ class Expert:
                 a.yaw + blend * (b.yaw - a.yaw),
                 a.lean + blend * (b.lean - a.lean),
             )
-            joints = solver.solve(pose, joints)
+            try:
+                joints = solver.solve(pose, joints)
+            except TrajectoryError as error:
+                raise SimulatorError(str(error)) from error
             row = self.home.copy()
             row[solver.indices] = joints
             self._set_gripper(row, arm, a.opening + blend * (b.opening - a.opening))

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
+from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot import check_positions
 from mtv_world_ros.sim.collect.record import chunk, expert_generator, RecordConfig, simulate
-from mtv_world_ros.sim.expert.kinematics import ArmSolver, top_down
+from mtv_world_ros.sim.expert.expert import top_down
 from mtv_world_ros.sim.tasks.tasks import TASKS
 from mtv_world_ros.sim.world.simulator import SimEpisode
 
@@ -119,7 +120,7 @@ def test_solver_reaches_poses_and_refuses_those_out_of_reach(robot, workcell):
     positions = np.zeros((1, len(robot.joint_names)))
     positions[0, solver.indices] = joints
     np.testing.assert_allclose(robot.tool_poses(positions)[0, 0], pose, atol=2e-3)
-    with pytest.raises(SimulatorError, match='out of reach'):
+    with pytest.raises(TrajectoryError, match='out of reach'):
         solver.solve(top_down(np.array([x, y + 0.9, 0.05]), 0.0), joints)
 
 
