@@ -242,7 +242,8 @@ def _draw_view(
             box, glow = glows[arm]
             paints[arm].lay(image, box, glow, drawn)
             if config.show_gripper:
-                white.lay(image, *next(cores[arm]), drawn)
+                box, glow = next(cores[arm])
+                white.lay(image, box, glow, drawn)
         for arm in order:
             _draw_fingers(fingers, image, arm, k)
         if objects is not None:

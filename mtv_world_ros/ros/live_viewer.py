@@ -9,12 +9,12 @@ import sys
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp
+from mtv_world_ros.ros.qos_profiles import best_offer
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.viewing import rerun_log
 from mtv_world_ros.viewing.streams import shown_as, Streams, take
@@ -54,17 +54,10 @@ class LiveViewer(Node):
             self._subscribe(topic, found[topic][0])
 
     def _subscribe(self, topic: str, msgtype: str) -> None:
-        offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
-        quality = QoSProfile(
-            depth=_DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        profile = best_offer(self.get_publishers_info_by_topic(topic), _DEPTH)
         self.get_logger().info(f'showing {topic}')
         self.create_subscription(
-            message_class(msgtype), topic, self._handler(topic, msgtype), quality, raw=True
+            message_class(msgtype), topic, self._handler(topic, msgtype), profile, raw=True
         )
 
     def _handler(self, topic: str, msgtype: str) -> Callable[[bytes], None]:

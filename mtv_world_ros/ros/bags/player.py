@@ -16,7 +16,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
@@ -26,13 +26,14 @@ from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_s
 from mtv_world_ros.ros.messages.conversions import values_of
 from mtv_world_ros.ros.messages.stamps import NANO, to_stamp
 from mtv_world_ros.ros.peers import Peers
+from mtv_world_ros.ros.qos_profiles import is_latched, LATCHED
 from mtv_world_ros.ros.run_node import run
 
 TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 #: recorders write messages this much out of order at most
 _WINDOW_NS = 2 * NANO
 #: topics whose last message late subscribers get
-_LATCHED = ('instruction', 'tf_static', 'robot_description')
+_STATES = ('instruction', 'tf_static', 'robot_description')
 _CLOCK_PERIOD_NS = 10_000_000
 #: connections that do not change for this long are complete [s]
 _SETTLED_S = 0.5
@@ -118,12 +119,8 @@ class Player(Node):
         self.get_logger().info(f'played {counted or "nothing"}')
 
     def _offer(self, msgtype: str, topic: str) -> Publisher:
-        latched = topic.rsplit('/', 1)[-1] in _LATCHED
-        profile = QoSProfile(
-            depth=1 if latched else 100,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        is_state = topic.rsplit('/', 1)[-1] in _STATES
+        profile = LATCHED if is_state else QoSProfile(depth=100)
         return self.create_publisher(message_class(msgtype), self._played_name(topic), profile)
 
     def _played_name(self, topic: str) -> str:
@@ -189,11 +186,9 @@ class Player(Node):
                 self._first_ns = first_ns + round(self._options.start * NANO)
             if (message.stamp_ns - self._first_ns) / NANO > self._options.duration:
                 return
-            if message.stamp_ns >= self._first_ns or self._is_latched(message.topic):
+            profile = self._outputs[message.topic].qos_profile
+            if message.stamp_ns >= self._first_ns or is_latched(profile):
                 yield message
-
-    def _is_latched(self, topic: str) -> bool:
-        return self._outputs[topic].qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     def _wait_until_due(self, timeline: Timeline, bag_ns: int) -> None:
         due_ns = timeline.due(bag_ns)

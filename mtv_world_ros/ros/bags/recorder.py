@@ -13,7 +13,6 @@ import time
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
@@ -27,6 +26,7 @@ from mtv_world_ros.ros.bags.raw_headers import (
     MIN_STAMPED_BYTES,
     read_stamp,
 )
+from mtv_world_ros.ros.qos_profiles import best_offer
 from mtv_world_ros.ros.run_node import run
 
 #: messages kept while the disk is busy
@@ -159,15 +159,12 @@ class Recorder(Node):
             )
 
     def _subscribe(self, topic: str, msgtype: str, leads: bool) -> None:
-        offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
-        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        publishers = self.get_publishers_info_by_topic(topic)
+        profile = best_offer(publishers, _DEPTH)
         offered = Qos(
-            reliability=reliability.name.lower(),
-            durability=durability.name.lower(),
-            depth=offers[0].depth or 10,
+            reliability=profile.reliability.name.lower(),
+            durability=profile.durability.name.lower(),
+            depth=publishers[0].qos_profile.depth or 10,
         )
         self._declared.append((topic, msgtype, offered))
         if self._writer is not None:
@@ -176,7 +173,7 @@ class Recorder(Node):
             message_class(msgtype),
             topic,
             self._handler(topic, msgtype, leads),
-            QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
+            profile,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 message_lost=lambda event: self._num_lost.update({topic: event.total_count_change})

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -28,6 +28,7 @@ from mtv_world_ros.ros.policy.loop import PolicyLoop
 from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor
 from mtv_world_ros.ros.policy.predicted_frames import PredictedFrames
+from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
@@ -85,13 +86,8 @@ class PolicyNode(Node):
             guarded=self._guarded,
         )
         self._subscribe_predictions(settings.world_model, frames)
-        latched = QoSProfile(
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
         self._plans = self.create_publisher(JointTrajectoryMsg, 'joint_trajectory', 10)
-        self._instruction = self.create_publisher(String, 'instruction', latched)
+        self._instruction = self.create_publisher(String, 'instruction', LATCHED)
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
         steady = Clock(clock_type=ClockType.STEADY_TIME)

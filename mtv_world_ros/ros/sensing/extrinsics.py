@@ -14,7 +14,7 @@ from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from mtv_world_ros.data.transform_tree import Mount, STILL, TransformTree
 from mtv_world_ros.data_types import CameraModel, FloatArray
@@ -23,14 +23,10 @@ from mtv_world_ros.geometry.transforms import inverse, quaternion
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header, NANO
 from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.sensing.observations import Scene
 
 Handler = Callable[[Any], None]
-_LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 
 
 def tf_message() -> Any | None:
@@ -73,10 +69,10 @@ class Extrinsics:
             self._log_absence()
             return
         if settings().publish_tf:
-            self._publisher = node.create_publisher(self._message, '/tf_static', _LATCHED)
+            self._publisher = node.create_publisher(self._message, '/tf_static', LATCHED)
         for topic, qos, latched in (
             ('/tf', QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT), False),
-            ('/tf_static', QoSProfile(depth=100, durability=_LATCHED.durability), True),
+            ('/tf_static', QoSProfile(depth=100, durability=LATCHED.durability), True),
         ):
             take = guarded(partial(self._take, latched=latched))
             node.create_subscription(self._message, topic, take, qos)

@@ -7,7 +7,6 @@ import hashlib
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from mtv_world_ros.bounded_input import check_limit
@@ -15,6 +14,7 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_description import described_robot
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
+from mtv_world_ros.ros.qos_profiles import LATCHED
 
 Handler = Callable[[Any], None]
 TOPIC = 'robot_description'
@@ -42,13 +42,8 @@ class RobotDescription:
         self._seen = b''
         self._problem = ''
         self._offset_m: float | None = None
-        latched = QoSProfile(
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
         self._topic = node.resolve_topic_name(TOPIC)
-        node.create_subscription(String, TOPIC, guarded(self._take), latched)
+        node.create_subscription(String, TOPIC, guarded(self._take), LATCHED)
 
     def problems(self) -> list[str]:
         """What is wrong with the description; empty = nothing."""
