@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from contextlib import closing
 import io
+from pathlib import Path
+import sqlite3
 import struct
+import tempfile
 from typing import Any
 
 import cv2
@@ -81,6 +85,25 @@ def chunk_bomb() -> bytes:
     body = struct.pack('<QQQI', 0, 1, 100, 0) + struct.pack('<I', 4) + b'zstd'
     body += struct.pack('<Q', len(packed)) + packed
     return stream.getvalue() + b'\x06' + struct.pack('<Q', len(body)) + body
+
+
+def sqlite_bag(statement: str = '') -> bytes:
+    """A recorded SQLite bag that something was done to."""
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(KINDS['bag, sqlite3'].samples()[0])
+        file.flush()
+        with closing(sqlite3.connect(file.name)) as database:
+            database.executescript(statement)
+        return Path(file.name).read_bytes()
+
+
+def endless_view() -> bytes:
+    """A bag whose messages are computed, and never end."""
+    return sqlite_bag(
+        'DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE n(id) AS '
+        '(SELECT 1 UNION ALL SELECT id + 1 FROM n) '
+        "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+    )
 
 
 def nested_answer() -> bytes:
@@ -159,6 +182,19 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         lambda: KINDS['video'].samples()[0].replace(b'Lavf', b'\xd6\xd6\xd6\xd6'),
     ),
     'chunk of 5 GB': ('bag', chunk_bomb),
+    'SQLite topic that is no UTF-8': (
+        'bag, sqlite3',
+        lambda: sqlite_bag().replace(b'std_msgs', b'std\xfdmsgs'),
+    ),
+    'SQLite message that is a number': (
+        'bag, sqlite3',
+        lambda: sqlite_bag('UPDATE messages SET data = 4000000000'),
+    ),
+    'SQLite time that is a text': (
+        'bag, sqlite3',
+        lambda: sqlite_bag("UPDATE messages SET timestamp = 'x'"),
+    ),
+    'SQLite messages without end': ('bag, sqlite3', endless_view),
     'nested answer': ('answer, msgpack', nested_answer),
     'vast answer': ('answer, msgpack', vast_answer),
     'tensor of stride 0': ('answer, pickle', stride_zero),

@@ -445,7 +445,7 @@ INCOMPLETE = ('evaluation', 'rollout', 'answer, language model')
 KINDS = {
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
-    'urdf': Kind(_urdfs, _read_urdf, share=0.5),
+    'urdf': Kind(_urdfs, _read_urdf),
     'task': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
     'policy': Kind(_config('policies'), _read_policy),
     'policy list': Kind(_config('rankings'), _read_policies),
@@ -462,16 +462,16 @@ KINDS = {
     'video': Kind(_videos, _read_video),
     'bag': Kind(_bags, _read_bag),
     'bag, sqlite3': Kind(_recorded_sqlite, _read_sqlite),
-    'recover': Kind(_bags, _recover, share=0.25),
-    'metadata': Kind(_metadata, _read_metadata, share=0.5),
+    'recover': Kind(_bags, _recover),
+    'metadata': Kind(_metadata, _read_metadata),
     'training state': Kind(_trees, _read_state_card),
     'features': Kind(_features, _read_features),
     'rollout': Kind(_features, _read_rollout),
     'evaluation': Kind(_evaluations, _read_evaluation),
     'weights': Kind(_weights, _read_weights),
-    'object motion': Kind(_networks, _read_network, share=0.25),
+    'object motion': Kind(_networks, _read_network),
     'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, share=0.1),
-    'instruction': Kind(_instructions, _match, share=0.1),
+    'instruction': Kind(_instructions, _match),
     'answer, msgpack': Kind(_answers, _read_answer),
     'answer, pickle': Kind(_pickles, _read_pickle),
     'answer, language model': Kind(_vlm_answers, _read_vlm_answer),
@@ -493,7 +493,7 @@ if _is_installed('rclpy'):
             partial(list, [None]),
             lambda message, _, key=key: message and send(key, message),
             damage=partial(_damaged, key),
-            share=20.0,
+            share=4.0,
         )
         for key in DAMAGE
     }

@@ -4,19 +4,23 @@ Every case is made from a seed that is printed: `--seed N --kind K --case C` rep
 rejected with an error of the package, or survived (read). Anything else (another error, more time
 or memory than the budget, a plan that would be imagined from implausible input) is a failure: it
 is printed, and the exit status is 1. Each kind runs in a process of its own, whose memory is
-limited. The first cases of a kind are those of the corpus, which once were accidents.
+limited. With `--json FILE`, what was interrupted goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 import json
 import multiprocessing
+import os
 from pathlib import Path
+import queue
 import resource
 import signal
+import subprocess
 import tempfile
 import time
 import traceback
@@ -29,6 +33,10 @@ from mtv_world_ros.errors import MtvWorldError
 
 #: a process that takes more memory ends
 MOST_BYTES = 2 * 2**30
+#: one that says nothing for this long hangs [s]: no signal ended it
+MOST_SILENT_S = 150 * MOST_S
+#: rows are kept this often [s]
+SAVE_S = 5.0
 
 
 class Outcome(NamedTuple):
@@ -80,16 +88,17 @@ def warm_up(kind: Kind, samples: list[Any], folder: Path) -> None:
         kind.read(make_case(kind, samples, 0, 0), folder)
 
 
-def _run(name: str, seed: int, count: int, only: int | None, results: Any) -> None:
+def _run(name: str, seed: int, cases: Iterable[int], results: Any) -> None:
     """Tries the cases of a kind; puts (case, outcome) into the queue, at last None."""
     kind = KINDS[name]
     samples = kind.samples()
+    silence()
     with tempfile.TemporaryDirectory() as folder:
         warm_up(kind, samples, Path(folder))
         base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         used = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES, used + MOST_BYTES))
-        for case in range(count) if only is None else (only,):
+        for case in cases:
             data = make_case(kind, samples, seed, case)
             results.put((case, None))
             outcome, seconds = attempt(kind, data, Path(folder))
@@ -98,39 +107,89 @@ def _run(name: str, seed: int, count: int, only: int | None, results: Any) -> No
     results.put(None)
 
 
-def fuzz(name: str, seed: int, count: int, only: int | None = None) -> dict[str, Any]:
-    """Tries cases of a kind; returns a row of the table and the failures.
+def silence() -> None:
+    """Libraries say of every damaged file what they think of it: thousands of lines."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    os.close(null)
 
-    A process that dies costs its case, and another goes on after it.
+
+def new_row(name: str, seed: int) -> dict[str, Any]:
+    """The row of a kind of which no case was tried."""
+    counts: dict[str, Any] = dict.fromkeys(('tried', 'rejected', 'survived'), 0)
+    return {'kind': name, 'seed': seed, 'commit': commit(), **counts} | {
+        'worst_s': 0.0, 'worst_mb': 0.0, 'wall_s': 0.0, 'failures': {}
+    }  # fmt: skip
+
+
+def commit() -> str:
+    """Short name of the commit that is tried; a + says that files were changed."""
+    words = ['git', '-C', str(Path(__file__).parent), 'describe', '--always', '--dirty=+']
+    return subprocess.run(words, capture_output=True, text=True).stdout.strip()
+
+
+def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: None) -> None:
+    """Tries cases of a kind and adds what became of them to its row.
+
+    A process that dies or hangs costs its case, and another goes on after it.
+
+    Args:
+        row: of `new_row`, or of an earlier call.
+        cases: numbers.
+        save: called now and then.
     """
     spawn = multiprocessing.get_context('spawn')
-    results = spawn.Queue()
-    row: dict[str, Any] = {'kind': name, 'tried': 0, 'rejected': 0, 'survived': 0}
-    row |= {'worst_s': 0.0, 'worst_mb': 0.0, 'failures': {}}
-    process = spawn.Process(target=_run, args=(name, seed, count, only, results), daemon=True)
-    process.start()
-    current = None
+    while cases:
+        results = spawn.Queue()
+        words = (row['kind'], row['seed'], cases, results)
+        process = spawn.Process(target=_run, args=words, daemon=True)
+        process.start()
+        last = _collect(row, process, results, save)
+        process.kill()
+        process.join()
+        if last is None:
+            break
+        row['failures'][str(last)] = 'the process hung or died'
+        row['tried'] += 1
+        cases = range(last + 1, cases.stop)
+
+
+def _collect(
+    row: dict[str, Any], process: Any, results: Any, save: Callable[[], None]
+) -> int | None:
+    """Adds outcomes to the row; the case with which the process died or hung, or None."""
+    current = row['tried']
+    saved = begin = time.monotonic()
+    silent_s = 0.0
     while True:
         try:
-            item = results.get(timeout=120 * MOST_S)
-        except Exception:  # empty: it hangs so that no signal ends it
-            process.kill()
-            row['failures'][current] = 'the process hung or died'
-            break
+            item = results.get(timeout=1.0)
+        except queue.Empty:
+            silent_s += 1.0
+            if process.is_alive() and silent_s < MOST_SILENT_S:
+                continue
+            return current
+        silent_s = 0.0
         if item is None:
-            break
+            row['wall_s'] += time.monotonic() - begin
+            return None
         current, outcome = item
-        if outcome is None:
-            continue
-        row['tried'] += 1
-        row['worst_s'] = max(row['worst_s'], outcome.seconds)
-        row['worst_mb'] = max(row['worst_mb'], outcome.megabytes)
-        if outcome.name in ('rejected', 'survived'):
-            row[outcome.name] += 1
-        else:
-            row['failures'][current] = outcome.name
-    process.join(10)
-    return row
+        if outcome is not None:
+            _add(row, current, outcome)
+        if time.monotonic() - saved > SAVE_S:
+            row['wall_s'] += time.monotonic() - begin
+            saved = begin = time.monotonic()
+            save()
+
+
+def _add(row: dict[str, Any], case: int, outcome: Outcome) -> None:
+    row['tried'] += 1
+    row['worst_s'] = max(row['worst_s'], outcome.seconds)
+    row['worst_mb'] = max(row['worst_mb'], outcome.megabytes)
+    if outcome.name in ('rejected', 'survived'):
+        row[outcome.name] += 1
+    else:
+        row['failures'][str(case)] = outcome.name
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -153,23 +212,40 @@ def main() -> int:
         '--count',
         type=int,
         default=500,
-        help='cases a kind; fewer of slow kinds, 20 times as many messages',
+        help='cases a kind; a tenth of checkpoints, four times as many messages',
     )
     parser.add_argument('--kind', nargs='+', choices=KINDS, default=list(KINDS))
     parser.add_argument('--case', type=int, help='try this case alone')
-    parser.add_argument('--json', type=Path, help='write the rows here')
+    parser.add_argument(
+        '--json', type=Path, help='keep the rows here; what is there already is not tried again'
+    )
     arguments = parser.parse_args()
-    print(f'seed {arguments.seed}', flush=True)
-    rows = []
+    rows = _stored(arguments.json)
     for name in arguments.kind:
+        row = rows.setdefault(name, new_row(name, arguments.seed))
+        print(f"seed {row['seed']}, kind '{name}'", flush=True)
         count = max(round(arguments.count * KINDS[name].share), 1)
-        rows.append(fuzz(name, arguments.seed, count, arguments.case))
-        for case, text in rows[-1]['failures'].items():
-            print(f"--seed {arguments.seed} --kind '{name}' --case {case}\n{text}", flush=True)
-    print(table(rows))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=1))
-    return int(any(row['failures'] for row in rows))
+        if arguments.case is not None:
+            fuzz(row, range(arguments.case, arguments.case + 1))
+        else:
+            fuzz(row, range(row['tried'], count), partial(_store, arguments.json, rows))
+        _store(arguments.json, rows)
+        for case, text in row['failures'].items():
+            print(f"--seed {row['seed']} --kind '{name}' --case {case}\n{text}", flush=True)
+    print(table(list(rows.values())))
+    return int(any(row['failures'] for row in rows.values()))
+
+
+def _stored(file: Path | None) -> dict[str, dict[str, Any]]:
+    rows = json.loads(file.read_text()) if file is not None and file.is_file() else []
+    return {row['kind']: row for row in rows}
+
+
+def _store(file: Path | None, rows: dict[str, dict[str, Any]]) -> None:
+    if file is not None:
+        part = file.with_suffix('.part')
+        part.write_text(json.dumps(list(rows.values()), indent=1))
+        part.replace(file)
 
 
 if __name__ == '__main__':

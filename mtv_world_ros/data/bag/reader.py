@@ -25,6 +25,7 @@ from mtv_world_ros.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+_SQLITE_MAGIC = b'SQLite format 3\0'
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<QQQII')
@@ -164,29 +165,37 @@ class BagReader:
         self, plain: Path, file: Path, topics: Collection[str] | None
     ) -> Iterator[BagMessage]:
         """Messages of a rosbag2_storage_sqlite3 file, read in the order they were recorded."""
-        if not plain.read_bytes()[:16].startswith(b'SQLite format 3\0'):
-            raise EpisodeError(f"'{file}' is not an SQLite file")
+        with plain.open('rb') as stream:
+            if stream.read(len(_SQLITE_MAGIC)) != _SQLITE_MAGIC:
+                raise EpisodeError(f"'{file}' is not an SQLite file")
         try:
-            with closing(_open_sqlite(plain)) as database:
-                declared = database.execute(
-                    'SELECT id, name, type, serialization_format FROM topics'
-                ).fetchall()
-                known = {}
-                for number, name, msgtype, encoding in declared:
-                    if encoding not in ('', 'cdr'):
-                        self._problem(f"'{name}' was left out: it is encoded as '{encoding}'")
-                    elif topics is None or name in topics:
-                        known[number] = name, msgtype
-                wanted = ', '.join(str(int(number)) for number in known)
+            with closing(_open_sqlite(plain, self._most_bytes)) as database:
+                known = self._sqlite_topics(database, topics)
+                wanted = ', '.join(str(number) for number in known)
                 rows = database.execute(
                     'SELECT topic_id, timestamp, data FROM messages '
                     f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
                 )
-                for number, stamp, data in rows:
+                for row in rows:
+                    number, stamp, data = _typed(row, int, int, bytes)
                     name, msgtype = known[number]
-                    yield BagMessage(name, msgtype, stamp, bytes(data))
-        except sqlite3.DatabaseError as error:
+                    yield BagMessage(name, msgtype, stamp, data)
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             raise _Cut(str(error)) from error
+
+    def _sqlite_topics(
+        self, database: sqlite3.Connection, topics: Collection[str] | None
+    ) -> dict[int, tuple[str, str]]:
+        """Name and message type by number in the table of topics."""
+        found = {}
+        rows = database.execute('SELECT id, name, type, serialization_format FROM topics')
+        for row in rows:
+            number, name, msgtype, encoding = _typed(row, int, str, str, str)
+            if encoding not in ('', 'cdr'):
+                self._problem(f"'{name}' was left out: it is encoded as '{encoding}'")
+            elif topics is None or name in topics:
+                found[number] = name, msgtype
+        return found
 
     def _mcap(
         self, plain: Path, file: Path, topics: Collection[str] | None
@@ -305,11 +314,28 @@ def _is_storage(file: Path) -> bool:
     return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
 
 
-def _open_sqlite(file: Path) -> sqlite3.Connection:
+def _open_sqlite(file: Path, most_bytes: int) -> sqlite3.Connection:
     """Opens it without writing beside it, unless a recorder that was killed left its journal."""
     journal = file.with_name(f'{file.name}-wal')
     mode = 'ro' if journal.is_file() and journal.stat().st_size else 'ro&immutable=1'
-    return sqlite3.connect(f'{file.resolve().as_uri()}?mode={mode}', uri=True)
+    database = sqlite3.connect(f'{file.resolve().as_uri()}?mode={mode}', uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
+    # a view in their place could compute without end
+    for name, kind in database.execute(
+        "SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"
+    ):
+        if kind != 'table':
+            database.close()
+            raise _Cut(f"'{name}' is a {kind}, not a table")
+    return database
+
+
+def _typed(row: tuple[Any, ...], *types: type) -> tuple[Any, ...]:
+    """The values of a row; SQLite keeps whatever type was put into a column."""
+    for value, kind in zip(row, types, strict=True):
+        if not isinstance(value, kind):
+            raise _Cut(f'a row holds {type(value).__name__} where {kind.__name__} belongs')
+    return row
 
 
 @contextmanager
