@@ -8,14 +8,21 @@ limit that is too low for you is raised with an environment variable, e.g.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 import errno
+from io import BytesIO
 import json
+import math
 import os
 from pathlib import Path
 import stat
-from typing import Any
+import struct
+from typing import Any, BinaryIO
+import zipfile
+import zlib
 
+import numpy as np
 import yaml
 
 from mtv_world_ros.errors import ConfigError
@@ -45,7 +52,7 @@ class Limits:
         trajectory_points: in a message.
         instruction_characters: of an instruction.
         answer_bytes: of an answer of a policy server or of a language model.
-        array_bytes: of an array in an answer.
+        array_bytes: of an array in an answer, and of all arrays in a file, inflated.
     """
 
     yaml_bytes: int = 4 * 2**20
@@ -125,6 +132,14 @@ def read_bytes(path: Path | str, limit: str) -> bytes:
         OSError: it cannot be read, or is no regular file.
         LimitError: it is too large.
     """
+    with _open_regular(path) as (file, size):
+        check_limit(limit, size, f"'{path}'")
+        return file.read(size)
+
+
+@contextmanager
+def _open_regular(path: Path | str) -> Iterator[tuple[BinaryIO, int]]:
+    """The file and its size [bytes]; OSError if it is no regular one."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with open(descriptor, 'rb') as file:
         status = os.fstat(descriptor)
@@ -132,8 +147,7 @@ def read_bytes(path: Path | str, limit: str) -> bytes:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, 'it is no regular file', str(path))
-        check_limit(limit, status.st_size, f"'{path}'")
-        return file.read(status.st_size)
+        yield file, status.st_size
 
 
 def read_text(path: Path | str, limit: str) -> str:
@@ -161,6 +175,47 @@ def parse_json(text: str | bytes, what: str) -> Any:
         return json.loads(text)
     except RecursionError:
         raise LimitError(f'{what} is nested too deeply') from None
+
+
+def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:
+    """Returns the arrays of an .npz file by name.
+
+    Args:
+        path: the file.
+        limit: name of the field of `Limits` for all of them together, inflated.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file.
+        ValueError: it is too large once inflated, damaged, or holds objects (pickles).
+    """
+    try:
+        with _open_regular(path) as (file, _), zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            check_limit(limit, sum(member.file_size for member in members), f"'{path}', inflated,")
+            return {
+                member.filename.removesuffix('.npy'): _array(archive.read(member))
+                for member in members
+            }
+    except (
+        zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError,
+        ArithmeticError, SyntaxError, MemoryError, LookupError, TypeError,
+    ) as error:  # fmt: skip
+        raise ValueError(f'{type(error).__name__}: {error}') from error
+
+
+def _array(data: bytes) -> np.ndarray:
+    """An array of as many bytes as it says it has."""
+    stream = BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    size = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or min(shape, default=0) < 0 or size != len(data) - stream.tell():
+        raise ValueError(f'an array of shape {shape} and type {dtype} in {len(data)} bytes')
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def parse_yaml(text: str | bytes) -> Any:

@@ -12,11 +12,10 @@ import hashlib
 from io import BytesIO
 import json
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
-from mtv_world_ros.bounded_input import parse_json
+from mtv_world_ros.bounded_input import parse_json, read_arrays
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
@@ -367,7 +366,7 @@ def cached_recording(
     """
     stored = cache / f'{_key(path, spec, robot, source)}.npz'
     if stored.is_file():
-        with suppress(OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile):
+        with suppress(OSError, ValueError, LookupError, TypeError):
             return _load(stored, path)  # where it is damaged it is made anew
     recording = load_recording(path, spec, robot, source=source)
     archive = BytesIO()
@@ -430,35 +429,34 @@ def _save(file: BytesIO, recording: Recording) -> None:
 
 
 def _load(file: Path, path: Path) -> Recording:
-    with np.load(file, allow_pickle=False) as stored:
-        text = parse_json(str(stored['text']), f"'{file}'")
-        cameras = tuple(
-            CameraModel(
-                K=stored[f'K_{i}'],
-                distortion=stored[f'distortion_{i}'],
-                T_mount_camera=stored[f'pose_{i}'],
-                **row,
-            )
-            for i, row in enumerate(text['cameras'])
+    stored = read_arrays(file, 'video_bytes')
+    text = parse_json(str(stored['text']), f"'{file}'")
+    cameras = tuple(
+        CameraModel(
+            K=stored[f'K_{i}'],
+            distortion=stored[f'distortion_{i}'],
+            T_mount_camera=stored[f'pose_{i}'],
+            **row,
         )
-        names = stored.files
-        return Recording(
-            path=Path(path),
-            task=text['task'],
-            outcome=text['outcome'],
-            instruction=text['instruction'],
-            objects=tuple(text['objects']),
-            cameras=cameras,
-            times=stored['times'],
-            frames=stored['frames'],
-            object_ids=stored['object_ids'] if 'object_ids' in names else None,
-            positions=stored['positions'],
-            commands=JointTrajectory(
-                joint_names=text['joint_names'],
-                times=stored['command_times'],
-                positions=stored['command_positions'],
-                velocities=stored['command_velocities'] if 'command_velocities' in names else None,
-            ),
-            stamp_ns=text['stamp_ns'],
-            object_poses=stored['object_poses'] if 'object_poses' in names else None,
-        )
+        for i, row in enumerate(text['cameras'])
+    )
+    return Recording(
+        path=Path(path),
+        task=text['task'],
+        outcome=text['outcome'],
+        instruction=text['instruction'],
+        objects=tuple(text['objects']),
+        cameras=cameras,
+        times=stored['times'],
+        frames=stored['frames'],
+        object_ids=stored.get('object_ids'),
+        positions=stored['positions'],
+        commands=JointTrajectory(
+            joint_names=text['joint_names'],
+            times=stored['command_times'],
+            positions=stored['command_positions'],
+            velocities=stored.get('command_velocities'),
+        ),
+        stamp_ns=text['stamp_ns'],
+        object_poses=stored.get('object_poses'),
+    )

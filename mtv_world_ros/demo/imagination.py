@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-import json
 import os
 from pathlib import Path
 import shutil
@@ -13,6 +12,7 @@ import subprocess
 import time
 
 from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
@@ -107,7 +107,12 @@ def imagine_episodes(
         raise EpisodeError(
             f"the episode runner ended with status {status}: {text} (logs are in '{logs}')"
         )
-    return json.loads((out / 'episodes.json').read_text())
+    try:
+        return list(read_json(out / 'episodes.json'))
+    except (OSError, ValueError, TypeError) as error:
+        raise EpisodeError(
+            f"what the episode runner wrote cannot be read: {error} (logs are in '{logs}')"
+        ) from error
 
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from io import BytesIO
+import math
 from pathlib import Path
 from typing import Any
-import zipfile
 
 import numpy as np
 
+from mtv_world_ros.bounded_input import read_arrays
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
@@ -239,10 +240,8 @@ def load_rollout(path: Path) -> StoredRollout:
         EpisodeError: it is not there or cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            held = dict(file)
-        return _unpacked(held)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, EpisodeError) as error:
+        return _unpacked(read_arrays(path))
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, EpisodeError) as error:
         raise EpisodeError(
             f"rollout '{path}' cannot be read ({error}); evaluate the episode again"
         ) from error
@@ -258,8 +257,11 @@ def _unpacked(held: dict[str, Any]) -> StoredRollout:
         stacked = decode_video(held[name].tobytes())
         frames = stacked.reshape(num_frames, num_views, height, width, 3)
         read[name] = frames.swapaxes(0, 1)
+    num_bits = math.prod(masks)
     for name in _MASKS:
-        bits = np.unpackbits(held[name], count=int(np.prod(masks)))
+        if min(masks) < 0 or held[name].size != math.ceil(num_bits / 8):
+            raise ValueError(f"'{name}' has {held[name].size} bytes for masks of shape {masks}")
+        bits = np.unpackbits(held[name], count=num_bits)
         read[name] = bits.reshape(masks).astype(bool)
     views = tuple(map(str, held['views']))
     return StoredRollout(views=views, objects=objects, fps=float(held['fps']), **read)

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot import Mimic
@@ -271,7 +272,8 @@ class _Hand:
 
 def _finger_points(model: pin.Model, urdf: Path, arm: _Arm) -> dict[int, FloatArray]:
     """Points of the finger links' shapes in their joints' frames; empty where one has none."""
-    links = {link.get('name'): link for link in ElementTree.parse(urdf).iter('link')}
+    root = ElementTree.fromstring(read_text(urdf, 'urdf_bytes'))
+    links = {link.get('name'): link for link in root.iter('link')}
     found = {}
     for joint in arm.fingers:
         points = []

@@ -79,7 +79,10 @@ def load_shape(robot: RobotModel) -> RobotShape:
     if urdf is None:
         return rods(robot, 'the robot is given by a table')
     path = robot.file.parent / str(urdf)
-    links = {link.attrib['name']: link for link in ElementTree.parse(path).iter('link')}
+    links = {
+        link.attrib['name']: link
+        for link in ElementTree.fromstring(read_text(path, 'urdf_bytes')).iter('link')
+    }
     found = {name: link_shapes(link, path) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)

@@ -13,12 +13,12 @@ from typing import Any
 
 import av
 from av.container import InputContainer
-import cv2
 import numpy as np
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_json, read_text
+from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data_types import ByteArray, FloatArray
-from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.errors import ConfigError, EpisodeError, nearest, ObservationError
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
 _INFO = Path('meta/info.json')
@@ -89,7 +89,7 @@ class LeRobotDataset:
             read = self._episodes_v3 if self.version == 'v3.0' else self._episodes_v2
             self.episodes = {entry.index: entry for entry in read()}
             self.tasks = self._tasks_v3() if self.version == 'v3.0' else self._tasks_v2()
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise EpisodeError(
                 f"'{root / 'meta'}' is not what format {self.version} has there: "
                 f'{type(error).__name__}: {error}'
@@ -166,7 +166,7 @@ class LeRobotDataset:
             raise EpisodeError(f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there")
         try:
             info = read_json(file)
-        except ValueError as error:
+        except (OSError, ValueError) as error:
             raise EpisodeError(f"'{file}' is not JSON: {error}") from error
         if not isinstance(info, Mapping):
             raise EpisodeError(f"'{file}' must hold keys and values")
@@ -260,10 +260,13 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': '{feature}' holds no image bytes, but {type(cell).__name__}"
             )
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise EpisodeError(f"'{entry.data_file}': an image of '{feature}' is damaged")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+        layout = 'png' if data[:4] == b'\x89PNG' else 'jpeg'
+        try:
+            return compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
+        except ObservationError as error:
+            raise EpisodeError(
+                f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
+            ) from error
 
 
 def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:

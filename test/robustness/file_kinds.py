@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 from contextlib import closing
 from functools import cache, partial
 import importlib.util
-import json
 import os
 from pathlib import Path
 import pickle
@@ -19,6 +18,7 @@ import tempfile
 from typing import Any, NamedTuple
 
 import cv2
+from folder_kinds import answers, FOLDERS, parts, with_part
 from node_messages import DAMAGE, damaged, send
 import numpy as np
 
@@ -66,6 +66,12 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _mutated_sample(samples: list[Any], rng: np.random.Generator) -> bytes:
     return mutated(samples[rng.integers(len(samples))], rng)
+
+
+def _mutated_content(samples: list[Any], rng: np.random.Generator) -> bytes:
+    """Of a file that stands behind its name, which stays."""
+    name, _, content = samples[rng.integers(len(samples))].partition(b'\n')
+    return name + b'\n' + mutated(content, rng)
 
 
 class Kind(NamedTuple):
@@ -239,9 +245,7 @@ def _load_checkpoint(data: bytes, folder: Path) -> Any:
 
     name, _, content = data.partition(b'\n')
     source = share_path('resource', 'checkpoint')
-    path = name.decode(errors='replace')
-    if path not in {str(file.relative_to(source)) for file in source.rglob('*.json')}:
-        raise MtvWorldError('the name of the file was changed')
+    path = name.decode()
     shutil.rmtree(folder / 'copy', ignore_errors=True)
     shutil.copytree(source, folder / 'copy', copy_function=os.symlink)
     (folder / 'copy' / path).unlink()
@@ -344,10 +348,6 @@ def _read_objects(data: bytes, folder: Path) -> Any:
     return load_object_list(_file(folder / 'objects.yaml', data))
 
 
-def _vlm_answers() -> list[bytes]:
-    return [b'{"objects": [{"name": "red block", "colour": "red"}, {"name": "plate"}]}']
-
-
 def _read_vlm_answer(data: bytes, _: Path) -> Any:
     from mtv_world_ros.vision.describers.vlm import read_answer
 
@@ -379,12 +379,6 @@ def _read_features(data: bytes, folder: Path) -> Any:
     return load_features(_file(folder / 'features.npz', data))
 
 
-def _read_rollout(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.evaluation.results import load_rollout
-
-    return load_rollout(_file(folder / 'rollout.npz', data))
-
-
 def _videos() -> list[bytes]:
     from mtv_world_ros.evaluation.video import encode_video
 
@@ -395,18 +389,6 @@ def _read_video(data: bytes, _: Path) -> Any:
     from mtv_world_ros.evaluation.video import decode_video
 
     return decode_video(data)
-
-
-def _evaluations() -> list[bytes]:
-    metrics = {'label': 'a', 'episodes': [], 'checkpoint': 'bundled', 'views': ['low', 'high']}
-    return [json.dumps(metrics).encode()]
-
-
-def _read_evaluation(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.evaluation.report.read_back import read_evaluations
-
-    _file(folder / 'metrics.json', data)
-    return read_evaluations(folder)
 
 
 def _weights() -> list[bytes]:
@@ -440,8 +422,6 @@ def _read_network(data: bytes, folder: Path) -> Any:
     return load_network(folder / 'motion')
 
 
-#: what an undamaged sample is refused for
-INCOMPLETE = ('evaluation', 'rollout', 'answer, language model')
 KINDS = {
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
@@ -466,17 +446,29 @@ KINDS = {
     'metadata': Kind(_metadata, _read_metadata),
     'training state': Kind(_trees, _read_state_card),
     'features': Kind(_features, _read_features),
-    'rollout': Kind(_features, _read_rollout),
-    'evaluation': Kind(_evaluations, _read_evaluation),
     'weights': Kind(_weights, _read_weights),
     'object motion': Kind(_networks, _read_network),
-    'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, share=0.1),
+    'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, _mutated_content, 0.1),
     'instruction': Kind(_instructions, _match),
     'answer, msgpack': Kind(_answers, _read_answer),
     'answer, pickle': Kind(_pickles, _read_pickle),
-    'answer, language model': Kind(_vlm_answers, _read_vlm_answer),
+    'answer, language model': Kind(answers, _read_vlm_answer),
     'message, CDR': Kind(_messages, _read_message),
 }  # fmt: skip
+
+
+def _read_folder(make: Any, read: Callable[[Path], Any], data: bytes, folder: Path) -> Any:
+    return read(with_part(make, data, folder))
+
+
+KINDS |= {
+    name: Kind(
+        partial(parts, make, *endings),
+        partial(_read_folder, make, read),
+        damage=_mutated_content,
+    )
+    for name, (make, endings, read) in FOLDERS.items()
+}
 
 
 def _is_installed(package: str) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import suppress
 import json
 import multiprocessing
 import os
@@ -28,6 +29,7 @@ from rosbags.highlevel import AnyReader
 
 from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.ros.bags.raw_headers import read_stamp
 
 sys.path.insert(0, str(ROOT / 'test' / 'ros'))
 
@@ -99,6 +101,8 @@ class Kills:
         self._sent: list[int] = []
         self._client.node.create_timer(PERIOD_S, self._publish)
         self._heard = 0
+        #: longest that a thread of the process waited for a processor, while it was at work
+        self._starved_s = 0.0
         self._client.node.create_subscription(
             ros().JOINT_STATE, '/joint_states', lambda _: self._hear(), 10
         )
@@ -119,8 +123,10 @@ class Kills:
         self._sent.clear()
         if not is_starting:
             self._client.wait(lambda: is_ready(self, log) or process.exitcode is not None, name)
+        starved_s = _waited_s(process.pid)
         self._client.spin_for(after_s)
         problem = '' if process.exitcode is None else f'it had ended with {process.exitcode}'
+        self._starved_s = _waited_s(process.pid) - starved_s
         process.kill()
         killed_ns = time.time_ns()
         process.join(10)
@@ -138,9 +144,9 @@ class Kills:
         self._client.close()
 
     def _publish(self) -> None:
-        message = ros().make_joint_state(time.time_ns())
-        self._joints.publish(message)
-        self._sent.append(time.time_ns())
+        stamp_ns = time.time_ns()
+        self._sent.append(stamp_ns)
+        self._joints.publish(ros().make_joint_state(stamp_ns))
 
     def _hear(self) -> None:
         self._heard += 1
@@ -193,14 +199,18 @@ class Kills:
         sent = [at for at in self._sent if begin_ns < at < killed_ns]
         # where the machine stops everything for a while, messages are older before they are sent
         age_s = 1.0 + max(np.diff([begin_ns, *sent, killed_ns]), default=0) / 1e9
+        age_s += self._starved_s
         until = killed_ns - round(age_s * 1e9)
         bags = [recover(source) for source in find_damaged(self._out / 'bag')]
         with AnyReader([bags[0].path]) as bag:
-            times = [stamp for _, stamp, _ in bag.messages()]
+            got = {read_stamp(data) for _, _, data in bag.messages()}
         due = [at for at in sent if at < until]
-        got = sum(at < until for at in times)
-        # a message is sent a little before it is recorded: the one at either end may be left out
-        assert got >= len(due) - 2, f'{got} of {len(due)} messages older than {age_s:.2f} s'
+        lost = [index for index, at in enumerate(due) if at not in got]
+        assert not lost, (
+            f'{len(lost)} of {len(due)} messages older than {age_s:.2f} s are lost: {lost[:20]}; '
+            f'{len(got)} are there, {sum(at < begin_ns for at in got)} from before it began; '
+            f'a thread of it waited {self._starved_s:.2f} s for a processor'
+        )
 
     def says(self, text: str, log: Path) -> bool:
         """Whether the log has the text."""
@@ -262,6 +272,15 @@ class Kills:
             process.kill()
             process.join(10)
             self._client.forget_node()
+
+
+def _waited_s(pid: int) -> float:
+    """The longest that a thread of a process waited for a processor so far [s]."""
+    waits = [0]
+    for file in Path(f'/proc/{pid}/task').glob('*/schedstat'):
+        with suppress(OSError):  # it ended
+            waits.append(int(file.read_text().split()[1]))
+    return max(waits) / 1e9
 
 
 def _nothing(*_: object) -> None:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-import zipfile
 
 import numpy as np
 
+from mtv_world_ros.bounded_input import read_arrays
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.frechet.features import ClipFeatures, FrameFeatures
@@ -174,9 +174,8 @@ def load_features(path: Path) -> dict[str, FloatArray]:
     if not path.is_file():
         return {}
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        return read_arrays(path)
+    except (OSError, ValueError) as error:
         raise EpisodeError(
             f"features '{path}' cannot be read ({error}); remove the file and evaluate again"
         ) from error
