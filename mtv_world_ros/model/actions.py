@@ -340,5 +340,8 @@ class FastTokenizer:
         """The inverse of `as_json`."""
         from tokenizers import Tokenizer
 
-        tokenizer = Tokenizer.from_str(json.dumps(values['tokenizer']))
+        try:
+            tokenizer = Tokenizer.from_str(json.dumps(values['tokenizer']))
+        except Exception as error:  # the library raises nothing narrower
+            raise ValueError(f'the tokenizer cannot be used: {error}') from error
         return FastTokenizer(tokenizer, int(values['smallest']), int(values['largest']))

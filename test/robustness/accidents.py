@@ -6,6 +6,7 @@ from array import array
 from collections.abc import Callable
 from contextlib import closing
 import io
+import json
 from pathlib import Path
 import sqlite3
 import struct
@@ -85,6 +86,14 @@ def chunk_bomb() -> bytes:
     body = struct.pack('<QQQI', 0, 1, 100, 0) + struct.pack('<I', 4) + b'zstd'
     body += struct.pack('<Q', len(packed)) + packed
     return stream.getvalue() + b'\x06' + struct.pack('<Q', len(body)) + body
+
+
+def foreign_token() -> bytes:
+    """A tokenizer that merges a token which it does not have."""
+    name, _, content = KINDS['action statistics'].samples()[-1].partition(b'\n')
+    values = json.loads(content)
+    values['tokenizer']['model']['merges'][0] = ['?', '?']
+    return name + b'\n' + json.dumps(values).encode()
 
 
 def sqlite_bag(statement: str = '') -> bytes:
@@ -195,6 +204,7 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         lambda: sqlite_bag("UPDATE messages SET timestamp = 'x'"),
     ),
     'SQLite messages without end': ('bag, sqlite3', endless_view),
+    'token that is not in the vocabulary': ('action statistics', foreign_token),
     'nested answer': ('answer, msgpack', nested_answer),
     'vast answer': ('answer, msgpack', vast_answer),
     'tensor of stride 0': ('answer, pickle', stride_zero),
