@@ -20,13 +20,13 @@ from pathlib import Path
 import queue
 import resource
 import signal
-import subprocess
 import tempfile
 import time
 import traceback
 from typing import Any, NamedTuple
 
 from file_kinds import Kind, KINDS, MOST_S
+from node_messages import commit
 import numpy as np
 
 from mtv_world_ros.errors import MtvWorldError
@@ -120,12 +120,6 @@ def new_row(name: str, seed: int) -> dict[str, Any]:
     return {'kind': name, 'seed': seed, 'commit': commit(), **counts} | {
         'worst_s': 0.0, 'worst_mb': 0.0, 'wall_s': 0.0, 'failures': {}
     }  # fmt: skip
-
-
-def commit() -> str:
-    """Short name of the commit that is tried; a + says that files were changed."""
-    words = ['git', '-C', str(Path(__file__).parent), 'describe', '--always', '--dirty=+']
-    return subprocess.run(words, capture_output=True, text=True).stdout.strip()
 
 
 def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: None) -> None:

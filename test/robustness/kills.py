@@ -5,7 +5,8 @@ a killed recording is recovered and read by rosbags, and the node that is starte
 one answers a plan with one end. The processes are forked from one that has imported everything
 (so that starting hundreds is cheap), and are killed up to
 `--longest` seconds after their start, or after they are at work.
-Prints a table; the exit status is 1 if anything was lost, hung or ended with a traceback.
+Prints a table; the exit status is 1 if anything was lost, hung or ended with a traceback. What was
+interrupted goes on where it was, if it is called with the same `--out`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import sys
 import time
 from typing import Any, NamedTuple
 
-from node_messages import ROOT, ros
+from node_messages import commit, ROOT, ros
 import numpy as np
 from rosbags.highlevel import AnyReader
 
@@ -91,7 +92,7 @@ class Kills:
 
     def __init__(self, out: Path, seed: int, longest_s: float) -> None:
         self._out, self._longest_s = out, longest_s
-        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         here = Path(__file__).parent  # the fork server looks for its modules there
         os.environ['PYTHONPATH'] = os.pathsep.join([str(here), str(ROOT)])
         self._context = multiprocessing.get_context('forkserver')
@@ -111,10 +112,11 @@ class Kills:
         if not (out / 'checkpoint').exists():
             ros().make_checkpoint(out / 'checkpoint')
 
-    def kill(self, name: str) -> Killed:
-        """Starts and kills one of `VICTIMS`."""
-        after_s = float(self._rng.uniform(0, self._longest_s))
-        is_starting = self._rng.random() < STARTING
+    def kill(self, name: str, number: int) -> Killed:
+        """Starts and kills one of `VICTIMS`, at the moment that belongs to the number."""
+        rng = np.random.default_rng([self._seed, number])
+        after_s = float(rng.uniform(0, self._longest_s))
+        is_starting = rng.random() < STARTING
         prepare, words, is_ready, check = VICTIMS[name]
         self._heard = 0
         prepare(self)
@@ -316,28 +318,30 @@ def main() -> int:
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'kills')
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    file = arguments.out / 'kills.json'
+    rows = {row['kind']: row for row in json.loads(file.read_text())} if file.is_file() else {}
     print(f'seed {arguments.seed}', flush=True)
     kills = Kills(arguments.out, arguments.seed, arguments.longest)
-    found: dict[str, list[Killed]] = {name: [] for name in arguments.only}
-    for number in range(arguments.kills):
+    for number in range(sum(row['tried'] for row in rows.values()), arguments.kills):
         name = arguments.only[number % len(arguments.only)]
-        found[name].append(kills.kill(name))
-        if found[name][-1].problem:
-            print(f'kill {number}, {name}: {found[name][-1].problem}', flush=True)
-        rows = [
-            {
-                'kind': f'kill of {name}',
-                'tried': len(done),
-                'failures': [one.problem for one in done if one.problem],
-                'worst_s': max((one.seconds for one in done), default=0.0),
-            }
-            for name, done in found.items()
-        ]
-        (arguments.out / 'kills.json').write_text(json.dumps(rows, indent=1))
+        row = rows.setdefault(f'kill of {name}', new_row(name, arguments.seed))
+        done = kills.kill(name, number)
+        row['tried'] += 1
+        row['worst_s'] = max(row['worst_s'], done.seconds)
+        if done.problem:
+            row['failures'][str(number)] = done.problem
+            print(f'kill {number}, {name}: {done.problem}', flush=True)
+        file.write_text(json.dumps(list(rows.values()), indent=1))
     kills.close()
-    for row in rows:
+    for row in rows.values():
         print(f'{row["kind"]}: {row["tried"]} tried, {len(row["failures"])} failed', flush=True)
-    return int(any(row['failures'] for row in rows))
+    return int(any(row['failures'] for row in rows.values()))
+
+
+def new_row(name: str, seed: int) -> dict[str, Any]:
+    """The row of what was not killed yet."""
+    return {'kind': f'kill of {name}', 'seed': seed, 'commit': commit(), 'tried': 0,
+            'worst_s': 0.0, 'failures': {}}  # fmt: skip
 
 
 if __name__ == '__main__':

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import cache
 import importlib.util
 from pathlib import Path
+import subprocess
 import sys
 from typing import Any
 
@@ -39,6 +40,12 @@ def ros() -> Any:
         sys.modules['ros_client'] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules['ros_client'])
     return sys.modules['ros_client']
+
+
+def commit() -> str:
+    """Short name of the commit that is tried; a + says that files were changed."""
+    words = ['git', '-C', str(ROOT), 'describe', '--always', '--dirty=+']
+    return subprocess.run(words, capture_output=True, text=True).stdout.strip()
 
 
 def number(rng: np.random.Generator) -> float:
