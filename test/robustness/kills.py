@@ -97,16 +97,12 @@ class Kills:
         os.environ['PYTHONPATH'] = os.pathsep.join([str(here), str(ROOT)])
         self._context = multiprocessing.get_context('forkserver')
         self._context.set_forkserver_preload(['kills_preload'])
-        self._client = ros().Client()
-        self._joints = self._client.node.create_publisher(ros().JOINT_STATE, '/joints', 1000)
         self._sent: list[int] = []
-        self._client.node.create_timer(PERIOD_S, self._publish)
         self._heard = 0
         #: longest that a thread of the process waited for a processor, while it was at work
         self._starved_s = 0.0
-        self._client.node.create_subscription(
-            ros().JOINT_STATE, '/joint_states', lambda _: self._hear(), 10
-        )
+        self._client: Any = None
+        self.renew_client()
         self._episode = self._write_episode()
         ros().make_calibration(out / 'calibration.yaml')
         if not (out / 'checkpoint').exists():
@@ -140,6 +136,16 @@ class Kills:
         if 'Traceback' in log.read_text(errors='replace'):
             problem = log.read_text(errors='replace')[-2000:]
         return Killed(after_s, problem, time.monotonic() - begin)
+
+    def renew_client(self) -> None:
+        """One that never knew who was killed: others take 20 s to forget a node."""
+        if self._client is not None:
+            self._client.close()
+        self._client = ros().Client()
+        node = self._client.node
+        self._joints = node.create_publisher(ros().JOINT_STATE, '/joints', 1000)
+        node.create_timer(PERIOD_S, self._publish)
+        node.create_subscription(ros().JOINT_STATE, '/joint_states', lambda _: self._hear(), 10)
 
     def close(self) -> None:
         """Ends the client."""
@@ -261,7 +267,7 @@ class Kills:
 
     def check_node(self, log: Path, killed_ns: int) -> None:
         """Another one answers a plan, with one end."""
-        self._client.forget_node()
+        self.renew_client()
         process = self._start('world_model', self.node_words(), log)
         try:
             self._client.connect_inputs(ros().INPUTS)
@@ -273,7 +279,6 @@ class Kills:
         finally:
             process.kill()
             process.join(10)
-            self._client.forget_node()
 
 
 def _waited_s(pid: int) -> float:
@@ -304,7 +309,7 @@ VICTIMS: dict[str, tuple[Callable[..., Any], ...]] = {
         lambda kills, log: kills.says('ready: ', log),
         _nothing,
     ),
-    'world_model': (_nothing, Kills.node_words, Kills.begin_plan, Kills.check_node),
+    'world_model': (Kills.renew_client, Kills.node_words, Kills.begin_plan, Kills.check_node),
 }
 
 
