@@ -37,17 +37,6 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
     'import-bag': lambda out: [
         'import-bag', str(EPISODE), '--robot', 'yam_bimanual', '--out', str(out / 'episodes')],
     'view': lambda out: ['view', str(EPISODE), '--save', str(out / 'a.rrd')],
-    'evaluate': lambda out: [
-        'evaluate', 'bundled', str(EPISODE.parent), '--out', str(out / 'evaluation'),
-        '--threads', '1', '--no-ceiling', '--actions', 'true'],
-    'demo': lambda out: ['demo', '--out', str(out / 'demo')],
-    'imagine': lambda out: [
-        'imagine', '--episodes', str(EPISODE), '--out', str(out / 'imagined')],
-    'calibrate': lambda out: [
-        'calibrate', 'bundled', str(EPISODE.parent), '--out', str(out / 'c'), '--no-store'],
-    'rank': lambda out: [
-        'rank', '--policies', 'expert', '--tasks', 'stack_blocks_two', '--episodes', '1',
-        '--out', str(out / 'ranking')],
     'recover': lambda out: ['recover', str(EPISODE), '--out', str(out / 'bag')],
     'collect': lambda out: [
         'collect', '--task', 'stack_blocks_two', '--episodes', '1', '--out', str(out / 'set')],
