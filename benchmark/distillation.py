@@ -5,7 +5,8 @@
 
 Distils `--checkpoint` into one student for each number of `--student-steps`, scores the teacher in
 `--teacher-steps` and each student in its own number of steps on held-out episodes, every chunk
-from its recorded start frame, and prints one table. Running it again goes on where it was stopped.
+from its recorded start frame, and prints one table. The models are timed in turns. Running it
+again goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -35,13 +36,14 @@ def student(steps: int, options: argparse.Namespace) -> Path:
     )
 
 
-def row(title: str, checkpoint: str | Path, steps: int, options: argparse.Namespace) -> list[str]:
+def row(
+    title: str, checkpoint: str | Path, steps: int, seconds: float, options: argparse.Namespace
+) -> list[str]:
     """A line of the table."""
     summary = score(
         checkpoint, options.work / 'scores' / title.replace(' ', '_'), options,
         mode='observe', steps=steps,
     )  # fmt: skip
-    seconds = chunk_seconds(checkpoint, options, steps)
     return [title, str(steps), *cells(summary), f'{seconds:.3f}', str(len(summary.results))]
 
 
@@ -59,11 +61,13 @@ def main() -> None:
     students = {
         int(steps): student(int(steps), options) for steps in options.student_steps.split(',')
     }
-    rows = [
-        row(f'teacher {steps}', options.checkpoint, int(steps), options)
+    models: dict[str, tuple[str | Path, int]] = {
+        f'teacher {steps}': (options.checkpoint, int(steps))
         for steps in options.teacher_steps.split(',')
-    ]
-    rows += [row(f'student {steps}', path, steps, options) for steps, path in students.items()]
+    }
+    models |= {f'student {steps}': (path, steps) for steps, path in students.items()}
+    seconds = chunk_seconds(models, options)
+    rows = [row(name, *model, seconds[name], options) for name, model in models.items()]
     options.repeats = int(rows[0][-1])
     publish(
         'distillation',

@@ -110,8 +110,8 @@ INTERVALS: dict[str, Draw] = {
     't, mean over episodes of unequal length': ratio_of_sums,
     'Wilson, share of independent trials': share,
     'Wilson by scene, share of rollouts': share_of_scenes,
-    "jackknife, Pearson's r of policies": r_of_rates,
-    'jackknife, MMRV of policies': mmrv_of_rates,
+    "posterior of the rates, Pearson's r of policies": r_of_rates,
+    'posterior of the rates, MMRV of policies': mmrv_of_rates,
     'prediction-powered rate': powered,
     'before: percentile bootstrap, mean of J': bootstrap_of_j,
 }

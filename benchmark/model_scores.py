@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 import statistics
 
 from control_tables import cell
+from page import in_turns
 
 from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.recording import load_recording
@@ -110,18 +112,43 @@ def cells(summary: Summary) -> list[str]:
 
 
 def chunk_seconds(
-    checkpoint: str | Path, options: argparse.Namespace, steps: int, repeats: int = 5
-) -> float:
-    """Returns the median time of the model for a chunk of the bundled episode [s]."""
+    models: Mapping[str, tuple[str | Path, int]], options: argparse.Namespace, repeats: int = 5
+) -> dict[str, float]:
+    """Returns the median times [s] that models take for a chunk of the bundled episode, in turns.
+
+    Args:
+        models: checkpoint and denoising steps, by name.
+        options: as `add_options` has them.
+        repeats: turns that count.
+    """
+    spent: dict[str, list[float]] = {name: [] for name in models}
+    works = {
+        name: _chunk(checkpoint, options, steps, spent[name])
+        for name, (checkpoint, steps) in models.items()
+    }
+    in_turns(works, repeats)
+    return {name: statistics.median(times[1:]) for name, times in spent.items()}
+
+
+def _chunk(
+    checkpoint: str | Path, options: argparse.Namespace, steps: int, spent: list[float]
+) -> Callable[[], None]:
+    """Returns what imagines a chunk and notes the time of the model [s], another seed each."""
     pipeline = loader(checkpoint, options)()
     recording = load_recording(
         share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
     )
     stretch = stretches(recording, pipeline.spec, 'observe')[0]
-    seconds = [
-        imagine_stretch(
-            pipeline, recording, stretch, actions=recording, seed=seed, num_inference_steps=steps
-        )[0].seconds['model']
-        for seed in range(repeats + 1)
-    ]
-    return statistics.median(seconds[1:])
+
+    def work() -> None:
+        prediction = imagine_stretch(
+            pipeline,
+            recording,
+            stretch,
+            actions=recording,
+            seed=len(spent),
+            num_inference_steps=steps,
+        )[0]
+        spent.append(prediction.seconds['model'])
+
+    return work

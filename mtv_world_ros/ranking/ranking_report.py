@@ -33,8 +33,8 @@ _CEILING = (
     "are the world model's."
 )
 _INTERVALS = (
-    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: jackknife over scenes, each '
-    'left out for all policies and both worlds at once; none below 4 scenes. MMRV weighs '
+    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: of the true rates, of '
+    'which few scenes are a noisy sample; none below 4 scenes or 3 policies. MMRV weighs '
     'a wrongly ranked pair by how far its true rates lie apart; 0 is perfect.'
 )
 

@@ -85,7 +85,8 @@ class Agreement:
     Attributes:
         score: `pearson` or `mmrv`.
         value: NaN where it is not defined, e.g. all rates alike.
-        interval: 95 % jackknife interval over scenes; NaN where these are too few.
+        interval: 95 % interval of the score of the true rates; NaN for too few scenes or
+            policies.
         num_policies: with a rate in both.
     """
 

@@ -5,7 +5,7 @@ An episode is one observation: frames, objects and views of the same episode are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, nan
 
@@ -170,36 +170,3 @@ def clustered_wilson(hits: FloatArray, counts: FloatArray) -> Interval:
     # all alike: nothing says how much the trials of a cluster have in common
     effective = num if simple == 0 else min(total, total * simple / max(variance, 1e-12))
     return wilson(share * effective, effective, float(t_quantile(num - 1)))
-
-
-def jackknife_interval(
-    score: Callable[[FloatArray], float], num: int, *, to: Callable, back: Callable
-) -> Interval:
-    """Returns the 95 % t interval of a score, from its values without each observation in turn.
-
-    The jackknife also tells how far the score of few observations is biased (r of noisy rates is
-    too small): the interval is centred half that far away, and is wider by it.
-
-    Args:
-        score: of (N,) weights of the observations, each 0 or 1.
-        num: N.
-        to: transformation under which the score is about normal, e.g. Fisher's.
-        back: its inverse.
-
-    Returns:
-        (low, high); NaN for fewer than `MIN_SCENES` observations, where the score is not defined,
-        or where no observation changes it.
-    """
-    whole = to(score(np.ones(num)))
-    if num < MIN_SCENES or not np.isfinite(whole):
-        return UNKNOWN
-    without = np.array([to(score(1 - one)) for one in np.eye(num)])
-    without = without[np.isfinite(without)]
-    left = len(without)
-    if left < MIN_SCENES:
-        return UNKNOWN
-    error = np.sqrt((left - 1) / left * ((without - without.mean()) ** 2).sum())
-    bias = (left - 1) * (whole - without.mean())
-    half = float(t_quantile(left - 1)) * np.hypot(error, bias)
-    middle = whole + bias / 2
-    return (float(back(middle - half)), float(back(middle + half))) if error > 1e-9 else UNKNOWN
