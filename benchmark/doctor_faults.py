@@ -1,10 +1,11 @@
 """Which faults of a recording does `mtv-world doctor` find, and which right ones does it pass?
 
-    python benchmark/doctor_faults.py DATASET [DATASET ...] [--repeats 20]
+    python benchmark/doctor_faults.py DATASET [DATASET ...] [--repeats 20] [--minutes 60]
 
 Views of cameras that stand still are judged as they are and with one thing wrong at a time: the
 camera turned about each axis, moved, with a scaled K or another view's calibration, or its clock
 late or early. The episodes' own calibration is taken to be right. The sign of each fault is drawn.
+Data sets take turns, a view each; --minutes ends a run early, with the n it got to.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+import time
 
 import cv2
 import numpy as np
@@ -145,19 +147,34 @@ def fixed_views(inspector: Inspector, path: Path, width: int) -> Episode:
 
 def count(
     dataset: Path, repeats: int, seed: int, width: int
-) -> tuple[str, dict[str, Counter[str]]]:
-    """Returns the robot of a data set, and the verdicts of each fault in `repeats` views."""
+) -> Iterator[tuple[str, dict[str, Counter[str]]]]:
+    """Yields a data set's robot and the verdicts of each fault, after each of `repeats` views."""
     rng, paths = np.random.default_rng(seed), list_episodes(dataset)
     inspector = load_inspector(recorded_robot(paths[0], read_info(paths[0]).robot))
     counts: dict[str, Counter[str]] = {name: Counter() for name in FAULTS}
     for path in rng.permutation(np.array(paths, dtype=object)):
         episode = fixed_views(inspector, path, width)
         for view in episode.views:
-            if counts['as it is'].total() < repeats:
-                for name, verdict in judge(inspector, episode, view, rng):
-                    counts[name][verdict] += 1
-                print(inspector.robot.name, {k: dict(v) for k, v in counts.items()}, flush=True)
-    return inspector.robot.name, counts
+            if counts['as it is'].total() == repeats:
+                return
+            for name, verdict in judge(inspector, episode, view, rng):
+                counts[name][verdict] += 1
+            yield inspector.robot.name, counts
+
+
+def count_all(options: argparse.Namespace) -> dict[str, dict[str, Counter[str]]]:
+    """Returns the counts by robot."""
+    ends = time.monotonic() + 60 * options.minutes
+    left = [count(d, options.repeats, options.seed, options.width) for d in options.datasets]
+    found = {}
+    while left and time.monotonic() < ends:
+        views = [(one, next(one, None)) for one in left]
+        left = [one for one, view in views if view is not None]
+        found.update(view for _, view in views if view is not None)
+        print(
+            {robot: {k: dict(v) for k, v in c.items()} for robot, c in found.items()}, flush=True
+        )
+    return found
 
 
 def main() -> None:
@@ -166,15 +183,14 @@ def main() -> None:
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('datasets', type=Path, nargs='+')
         parser.add_argument('--width', type=int, default=384, help='of the images [px]')
+        parser.add_argument('--minutes', type=float, default=1e9, help='stop starting after that')
 
     options = parse_arguments(__doc__, 20, more)
-    found = dict(
-        count(path, options.repeats, options.seed, options.width) for path in options.datasets
-    )
+    found = count_all(options)
     rows = [[name, *(_cell(name, counts[name]) for counts in found.values())] for name in FAULTS]
     body = (
-        'Views that were judged right: passed (`ok`) as they are, found (`suspicious` or '
-        '`broken`) with a fault; n is the number of views of each robot at most. Images are '
+        'Views as they are that passed (`ok`), and views with a fault that were found '
+        '(`suspicious` or `broken`), of each robot. Images are '
         f'{options.width} px wide; each sign of a fault is as likely.\n\n'
         + table(['the view', *(f'`{name}`' for name in found)], rows)
     )
