@@ -242,8 +242,8 @@ def _in_order(
         add(stamp, 0, writer.write_instruction, stamp, words)
     for stamp, row in zip(stamps.tolist(), positions, strict=True):
         add(stamp, 1, writer.write_joint_states, stamp, robot.joint_names, row)
-    for stamp, trajectory in commands:
-        add(stamp, 2, writer.write_trajectory, stamp, trajectory)
+    for stamp, trajectory in commands:  # after what it starts from, so that it can be played
+        add(stamp, 6, writer.write_trajectory, stamp, trajectory)
     frames = [(v, s, i) for v in episode.views for i, s in enumerate(episode.images[v].stamps_ns)]
     for view, stamp_ns, index in frames:
         stamp = int(stamp_ns)

@@ -176,9 +176,7 @@ def convert_episode(
         stack.enter_context(writer)
         writer.outcome = _outcome(rows, mapping)
         stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
-        commands = _commands(times, commanded, mapping, dataset.fps)
-        for row, trajectory in commands:
-            writer.write_trajectory(stamps[row], trajectory)
+        commands = dict(_commands(times, commanded, mapping, dataset.fps))
         for k, stamp_ns in enumerate(stamps):
             if k == 0 or texts[k] != texts[k - 1]:
                 writer.write_instruction(stamp_ns, texts[k])
@@ -188,7 +186,9 @@ def convert_episode(
                 frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
                 writer.write_camera_info(view, stamp_ns, camera)
                 writer.write_image(view, stamp_ns, frame)
-    return *odd, *jumps([trajectory for _, trajectory in commands], mapping.robot)
+            if k in commands:  # after what it starts from, so that the episode can be played
+                writer.write_trajectory(stamp_ns, commands[k])
+    return *odd, *jumps(commands.values(), mapping.robot)
 
 
 def _read_rows(

@@ -29,6 +29,7 @@ class CameraEstimate:
         std_deg: standard error of its direction and roll [degrees].
         evidence: what it was estimated from and how well that fits, in words.
         residual_px: median distance of points from where they should be; NaN of silhouettes.
+        match: correlation of drawn and seen motion, -1 .. 1; NaN of points.
     """
 
     camera: CameraModel
@@ -36,6 +37,7 @@ class CameraEstimate:
     std_deg: float
     evidence: str
     residual_px: float = float('nan')
+    match: float = float('nan')
 
 
 def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:

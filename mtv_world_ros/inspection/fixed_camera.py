@@ -27,8 +27,10 @@ from mtv_world_ros.inspection.camera_pose import (
     CameraEstimate,
     covered_frames,
     grey,
+    left_out,
     moved,
     shrunk,
+    spread,
     UNITS,
     with_pose,
 )
@@ -140,6 +142,7 @@ class FixedCamera:
             std_deg=std_deg,
             evidence=f'correlation of drawn and seen motion {fit:.2f} over {len(fine.pairs)} '
             'pairs of frames',
+            match=fit,
         )
 
     def _far_pairs(self) -> np.ndarray:
@@ -208,10 +211,11 @@ class FixedCamera:
         return (self._drawn(T, changes) - changes.seen).reshape(len(changes.pairs), -1)
 
     def _standard_errors(self, T: FloatArray, changes: _Changes) -> tuple[float, float]:
-        """Of a fit to few independent measurements [mm, degrees].
+        """Of the camera's place [mm] and direction [degrees].
 
         Errors of the shapes, shadows and the robot's own pattern are the same for a whole link
-        in all frames, so that pixels say much less than their number.
+        in all frames, so that pixels say much less than their number: they are counted as few
+        independent measurements, and the pose's changes without one link at a time are added.
         """
         errors = self._errors(T, changes).ravel()
         slopes = np.stack(
@@ -223,12 +227,36 @@ class FixedCamera:
         normal = np.asarray((weights * slopes) @ slopes.T, np.float64)
         variance = float((weights * errors**2).sum()) / _NUM_INDEPENDENT
         at_centre = np.diag(UNITS) @ np.linalg.pinv(normal) @ np.diag(UNITS) * variance
+        moves = np.eye(6)  # turns about the centre shift the camera
         away = T[:3, :3].T @ (T[:3, 3] - self.centre)
         x, y, z = away
-        lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-        moves = np.hstack([lever, np.eye(3)])
-        shift = np.sqrt(np.trace(moves @ at_centre @ moves.T))
-        return 1000 * float(shift), float(np.degrees(np.sqrt(np.trace(at_centre[:3, :3]))))
+        moves[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        at_camera = moves @ at_centre @ moves.T
+        shift, turn = np.trace(at_camera[3:, 3:]), np.trace(at_camera[:3, :3])
+        without = []
+        for part in self._pixels_of_links(T, changes):
+            weighted = weights[part] * slopes[:, part]
+            less = np.asarray(weighted @ slopes[:, part].T, np.float64)
+            gradient = np.asarray(weighted @ errors[part], np.float64)
+            without.append(moves @ left_out(normal, less, gradient))
+        mm, degrees = spread(np.array(without)) if len(without) > 1 else (0.0, 0.0)
+        return (
+            float(np.hypot(1000 * np.sqrt(shift), mm)),
+            float(np.hypot(np.degrees(np.sqrt(turn)), degrees)),
+        )
+
+    def _pixels_of_links(self, T: FloatArray, changes: _Changes) -> list[np.ndarray]:
+        """Indices of the pixels at which each link is drawn, each pixel at one link."""
+        owner = np.full(changes.seen.size, -1)
+        links = list(dict.fromkeys(part.link for part in self._parts))
+        kernel = np.ones((2 * round(2 * changes.blur) + 1,) * 2, np.uint8)
+        for number, link in enumerate(links):
+            parts = [part for part in self._parts if part.link == link]
+            before, after = self._silhouettes(T, changes, parts)
+            around = np.stack([cv2.dilate(one, kernel) for one in before | after])
+            owner[np.flatnonzero(around)] = number
+        found = [np.flatnonzero(owner == number) for number in range(len(links))]
+        return [pixels for pixels in found if len(pixels)]
 
     def _refined(
         self,
