@@ -94,6 +94,25 @@ def test_lifecycle_node_answers_the_command_line(launch, ros2):
 
 
 @pytest.mark.native_ros
+@pytest.mark.control_msgs
+def test_action_answers_the_command_line(launch, ros2):
+    process = launch('world_model.launch.py')
+    for line in process.stdout:
+        if 'ready: low, high' in line:
+            break
+    name = '/world_model/follow_joint_trajectory'
+    kind = 'control_msgs/action/FollowJointTrajectory'
+    assert f'{name} [{kind}]' in ros2('action', 'list', '-t')
+    points = '[{positions: [0.0], time_from_start: {sec: 1}}]'
+    goal = f'{{trajectory: {{joint_names: [elbow], points: {points}}}}}'
+    said = ros2('action', 'send_goal', name, kind, goal)
+    assert 'Goal accepted' in said
+    assert "it has no ['elbow']" in said and 'status: ABORTED' in said
+    process.send_signal(signal.SIGINT)
+    check_end(process)
+
+
+@pytest.mark.native_ros
 def test_replays_in_two_namespaces_at_once(launch):
     processes = [
         launch('replay.launch.py', f'namespace:={name}', 'rate:=4.0', 'pace:=burst')
