@@ -85,7 +85,7 @@ def agreement_interval(
     The rates are drawn from their posterior under two priors (`draw_rates`): the worse end (low
     r, high MMRV) is the 4 % quantile where a judge is off by about .1, the better end the 1 %
     quantile where it may be nearly perfect. The score of the observed rates, in which the noise
-    of few scenes is still contained, lies within. In simulated rankings it covers 93 to 99 %
+    of few scenes is still contained, lies within. In simulated rankings it covers 94 to 99 %
     (`benchmark/interval_coverage.py`).
 
     Args:
