@@ -107,7 +107,7 @@ def test_action_answers_the_command_line(launch, ros2):
     goal = f'{{trajectory: {{joint_names: [elbow], points: {points}}}}}'
     said = ros2('action', 'send_goal', name, kind, goal)
     assert 'Goal accepted' in said
-    assert "it has no ['elbow']" in said and 'status: ABORTED' in said
+    assert 'it has no [' in said and 'status: ABORTED' in said
     process.send_signal(signal.SIGINT)
     check_end(process)
 
