@@ -31,8 +31,9 @@ SMALL = {
     'evaluate': ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
 }
-#: a busy machine takes long to start a node
+#: a busy machine takes long to start a node, and to hand it images
 PATIENT = ['--wait-timeout', '300', '--answer-timeout', '300']
+CALM = ['-p', 'num_threads:=1', '-p', 'max_image_age_s:=60.0', '-p', 'max_joint_state_age_s:=60.0']
 POLICY = """
 import numpy as np
 from mtv_world_ros.data_types import JointTrajectory
@@ -92,7 +93,7 @@ class Node:
         self.log = log
         with log.open('w') as out:
             self._process = subprocess.Popen(
-                [sys.executable, '-c', start, *words[1:], '-p', 'num_threads:=1'],
+                [sys.executable, '-c', start, *words[1:], *CALM],
                 stdout=out, stderr=subprocess.STDOUT,
             )  # fmt: skip
 
