@@ -85,11 +85,29 @@ def _card(dataset: Path) -> dict[str, Any]:
         card = read_json(file)
         splits = card.get('splits', {})
         entries = card.get('episodes', [])
-        if not isinstance(splits, dict) or any('name' not in entry for entry in entries):
+        if not (_are_splits(splits) and _are_entries(entries)):
             raise TypeError("'splits' or 'episodes' are not as 'mtv-world collect' writes them")
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"'{file}' is not a data set card: {error}") from error
     return card
+
+
+def _are_splits(splits: Any) -> bool:
+    """Whether these are lists of names by name."""
+    return isinstance(splits, dict) and all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names)
+        for names in splits.values()
+    )
+
+
+def _are_entries(entries: Any) -> bool:
+    """Whether these are episodes with a name, and the name of a scene if any."""
+    return isinstance(entries, list) and all(
+        isinstance(entry, dict)
+        and isinstance(entry.get('name'), str)
+        and isinstance(entry.get('scene') or '', str)
+        for entry in entries
+    )
 
 
 def _check_siblings(
