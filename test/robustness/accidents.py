@@ -206,10 +206,13 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     'SQLite messages without end': ('bag, sqlite3', endless_view),
     'token that is not in the vocabulary': ('action statistics', foreign_token),
     'split that is a number': (
-        'data set card', lambda: b'dataset.json\n{"splits": {"test": 1.5}, "episodes": []}'),
+        'data set card',
+        lambda: b'dataset.json\n{"splits": {"test": 1.5}, "episodes": []}',
+    ),
     'scene that is a list': (
         'data set card',
-        lambda: b'dataset.json\n{"splits": {}, "episodes": [{"name": "a", "scene": ["x"]}]}'),
+        lambda: b'dataset.json\n{"splits": {}, "episodes": [{"name": "a", "scene": ["x"]}]}',
+    ),
     'nested answer': ('answer, msgpack', nested_answer),
     'vast answer': ('answer, msgpack', vast_answer),
     'tensor of stride 0': ('answer, pickle', stride_zero),
