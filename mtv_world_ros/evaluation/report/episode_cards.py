@@ -109,6 +109,7 @@ def _results(name: str, evaluations: Sequence[Evaluated]) -> list[EpisodeResult 
 def _classes(name: str, evaluations: Sequence[Evaluated], key: str, found: _Found) -> str:
     known = [result for result in _results(name, evaluations) if result is not None]
     statuses = {row.status for result in known for row in result.rows if row.name}
+    views = sorted({row.view for result in known for row in result.rows})
     scored = {
         view: [
             np.nan if result is None else episode_means(result.rows, view or None)[key]
@@ -121,6 +122,7 @@ def _classes(name: str, evaluations: Sequence[Evaluated], key: str, found: _Foun
         found.outcome.classes(known[0].outcome),
         found.status.classes(*statuses),
         found.estimate.classes(*map(_estimate, known)),
+        found.view.classes(*views),
         *(
             found.score.classes(_bin(float(mean_of_known(np.array(values)))), of=view)
             for view, values in scored.items()
