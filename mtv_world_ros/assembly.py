@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
-from mtv_world_ros.model.card import CAMERAS, read_card, ROBOT_FOLDER
+from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.policies.policy_config import load_policy_config, ScriptedPolicySettings
@@ -154,7 +154,7 @@ def load_pipeline(
 
 
 def assemble(
-    card: Any,
+    card: CheckpointCard,
     world_model: WorldModel,
     *,
     robot: RobotModel,
@@ -176,8 +176,8 @@ def assemble(
             calibration=calibration,
             segmenter=segmenter,
         ),
-        rendering=TrajectoryVideoConfig(**card['rendering']),
-        object_mask=card['object_mask'],
+        rendering=TrajectoryVideoConfig(**card.rendering),
+        object_mask=card.object_mask,
         objects=objects,
         horizon=horizon,
         object_motion=_predictor(object_motion, robot),
@@ -234,7 +234,7 @@ def checkpoint_robot(checkpoint: str | Path, robot: str | Path | None = None) ->
         ConfigError: there is no file of the robot.
     """
     folder = checkpoint_path(checkpoint)
-    trained = str(read_card(folder)['robot'])
+    trained = read_card(folder).robot
     carried = folder / ROBOT_FOLDER / ROBOT_YAML
     default = carried if carried.is_file() else trained
     model = load_robot(robot_path(robot or default))
@@ -257,7 +257,7 @@ def checkpoint_cameras(checkpoint: str | Path) -> Path:
     carried = folder / ROBOT_FOLDER / CAMERAS
     if carried.is_file():
         return carried
-    robot = read_card(folder)['robot']
+    robot = read_card(folder).robot
     try:
         return share_path('config', 'cameras', f'{robot}.yaml')
     except ConfigError as error:

@@ -104,7 +104,9 @@ class Schema(BaseModel):
         Raises:
             ConfigError: a changed value is wrong.
         """
-        return type(self)(**{**dict(self), **changes})
+        # what was left to its default stays so
+        held = {name: getattr(self, name) for name in self.model_fields_set}
+        return type(self)(**{**held, **changes})
 
 
 def validated(

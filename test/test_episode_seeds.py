@@ -11,6 +11,7 @@ from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpe
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
 
@@ -18,7 +19,7 @@ SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=4, width=64, height=48, robot='yam_bimanual'
 )
 YAM = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
+CARD = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
 
 
 class SeededWorldModel(PersistenceWorldModel):

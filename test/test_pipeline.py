@@ -22,6 +22,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
 from mtv_world_ros.observed_episode import ObservedEpisode
@@ -31,7 +32,7 @@ SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
 )
 YAM = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-CARD = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
+CARD = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
 
 
 class CountingWorldModel(PersistenceWorldModel):
@@ -313,7 +314,7 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
 ) -> None:
     log: list[int] = []
     pipeline = replace(
-        assemble({**CARD, 'rendering': {'object_motion': True}}, world_model, robot=YAM),
+        assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM),
         object_motion=DriftingObjects(log),
     )
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
@@ -329,7 +330,7 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
 def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
-    pipeline = assemble({**CARD, 'rendering': {'object_motion': True}}, world_model, robot=YAM)
+    pipeline = assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM)
     predictor = ObjectMotionPredictor(ObjectMotionNetwork(), pipeline.robot)
     episode = replace(pipeline, object_motion=predictor).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
@@ -361,7 +362,7 @@ def test_the_objects_are_those_of_the_instruction(
 def test_without_object_masks_the_control_is_dark_but_for_the_trails(
     world_model: CountingWorldModel, recording: Recording
 ) -> None:
-    imagine(assemble({**CARD, 'object_mask': False}, world_model, robot=YAM), recording, 1.6)
+    imagine(assemble(CARD.replace(object_mask=False), world_model, robot=YAM), recording, 1.6)
     imagine(assemble(CARD, world_model, robot=YAM), recording, 1.6)
     without, with_masks = (np.count_nonzero(t) for t in world_model.trajectories)
     assert 0 < without < with_masks
@@ -443,7 +444,7 @@ class SlidingModel:
 def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
     world_model: CountingWorldModel, recording: Recording
 ) -> None:
-    card = {**CARD, 'rendering': {'object_motion': True}}
+    card = CARD.replace(rendering={'object_motion': True})
     model = SlidingModel()
     pipeline = replace(assemble(card, world_model, robot=YAM), object_motion=model)
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)

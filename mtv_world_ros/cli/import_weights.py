@@ -71,7 +71,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
         transformer=config.transformer,
         autoencoder=config.autoencoder,
         scheduler=config.scheduler,
-        card={**config.card({'imported_from': str(arguments.path)}), **text},
+        card=config.card({'imported_from': str(arguments.path)}, **text),
         robot=robot.file,
         elsewhere={part: getattr(arguments, part) for part in _ELSEWHERE},
     )

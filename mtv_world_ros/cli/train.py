@@ -165,7 +165,7 @@ def _train(arguments: argparse.Namespace) -> int:
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
     dataset = str(arguments.held_out or arguments.dataset)
-    out = arguments.out / f'evaluation_{read_card(folder)["trained_on"]["steps"]}'
+    out = arguments.out / f'evaluation_{read_card(folder).trained_on["steps"]}'
     words = [model[0], dataset, *model[1:], '--out', str(out)]
     print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
     return 0

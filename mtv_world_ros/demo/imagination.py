@@ -16,7 +16,7 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
-from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.processes import (
     last_line,
     module_command,
@@ -86,7 +86,7 @@ def imagine_episodes(
     logs.mkdir(parents=True, exist_ok=True)
     (out / 'episodes.json').unlink(missing_ok=True)
     environment = private_domain() if options.episodes else dict(os.environ)
-    views = spec_of(read_card(checkpoint_path(options.checkpoint))).views
+    views = read_card(checkpoint_path(options.checkpoint)).spec.views
     commands = {
         'world_model': _world_model_command(options, views),
         'policy': _policy_command(options, views),

@@ -33,7 +33,7 @@ from mtv_world_ros.evaluation.video import (
     write_video,
 )
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rendering.images import write_png
 
 
@@ -68,8 +68,7 @@ def run_demo(
     Raises:
         EpisodeError: the episode cannot be used or a process failed.
     """
-    card = read_card(checkpoint_path(checkpoint))
-    spec = spec_of(card)
+    spec = read_card(checkpoint_path(checkpoint)).spec
     recording = load_recording(episode, spec, checkpoint_robot(checkpoint, robot))
     options = DemoOptions(
         checkpoint=checkpoint,

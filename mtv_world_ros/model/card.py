@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -89,6 +89,28 @@ class CheckpointCard(Schema):
     )
     history: HistorySettings = HistorySettings()
 
+    @property
+    def spec(self) -> WorldModelSpec:
+        """What the model takes and gives."""
+        return WorldModelSpec(
+            views=self.views,
+            fps=self.fps,
+            num_frames=self.num_frames,
+            width=self.width,
+            height=self.height,
+            robot=self.robot,
+            num_inference_steps=self.num_inference_steps,
+            num_history=self.history.num_frames,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """Returns what the file says: nothing of what was left to its default."""
+        return self.model_dump(mode='json', exclude_unset=True)
+
+    def write(self, folder: Path) -> None:
+        """Writes it into a checkpoint's or adapter's folder."""
+        (folder / CARD).write_text(json.dumps(self.plain(), indent=2) + '\n')
+
 
 #: what only some checkpoints have
 OPTIONAL_KEYS = tuple(k for k, f in CheckpointCard.model_fields.items() if not f.is_required())
@@ -100,8 +122,8 @@ SHARED_KEYS = tuple(
 )
 
 
-def read_card(folder: Path) -> dict[str, Any]:
-    """Returns the checked contents of `world_model.json`.
+def read_card(folder: Path) -> CheckpointCard:
+    """Returns the contents of `world_model.json`.
 
     Raises:
         CheckpointError: missing, not JSON, or with missing, unknown or wrong values.
@@ -113,23 +135,13 @@ def read_card(folder: Path) -> dict[str, Any]:
             "or set 'checkpoint' to a folder that has it"
         )
     try:
-        card = read_json(path)
+        values = read_json(path)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"'{path}' is not valid JSON: {error}") from error
-    check_card(card, path)
-    return card
+    return validated(CheckpointCard, values, f"'{path}'", error=CheckpointError)
 
 
-def check_card(card: Mapping[str, Any], path: Path) -> None:
-    """Checks the contents of a card; `path` is for the message.
-
-    Raises:
-        CheckpointError: missing, unknown or wrong values.
-    """
-    validated(CheckpointCard, card, f"'{path}'", error=CheckpointError)
-
-
-def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
+def check_same_model(card: CheckpointCard, adapter: Path) -> None:
     """Checks that an adapter was trained for what a checkpoint takes and gives.
 
     Args:
@@ -143,13 +155,13 @@ def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
         return
     theirs = read_card(adapter)
     for key in SHARED_KEYS:
-        mine, other = card[key], theirs[key]
+        mine, other = card.plain()[key], theirs.plain()[key]
         if mine != other:
             raise CheckpointError(
                 f"adapter '{adapter}' was trained with '{key}' {other}, this checkpoint's is "
                 f'{mine}; use the checkpoint that it was trained on'
             )
-    mine, other = history_settings(card), history_settings(theirs)
+    mine, other = card.history, theirs.history
     if mine != other:
         raise CheckpointError(
             f"adapter '{adapter}' was trained with history ({_settings(other)}), this checkpoint "
@@ -159,27 +171,3 @@ def check_same_model(card: Mapping[str, Any], adapter: Path) -> None:
 
 def _settings(history: HistorySettings) -> str:
     return ', '.join(f'{name} {value}' for name, value in history.model_dump().items())
-
-
-def spec_of(card: Mapping[str, Any]) -> WorldModelSpec:
-    """Returns what a card says of the model's input and output."""
-    return WorldModelSpec(
-        views=tuple(card['views']),
-        fps=float(card['fps']),
-        num_frames=card['num_frames'],
-        width=card['width'],
-        height=card['height'],
-        robot=card['robot'],
-        num_inference_steps=card.get('num_inference_steps', 4),
-        num_history=card.get('history', {}).get('num_frames', 0),
-    )
-
-
-def history_settings(card: Mapping[str, Any]) -> HistorySettings:
-    """Returns what a checkpoint's card says of its history.
-
-    Raises:
-        CheckpointError: an unknown key or a wrong value.
-    """
-    where = f"{CARD}: 'history' cannot be used"
-    return validated(HistorySettings, card.get('history', {}), where, error=CheckpointError)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-import json
 from pathlib import Path
 import shutil
 from typing import Any, cast
@@ -15,7 +13,7 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, MtvWorldError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
-from mtv_world_ros.model.card import CARD, check_card, read_card, ROBOT_FOLDER
+from mtv_world_ros.model.card import CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
@@ -36,9 +34,7 @@ class Checkpoint:
         transformer: the diffusion transformer.
         autoencoder: pixels to latents and back.
         scheduler: noise levels and the step rule.
-        card: `world_model.json`: views, fps, num_frames (T), width, height, robot, control,
-            object_mask, rendering, trained_on; of models with text also prompt, negative_prompt
-            and guidance_scale.
+        card: what it takes, gives and was trained on.
         actions: how positions become the transformer's actions; None where they are drawn.
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.
@@ -50,7 +46,7 @@ class Checkpoint:
     transformer: MultiViewWanTransformer
     autoencoder: Autoencoder
     scheduler: Scheduler
-    card: Mapping[str, Any]
+    card: CheckpointCard
     actions: ActionEncoding | None = None
     text_encoder: TextEncoder | None = None
     image_encoder: ImageEncoder | None = None
@@ -64,7 +60,6 @@ def save_checkpoint(
 ) -> None:
     """Writes a checkpoint folder; it appears under its name only when it is whole."""
     with disk_errors(), whole_folder(folder) as partial:
-        check_card(checkpoint.card, partial)
         stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
         stored.save_pretrained(partial / 'transformer', safe_serialization=True)
         cast(Any, checkpoint.autoencoder).save_pretrained(
@@ -78,7 +73,7 @@ def save_checkpoint(
                 encoder.save(partial)
         for name, part in _folders(checkpoint).items():
             shutil.copytree(part, partial / name)
-        (partial / CARD).write_text(json.dumps(dict(checkpoint.card), indent=2) + '\n')
+        checkpoint.card.write(partial)
 
 
 def _folders(checkpoint: Checkpoint) -> dict[str, Path]:
@@ -119,7 +114,7 @@ def _load(folder: Path, dtype: torch.dtype) -> Checkpoint:
             f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
             'loaded: convert them and remove these'
         )
-    control = card['control']
+    control = card.control
     drawn = control == TRAJECTORY_VIDEO
     with_text = (folder / 'text_encoder').is_dir()
     adapter, motion = folder / ADAPTER_FOLDER, folder / OBJECT_MOTION_FOLDER

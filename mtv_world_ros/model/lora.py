@@ -19,7 +19,7 @@ from torch import nn, Tensor
 from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.files import whole_folder
-from mtv_world_ros.model.card import CARD
+from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.tensor_files import disk_errors, pickle_error, PICKLES
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.wan_keys import transformer_keys
@@ -71,7 +71,7 @@ def save_adapter(
     folder: Path,
     *,
     weights: Mapping[str, Tensor] | None = None,
-    card: Mapping[str, Any] | None = None,
+    card: CheckpointCard | None = None,
 ) -> None:
     """Writes the adapter's folder; it appears under its name only when it is whole.
 
@@ -93,7 +93,7 @@ def save_adapter(
         _save({name: tensors[name] for name in beside(transformer)}, partial / BESIDE_FILE)
         (partial / BASE_FILE).write_text(json.dumps(_base(transformer), indent=2) + '\n')
         if card is not None:
-            (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
+            card.write(partial)
 
 
 def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:

@@ -13,7 +13,7 @@ import torch
 from mtv_world_ros.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.model.card import check_same_model, history_settings, spec_of
+from mtv_world_ros.model.card import check_same_model
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
     condition,
@@ -94,11 +94,11 @@ class DiffusionWorldModel:
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self._decoder = decoder_of(self.autoencoder, serving, dtype)
         self.scheduler = checkpoint.scheduler
-        self.spec = spec_of(checkpoint.card)
+        self.spec = checkpoint.card.spec
         check_video(self.autoencoder, self.transformer.config, self.spec)
         if serving.tiny_encoder:
             self.autoencoder = self._decoder
-        self.history = history_settings(checkpoint.card)
+        self.history = checkpoint.card.history
         check_history(self.history, self.autoencoder, self.transformer.config)
         self.text_encoder = checkpoint.text_encoder
         self.image_encoder = checkpoint.image_encoder
@@ -211,7 +211,7 @@ class DiffusionWorldModel:
                     seeds=seeds,
                     num_inference_steps=num_inference_steps,
                     should_stop=should_stop,
-                    guidance_scale=float(self.card.get('guidance_scale', 1.0)),
+                    guidance_scale=self.card.guidance_scale,
                 )
                 latents = latents.to(self._decoder.dtype)
                 # one at a time: decoding takes more memory than denoising
@@ -272,11 +272,11 @@ class DiffusionWorldModel:
             return latents
         dtype = self.transformer.dtype
         negative = None
-        if self.card.get('guidance_scale', 1.0) != 1.0:
-            negative = self.text_encoder.encode(self.card.get('negative_prompt', ''), self.device)
+        if self.card.guidance_scale != 1.0:
+            negative = self.text_encoder.encode(self.card.negative_prompt, self.device)
         return replace(
             latents,
-            text=self.text_encoder.encode(self.card.get('prompt', ''), self.device).to(dtype),
+            text=self.text_encoder.encode(self.card.prompt, self.device).to(dtype),
             negative_text=None if negative is None else negative.to(dtype),
             image=self.image_encoder.encode(start[0]).flatten(0, 1)[None].to(dtype),
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 import hashlib
 import json
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.model.card import SHARED_KEYS, spec_of
+from mtv_world_ros.model.card import CheckpointCard, SHARED_KEYS
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import check_video
@@ -77,10 +76,10 @@ def load_base(
     _check_transformer(config, loaded.transformer, folder)
     _check_card(config, loaded.card, folder)
     autoencoder = place(loaded.autoencoder, device, dtype).eval().requires_grad_(False)
-    check_video(autoencoder, loaded.transformer.config, spec_of(loaded.card))
+    check_video(autoencoder, loaded.transformer.config, loaded.card.spec)
     text = image = None
     if loaded.text_encoder is not None and loaded.image_encoder is not None:
-        text = loaded.text_encoder.encode(loaded.card.get('prompt', ''), device).clone()
+        text = loaded.text_encoder.encode(loaded.card.prompt, device).clone()
         image = loaded.image_encoder.to(device, dtype)
     digest = _digest(loaded.transformer)
     if config.lora.rank:
@@ -107,10 +106,11 @@ def _check_transformer(
             )
 
 
-def _check_card(config: TrainingConfig, card: Mapping[str, Any], folder: Path) -> None:
+def _check_card(config: TrainingConfig, card: CheckpointCard, folder: Path) -> None:
     """An adapter is served with its base's card, so it has to be trained with it."""
-    mine = config.card({})
-    theirs = {**card, 'rendering': TrajectoryVideoConfig(**card['rendering']).model_dump()}
+    mine = config.card({}).plain()
+    rendering = TrajectoryVideoConfig(**card.rendering).model_dump()
+    theirs = {**card.plain(), 'rendering': rendering}
     for name in (*SHARED_KEYS, 'rendering', 'history'):
         held, wanted = theirs.get(name), mine.get(name)
         if _plain(held) != _plain(wanted):

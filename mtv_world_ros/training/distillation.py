@@ -40,7 +40,7 @@ from mtv_world_ros.config import Schema
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.model.card import history_settings, spec_of
+from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.lora import Adapters
@@ -108,9 +108,9 @@ class DistillTrainer(Trainer):
         self.teacher = place(copy_of(teacher.transformer), self.device, dtype).eval()
         self.teacher.requires_grad_(False)
         self.autoencoder = place(teacher.autoencoder, self.device, torch.float32)
-        self.guidance = float(teacher.card.get('guidance_scale', 1.0))
+        self.guidance = teacher.card.guidance_scale
         self.encoders = self._encoders(teacher)
-        self._negative = self._text('negative_prompt') if self.guidance != 1.0 else None
+        self._negative = self._text(teacher.card.negative_prompt) if self.guidance != 1.0 else None
         self._sigmas = path_sigmas(teacher.scheduler, distill.num_steps, distill.substeps)
 
     def _encoders(self, teacher: Checkpoint) -> Encoders:
@@ -118,18 +118,18 @@ class DistillTrainer(Trainer):
             teacher.image_encoder.to(self.device, self.weights.worker.dtype)
         return Encoders(
             autoencoder=self.autoencoder,
-            text=self._text('prompt'),
+            text=self._text(teacher.card.prompt),
             image=teacher.image_encoder,
             history=self.config.history,
         )
 
-    def _text(self, key: str) -> Tensor | None:
-        """Tokens of a text in the card; None in models without text."""
+    def _text(self, text: str) -> Tensor | None:
+        """Tokens of a text; None in models without text."""
         encoder = self.parts.text_encoder
         if encoder is None:
             return None
         # a copy: what encoding gives takes no part in gradients
-        return encoder.encode(self.parts.card.get(key, ''), self.device).clone()
+        return encoder.encode(text, self.device).clone()
 
     def start_from(self, folder: Path) -> None:
         """Takes the teacher's weights, its adapter merged."""
@@ -197,10 +197,10 @@ class DistillTrainer(Trainer):
             'steps': self.step,
             'seed': self.seed,
             'distilled': self.distill.model_dump(),
-            'teacher': self.parts.card['trained_on'],
+            'teacher': self.parts.card.trained_on,
         }
         card = {
-            **self.parts.card,
+            **self.parts.card.plain(),
             'num_inference_steps': self.distill.num_steps,
             'trained_on': trained_on,
         }
@@ -209,7 +209,7 @@ class DistillTrainer(Trainer):
             self.parts,
             transformer=self.weights.averaged(),
             scheduler=straight_scheduler(self.parts.scheduler),
-            card=card,
+            card=CheckpointCard(**card),
             adapter=None,
             robot=self.robot or self.parts.robot,
         )
@@ -240,7 +240,7 @@ def distill(
         TrainingError: `out` holds another distillation; see also `train`.
     """
     teacher = load_checkpoint(checkpoint)
-    _check_same(run.out, {**settings.model_dump(), 'teacher': teacher.card['trained_on']})
+    _check_same(run.out, {**settings.model_dump(), 'teacher': teacher.card.trained_on})
     return train(
         run.replace(config=student_config(run.config, teacher), initial=checkpoint),
         robot=robot,
@@ -251,7 +251,7 @@ def distill(
 
 def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfig:
     """Returns a configuration with the teacher's architecture, video and rendering."""
-    card, spec = teacher.card, spec_of(teacher.card)
+    card, spec = teacher.card, teacher.card.spec
     return config.replace(
         transformer=_arguments(teacher.transformer.config),
         autoencoder=_with_class(getattr(teacher.autoencoder, 'vae', teacher.autoencoder)),
@@ -263,11 +263,11 @@ def student_config(config: TrainingConfig, teacher: Checkpoint) -> TrainingConfi
             width=spec.width,
             height=spec.height,
             robot=spec.robot,
-            control=card['control'],
-            object_mask=card['object_mask'],
+            control=card.control,
+            object_mask=card.object_mask,
         ),
-        rendering=TrajectoryVideoConfig(**card['rendering']),
-        history=config.history.replace(**dict(history_settings(card))),
+        rendering=TrajectoryVideoConfig(**card.rendering),
+        history=config.history.replace(**dict(card.history)),
         lora=LoraSettings(),  # all of the student is trained
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
-from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
+from mtv_world_ros.model.card import CheckpointCard, OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -340,7 +340,7 @@ class Trainer:
 
 
 def export_adapter(
-    folder: Path, weights: Weights, card: Mapping[str, Any], base: Base | None
+    folder: Path, weights: Weights, card: CheckpointCard, base: Base | None
 ) -> None:
     """Writes the averaged adapter in float32, with the weights trained beside it and its card."""
     save_adapter(weights.worker, folder, weights=weights.averages(), card=_with_text(card, base))
@@ -349,7 +349,7 @@ def export_adapter(
 def export_checkpoint(
     folder: Path,
     weights: Weights,
-    card: Mapping[str, Any],
+    card: CheckpointCard,
     base: Base | None,
     config: TrainingConfig,
     encoders: Encoders,
@@ -373,10 +373,10 @@ def export_checkpoint(
     save_checkpoint(parts, folder, dtype=dtype)
 
 
-def _with_text(card: Mapping[str, Any], base: Base | None) -> dict[str, Any]:
+def _with_text(card: CheckpointCard, base: Base | None) -> CheckpointCard:
     """With the prompt and guidance that the base has."""
-    theirs = base.checkpoint.card if base else {}
-    return {**card, **{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs}}
+    theirs = base.checkpoint.card.plain() if base else {}
+    return card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
 
 
 def batch_loss(

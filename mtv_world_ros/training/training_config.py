@@ -24,7 +24,7 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.model.actions import check_control, TRAJECTORY_VIDEO
-from mtv_world_ros.model.card import HistorySettings, spec_of
+from mtv_world_ros.model.card import CheckpointCard, HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 
 
@@ -247,7 +247,7 @@ class TrainingConfig(Schema):
     @property
     def spec(self) -> WorldModelSpec:
         """What a model of this configuration takes and gives."""
-        return spec_of(self.card({}))
+        return self.card({}).spec
 
     def with_steps(self, num_clips: int) -> TrainingConfig:
         """Returns a copy with `epochs` converted to steps, if it counts in epochs."""
@@ -257,15 +257,16 @@ class TrainingConfig(Schema):
         steps = max(1, ceil(optimizer.epochs * num_clips / optimizer.batch_size))
         return self.replace(optimizer=optimizer.replace(steps=steps))
 
-    def card(self, trained_on: Mapping[str, Any]) -> dict[str, Any]:
-        """The checkpoint's card, `world_model.json`; `trained_on` says where weights come from."""
-        return {
+    def card(self, trained_on: Mapping[str, Any], **text: Any) -> CheckpointCard:
+        """Returns the checkpoint's card; `trained_on` says where weights come from."""
+        return CheckpointCard(
             **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
-            'rendering': self.rendering.model_dump(),
+            rendering=self.rendering.model_dump(),
             **self.history.as_card(),
-            'num_inference_steps': self.sampling.num_inference_steps,
-            'trained_on': dict(trained_on),
-        }
+            num_inference_steps=self.sampling.num_inference_steps,
+            trained_on=dict(trained_on),
+            **text,
+        )
 
 
 class TrainingRun(Schema):

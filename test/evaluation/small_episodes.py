@@ -17,6 +17,7 @@ from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
@@ -202,6 +203,6 @@ def blurred_oracle(recordings: list[Recording]) -> OracleWorldModel:
 
 def persistence(spec: WorldModelSpec) -> Pipeline:
     """A pipeline whose world model holds the first frame; a worker process can make it, too."""
-    card = {'robot': 'yam_bimanual', 'rendering': {}, 'object_mask': True}
+    card = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
     yam = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
     return assemble(card, PersistenceWorldModel(spec), robot=yam)

@@ -13,6 +13,7 @@ import torch
 
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
+from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
@@ -36,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
         transformer=build(SMALL),
         autoencoder=SpaceToDepthAutoencoder(),
         scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
-        card=CARD,
+        card=CheckpointCard(**CARD),
     )
     save_checkpoint(checkpoint, tmp_path / 'checkpoint')
     return tmp_path / 'checkpoint'
@@ -48,7 +49,7 @@ def test_loads_bit_for_bit_what_was_saved(folder: Path) -> None:
         assert torch.equal(loaded.transformer.state_dict()[name], value), name
     torch.testing.assert_close(loaded.transformer(**inputs()), build(SMALL)(**inputs()))
     assert loaded.scheduler.config['shift'] == 5.0
-    assert loaded.card == CARD
+    assert loaded.card.plain() == CARD
 
 
 def test_leaves_nothing_but_safetensors_and_json(folder: Path) -> None:

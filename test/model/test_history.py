@@ -15,7 +15,7 @@ from torch import Tensor
 from mtv_world_ros.data_types import History
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
-from mtv_world_ros.model.card import history_settings
+from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.transformer.tokens import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -196,7 +196,7 @@ def world_model(**card: object) -> DiffusionWorldModel:
             transformer=build(SMALL),
             autoencoder=SpaceToDepthAutoencoder(),
             scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
-            card={**CARD, **card},
+            card=CheckpointCard(**{**CARD, **card}),
         )
     )
 
@@ -256,10 +256,10 @@ def test_a_seed_gives_the_same_chunk_in_every_company_with_history() -> None:
     ('changes', 'match'),
     [
         ({'num_frames': 3}, 'num_frames to a multiple of 2'),
-        ({'num_frames': -1}, 'num_frames is -1'),
+        ({'num_frames': -1}, "'num_frames' is -1"),
         ({'noise_level': 1.0}, 'at least 0 and below 1'),
-        ({'reference': 'last'}, "'last' is not one of chunk_start, first_frame"),
-        ({'frames': 4}, "'history' cannot be used.*frames"),
+        ({'reference': 'last'}, "'last'; valid are chunk_start, first_frame"),
+        ({'frames': 4}, "history: unknown key 'frames'"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changes: dict, match: str) -> None:
@@ -268,5 +268,5 @@ def test_settings_that_cannot_be_are_refused(changes: dict, match: str) -> None:
 
 
 def test_settings_are_off_where_the_card_has_none() -> None:
-    assert not history_settings(CARD).on
-    assert history_settings(CARD).as_card() == {}
+    history = CheckpointCard(**CARD).history
+    assert not history.on and history.as_card() == {}

@@ -16,6 +16,8 @@ import torch
 from transformers import PreTrainedTokenizerFast
 from wan_reference import random_weights, video_tensors, Weights
 
+from mtv_world_ros.model.card import CheckpointCard
+
 Shapes = dict[str, tuple[int, ...]]
 
 HEADS, LAYERS, DIM, FFN = 2, 2, 24, 40
@@ -40,19 +42,19 @@ SCHEDULER = {
     'use_flow_sigmas': True,
     'flow_shift': 3.0,
 }
-CARD = {
-    'views': ['low', 'high'],
-    'fps': 16.0,
-    'num_frames': 4,
-    'width': 32,
-    'height': 32,
-    'robot': 'yam_bimanual',
-    'control': 'trajectory_video',
-    'object_mask': True,
-    'rendering': {},
-    'trained_on': {},
-    'prompt': 'pick the block',
-}
+CARD = CheckpointCard(
+    views=['low', 'high'],
+    fps=16.0,
+    num_frames=4,
+    width=32,
+    height=32,
+    robot='yam_bimanual',
+    control='trajectory_video',
+    object_mask=True,
+    rendering={},
+    trained_on={},
+    prompt='pick the block',
+)
 
 
 def transformer_weights(seed: int = 0) -> Weights:

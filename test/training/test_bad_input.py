@@ -116,7 +116,7 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
     assert sorted(path.name for path in tmp_path.iterdir()) == ['checkpoint', 'state']
     resumed = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
     assert resumed.load_state() and resumed.step == 1
-    assert load_checkpoint(tmp_path / 'checkpoint').card['trained_on']['steps'] == 1
+    assert load_checkpoint(tmp_path / 'checkpoint').card.trained_on['steps'] == 1
 
 
 def test_a_killed_data_process_is_said_and_others_make_the_same_clips(

@@ -24,7 +24,7 @@ def test_the_best_checkpoint_by_the_judge_is_kept(
     scores = {1: float('nan'), 2: 0.3, 3: 0.5, 4: 0.4}
 
     def judge(checkpoint: Path, step: int) -> Judged:
-        assert read_card(checkpoint)['trained_on']['steps'] == step
+        assert read_card(checkpoint).trained_on['steps'] == step
         return Judged(score=scores[step], numbers={'j_moving': scores[step]})
 
     train(
@@ -34,8 +34,8 @@ def test_the_best_checkpoint_by_the_judge_is_kept(
         held_out=HeldOut(judge, 1),
     )
     assert json.loads((tmp_path / 'best.json').read_text()) == {'step': 3, 'score': 0.5}
-    assert read_card(tmp_path / 'checkpoint-best')['trained_on']['steps'] == 3
-    assert read_card(tmp_path / 'checkpoint')['trained_on']['steps'] == 4
+    assert read_card(tmp_path / 'checkpoint-best').trained_on['steps'] == 3
+    assert read_card(tmp_path / 'checkpoint').trained_on['steps'] == 4
     rows = [json.loads(line) for line in (tmp_path / 'log.jsonl').open()]
     assert [row['j_moving'] for row in rows if 'j_moving' in row][1:] == [0.3, 0.5, 0.4]
 

@@ -197,7 +197,7 @@ def test_a_wrong_setting_names_the_nearest(override: dict, message: str) -> None
 
 @pytest.mark.parametrize(('preset', 'steps'), [('small', 1), ('wan-1.3b', 50), ('wan-14b', 50)])
 def test_a_checkpoint_says_how_many_steps_it_is_made_for(preset: str, steps: int) -> None:
-    assert load_training_config(preset).card({})['num_inference_steps'] == steps
+    assert load_training_config(preset).card({}).num_inference_steps == steps
     changed = load_training_config(preset, {'sampling.num_inference_steps': 7})
     assert changed.spec.num_inference_steps == 7
 

@@ -14,7 +14,7 @@ from wan_files import write_videox
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.card import check_same_model, read_card
+from mtv_world_ros.model.card import check_same_model, HistorySettings, read_card
 from mtv_world_ros.training.training_config import load_training_config
 
 SMALL = ['--dtype', 'float32', '--threads', '1']
@@ -55,8 +55,8 @@ def test_the_history_of_the_preset_goes_through_import_and_training(
     assert config.history == load_training_config('wan-1.3b').history.replace()
     assert config.history.num_frames == 5
     for folder in (recipe['base'], recipe['lora'] / 'adapter'):
-        assert read_card(folder)['history']['num_frames'] == 5
-        assert read_card(folder)['guidance_scale'] == config.sampling.guidance_scale
+        assert read_card(folder).history.num_frames == 5
+        assert read_card(folder).guidance_scale == config.sampling.guidance_scale
 
 
 def test_the_printed_evaluation_of_the_adapter_runs(recipe: dict[str, Path]) -> None:
@@ -87,10 +87,10 @@ def test_an_adapter_of_another_history_is_refused(
     recipe: dict[str, Path], tmp_path: Path, base: bool
 ) -> None:
     card = read_card(recipe['base'])
-    other = {name: value for name, value in card.items() if name != 'history'}
+    other = card.replace(history=HistorySettings())
     held, theirs = (card, other) if base else (other, card)
-    (tmp_path / 'world_model.json').write_text(json.dumps(theirs))
+    theirs.write(tmp_path)
     with pytest.raises(CheckpointError, match='trained with history .num_frames'):
         check_same_model(held, tmp_path)
-    (tmp_path / 'world_model.json').write_text(json.dumps(held))
+    held.write(tmp_path)
     check_same_model(held, tmp_path)

@@ -214,7 +214,7 @@ def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(
     trainer = make(config, tmp_path, base)
     trainer.export(trainer.result)
     checkpoint = load_checkpoint(base)
-    slower = replace(checkpoint, card={**checkpoint.card, 'fps': 2.5})
+    slower = replace(checkpoint, card=checkpoint.card.replace(fps=2.5))
     model = DiffusionWorldModel(slower)
     with pytest.raises(CheckpointError, match=r"'fps' 5.0, this checkpoint's is 2.5"):
         model.use_adapter(trainer.result)

@@ -47,6 +47,6 @@ def make_base(folder: Path, config: TrainingConfig, prompt: str = 'pick the bloc
         transformer=config.transformer,
         autoencoder=config.autoencoder,
         scheduler=config.scheduler,
-        card={**config.card({}), 'prompt': prompt},
+        card=config.card({}, prompt=prompt),
     )
     return folder / 'base'

@@ -205,7 +205,7 @@ class ObjectMotionNetwork(nn.Module):
         w, h = (self.width, width), (self.hidden, hidden)
         tips = (8 if self.fingertips else 0, 8)
         old, new = self.state_dict(), wider.state_dict()
-        known = self.tool_edge[0].in_features - h[0] - tips[0]
+        known = old['tool_edge.0.weight'].shape[1] - h[0] - tips[0]
         blocks = {  # of the columns, (old, new), in the order in which `step` gives them
             'tool_edge.0.weight': [(known, known), h, tips],
             'node.0.weight': [(14 + _SHAPE, 14 + _SHAPE), h, w, w],

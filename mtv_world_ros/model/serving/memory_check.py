@@ -16,7 +16,6 @@ from torch.utils._pytree import tree_leaves
 
 from mtv_world_ros.errors import ModelMemoryError
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
-from mtv_world_ros.model.card import history_settings, spec_of
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
@@ -102,7 +101,7 @@ def _weights(module: nn.Module) -> int:
 def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
     """Returns the most that a pass of the transformer or decoding holds beside the weights."""
     config: Any = checkpoint.transformer.config
-    spec = spec_of(checkpoint.card)
+    spec = checkpoint.card.spec
     shape = (config['latent_channels'], spec.height // 8, spec.width // 8)
     views = len(spec.views)
     with FakeTensorMode(), _default(dtype), torch.inference_mode():
@@ -123,7 +122,7 @@ def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: tor
             'reference': image,
             'encoder_hidden_states': torch.empty(1, NUM_TEXT_TOKENS, config['text_dim']),
         }
-        if before := history_settings(checkpoint.card).num_frames:
+        if before := checkpoint.card.history.num_frames:
             count = decoder.num_latent_frames(before - 1)
             arguments['history'] = torch.empty(1, views, shape[0], count, *shape[1:])
             arguments['history_timestep'] = torch.empty(1)

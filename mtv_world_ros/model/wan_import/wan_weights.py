@@ -16,7 +16,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.model import wan_keys
-from mtv_world_ros.model.card import CARD, check_card, ROBOT_FOLDER
+from mtv_world_ros.model.card import CheckpointCard, ROBOT_FOLDER
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.tensor_files import (
     INDEX,
@@ -65,7 +65,7 @@ def import_weights(
     transformer: Mapping[str, Any],
     autoencoder: Mapping[str, Any],
     scheduler: Mapping[str, Any],
-    card: Mapping[str, Any],
+    card: CheckpointCard,
     elsewhere: Mapping[str, Path | None] | None = None,
     robot: Path | None = None,
     shard_bytes: int = SHARD_BYTES,
@@ -80,7 +80,7 @@ def import_weights(
         transformer: arguments of `MultiViewWanTransformer`.
         autoencoder: arguments of the autoencoder.
         scheduler: arguments of the noise schedule.
-        card: `world_model.json`.
+        card: of the checkpoint.
         elsewhere: files or folders of parts that are not in `path`.
         robot: YAML of the robot that it will be trained on, to be carried by the checkpoint.
         shard_bytes: size at which a new file is begun.
@@ -88,7 +88,6 @@ def import_weights(
     Raises:
         CheckpointError: a part, shard or tensor is missing, unknown, of another model or a pickle.
     """
-    check_card(card, out / CARD)
     if out.exists():
         raise CheckpointError(f"'{out}' exists; give --out a folder that does not")
     sources = find_sources(Path(path), elsewhere or {})
@@ -98,7 +97,7 @@ def import_weights(
         build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
         if robot is not None:
             save_robot(robot, partial / ROBOT_FOLDER)
-        (partial / CARD).write_text(json.dumps(dict(card), indent=2) + '\n')
+        card.write(partial)
         listed = [asdict(report) for report in reports]
         (partial / REPORT).write_text(json.dumps(listed, indent=2) + '\n')
     return reports

@@ -14,7 +14,7 @@ from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_path, load_pip
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError, MtvWorldError
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.model.card import read_card, spec_of
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 from mtv_world_ros.ros.parameters import NodeSettings, Settings
@@ -106,4 +106,4 @@ def check_calibration(
 
 def load_spec(checkpoint: str) -> WorldModelSpec:
     """Returns what a checkpoint takes and gives, without loading it."""
-    return spec_of(read_card(checkpoint_path(checkpoint)))
+    return read_card(checkpoint_path(checkpoint)).spec

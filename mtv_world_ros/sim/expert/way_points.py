@@ -341,7 +341,7 @@ def _visit(stops: Stops, size: float, side: _Side) -> Stops:
     rng, floor = side.play, min(stop.position[2] for stop in stops)
     for _ in range(round(size)):
         at = int(rng.integers(len(stops)))
-        x, y, z = side.objects[rng.integers(len(side.objects))]
+        x, y, z = side.objects[int(rng.integers(len(side.objects)))]
         angle = rng.uniform(0.0, 2 * np.pi)
         way = np.array([np.cos(angle), np.sin(angle)])
         past = np.array([x, y]) + rng.normal(0.0, _VISIT_BESIDE_M, 2)

@@ -32,7 +32,7 @@ from mtv_world_ros.model.serving.prepare import Float8Linear, to_float8
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import HistoryConfig, load_training_config
 
 
 @pytest.fixture(scope='module')
@@ -313,14 +313,10 @@ def test_memory_held_at_most_is_counted() -> None:
 def preset(name: str) -> SimpleNamespace:
     """A checkpoint of a preset without weights."""
     config = load_training_config(name)
-    video = config.video
     with torch.device('meta'):
         transformer = MultiViewWanTransformer(**config.transformer)
         autoencoder = build_autoencoder(config.autoencoder)
-    card = {
-        n: getattr(video, n) for n in ('views', 'fps', 'num_frames', 'width', 'height', 'robot')
-    }
-    card['history'] = {'num_frames': 5}
+    card = config.replace(history=HistoryConfig(num_frames=5)).card({})
     return SimpleNamespace(
         transformer=transformer, autoencoder=autoencoder, image_encoder=None, card=card
     )

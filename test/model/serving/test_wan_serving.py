@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def load(folder: Path, dtype: torch.dtype = torch.float32, **card: Any) -> DiffusionWorldModel:
     checkpoint: Checkpoint = load_checkpoint(folder)
-    changed = replace(checkpoint, card={**checkpoint.card, **card})
+    changed = replace(checkpoint, card=checkpoint.card.replace(**card))
     return DiffusionWorldModel(changed, dtype=dtype)
 
 
@@ -126,7 +126,7 @@ def test_guidance_costs_a_second_pass_only_where_it_is_on(
 
 
 def test_guidance_leads_from_the_negative_prompt_to_the_prompt(folder: Path) -> None:
-    same = {'negative_prompt': CARD['prompt'], 'guidance_scale': 5.0}
+    same = {'negative_prompt': CARD.prompt, 'guidance_scale': 5.0}
     plain, nowhere = predict(load(folder), [0]), predict(load(folder, **same), [0])
     assert np.abs(plain.astype(int) - nowhere).max() <= 1
     guided = predict(load(folder, negative_prompt='red', guidance_scale=5.0), [0])

@@ -18,6 +18,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
+from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.transformer.action_context import by_slot
 from mtv_world_ros.model.transformer.cross_attention import Context
@@ -239,7 +240,7 @@ def folder(request, robot, tmp_path: Path) -> Path:
         transformer=build(SMALL, control=request.param, action_dim=DIM),
         autoencoder=SpaceToDepthAutoencoder(),
         scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
-        card=card,
+        card=CheckpointCard(**card),
         actions=encoding,
     )
     save_checkpoint(checkpoint, tmp_path / 'checkpoint')

@@ -230,7 +230,7 @@ def test_the_command_prints_what_became_of_every_part(
     assert 'transformer: 89 tensors, 0.0 M parameters (BF16)' in printed
     assert 'new, zero: view_embedding' in printed
     assert "left out: 1 (CLIP's temperature)" in printed
-    assert load_checkpoint(out).card['prompt'].startswith('The robotic arm picks up objects')
+    assert load_checkpoint(out).card.prompt.startswith('The robotic arm picks up objects')
     (videox / WEIGHTS).unlink()
     assert main(['import-weights', str(videox), '--out', str(tmp_path / 'other')]) == 1
     assert 'holds no transformer: expected a folder transformer/' in capsys.readouterr().err
