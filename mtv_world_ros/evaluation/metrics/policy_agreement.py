@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import warnings
 
@@ -106,7 +106,7 @@ def agreement_interval(
     if not np.isfinite(whole) or np.array_equal(both[0], both[1], equal_nan=True):
         return UNKNOWN
     of_draws, is_worse_low = _OF_DRAWS[score]
-    doubtful, trusting = (of_draws(*draw_rates(*both, scale)) for scale in _PRIORS)
+    doubtful, trusting = (of_draws(*draw_rates(both[0], both[1], scale)) for scale in _PRIORS)
     if is_worse_low:
         low, high = np.quantile(doubtful, _WORSE_TAIL), np.quantile(trusting, 1 - _BETTER_TAIL)
     else:
@@ -128,7 +128,10 @@ def _violation_of(judged: FloatArray, true: FloatArray) -> FloatArray:
 
 
 #: score -> the same of draws, and whether a low value is the worse one
-_OF_DRAWS = {pearson: (_pearson_of, True), mean_maximum_rank_violation: (_violation_of, False)}
+_OF_DRAWS: Mapping[object, tuple[Callable[[FloatArray, FloatArray], FloatArray], bool]] = {
+    pearson: (_pearson_of, True),
+    mean_maximum_rank_violation: (_violation_of, False),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

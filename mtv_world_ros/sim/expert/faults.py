@@ -493,10 +493,11 @@ def _controller_faults(
         positions = _weak(positions, grippers, variant.size('weak'), own)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
     error = np.zeros_like(positions)
+    rows, joints = error.shape
     if variant.size('zero'):
-        error += _offset(*error.shape, variant.size('zero'), period, rng)
+        error += _offset(rows, joints, variant.size('zero'), period, rng)
     if variant.size('spike'):
-        error += _spikes(*error.shape, variant.size('spike'), period, rng)
+        error += _spikes(rows, joints, variant.size('spike'), period, rng)
     error[:, grippers] = 0.0
     return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
 
