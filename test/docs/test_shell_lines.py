@@ -48,7 +48,7 @@ PLAYER = ROOT / 'mtv_world_ros' / 'ros' / 'bags' / 'player.py'
 #: folders of the repository that lines may name files of
 FOLDERS = ('benchmark', 'config', 'docs', 'examples', 'launch', 'requirements', 'resource', 'test')
 #: options of other programs that the texts mention
-FOREIGN_OPTIONS = {'--show-args', '--symlink-install', '--system-site-packages'}
+FOREIGN_OPTIONS = {'--feedback', '--show-args', '--symlink-install', '--system-site-packages'}
 _COMMENT = re.compile(r'<!-- (needs|small): (.+?) -->')
 _CODE = re.compile(r'`([^`\n]+)`')
 
