@@ -111,7 +111,7 @@ class ToolPoses(Schema):
             return rotation(row)
         if self.rotation_is == 'quaternion_wxyz':
             return rotation(np.roll(row, -1))
-        angles = row * (np.pi / 180 if self.angle_unit == 'deg' else 1.0) * self.scale[1]
+        angles = row * UNITS[self.angle_unit] * self.scale[1]
         if self.rotation_is == 'rpy':
             return np.asarray(pin.rpy.rpyToMatrix(angles))
         return np.asarray(pin.exp3(angles))

@@ -154,8 +154,9 @@ def check_same_model(card: CheckpointCard, adapter: Path) -> None:
     if not (adapter / CARD).is_file():
         return
     theirs = read_card(adapter)
+    own, given = card.plain(), theirs.plain()
     for key in SHARED_KEYS:
-        mine, other = card.plain()[key], theirs.plain()[key]
+        mine, other = own[key], given[key]
         if mine != other:
             raise CheckpointError(
                 f"adapter '{adapter}' was trained with '{key}' {other}, this checkpoint's is "

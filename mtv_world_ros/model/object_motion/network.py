@@ -27,6 +27,8 @@ _SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
 _NEAR = 100.0  # 1 / 1 cm: clearances enter in this unit, cut off at 3
 #: clearances of a tool and an object, and of two objects
 _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
+#: heights of two fingertips over bottom and top, now and next
+_NUM_FINGERTIP_HEIGHTS = 2 * 4
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
 
@@ -164,20 +166,19 @@ class ObjectMotionNetwork(nn.Module):
             'fingertips': fingertips,
         }
         self.width, self.hidden, self.fingertips = width, hidden, fingertips
-        shape = _SHAPE
-        self.shape = _mlp(num_features + 1, width, shape)
+        self.shape = _mlp(num_features + 1, width, _SHAPE)
         # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
         # clearances now and next
         given = 22 + 2 * _NUM_TOOL_CLEARANCES
-        tips = 8 if fingertips else 0
-        self.tool_edge = _mlp(given + shape + hidden + tips, width, width, width)
+        tips = _NUM_FINGERTIP_HEIGHTS if fingertips else 0
+        self.tool_edge = _mlp(given + _SHAPE + hidden + tips, width, width, width)
         # offset (3) | velocities (6) | rotation of the other (6) | clearances
         given = 15 + _NUM_OBJECT_CLEARANCES
-        self.object_edge = _mlp(given + 2 * shape + hidden, width, width)
+        self.object_edge = _mlp(given + 2 * _SHAPE + hidden, width, width)
         self.gate = nn.Linear(width, 1)
         self.push = nn.Linear(width, 6)
         # height, clearance over the table, velocity, spin, rotation
-        self.node = _mlp(2 + 3 + 3 + 6 + shape + hidden + 2 * width, width, width)
+        self.node = _mlp(2 + 3 + 3 + 6 + _SHAPE + hidden + 2 * width, width, width)
         self.free = nn.Linear(width, 6)
         self.stay = nn.Linear(width, 1)
         self.memory = nn.GRUCell(width, hidden)
@@ -203,7 +204,7 @@ class ObjectMotionNetwork(nn.Module):
             )
         wider = ObjectMotionNetwork(self.config['num_features'], width, hidden, fingertips=True)
         w, h = (self.width, width), (self.hidden, hidden)
-        tips = (8 if self.fingertips else 0, 8)
+        tips = (_NUM_FINGERTIP_HEIGHTS if self.fingertips else 0, _NUM_FINGERTIP_HEIGHTS)
         old, new = self.state_dict(), wider.state_dict()
         known = old['tool_edge.0.weight'].shape[1] - h[0] - tips[0]
         blocks = {  # of the columns, (old, new), in the order in which `step` gives them
