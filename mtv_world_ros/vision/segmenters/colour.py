@@ -30,8 +30,10 @@ _MAX_HUE_ERROR = 28.0
 _MIN_SATURATION = 0.3
 #: shares of the object's own saturation between which its edge may lie
 _EDGE_RANGE = (0.25, 0.6)
-#: darker pixels have no hue [0-100]
-_MIN_LIGHTNESS = 8.0
+#: darker pixels have no hue [0-255]
+_MIN_LIGHTNESS_8BIT = ceil(0.08 * 255)
+#: of pixels with the hue of a word, saturation in HSV as a share of that in CIELAB, at the least
+_HSV_SHARE = 0.6
 _TRACKING = TrackingConfig()
 #: pixels of at least this share of the core's saturation say what colour the object has
 _STRONG_SHARE = 0.8
@@ -54,21 +56,17 @@ class ColourSegmenter:
         colours = _lab(np.array([list(PALETTE.values())], np.uint8))[0]
         self._saturations = _saturation(colours)
         self._word_of_ab = _hue_table(colours)
-        self._boxes = [self._box(word) for word in range(len(self._words))]
+        steps = np.arange(256, dtype=np.uint8)
+        a, b = np.meshgrid(steps, steps, indexing='ij')
+        centred = _centred(np.stack([a, a, b], -1))
+        self._chroma_of_ab = np.hypot(centred[..., 1], centred[..., 2])
+        self._shade_of_lightness = centred[:, 0, 0] + 16
 
-    def _box(self, word: int) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
-        """Least and greatest 8-bit L, a, b of pixels that `_pixels` may count as a word's."""
-        darkest = min(ceil(_MIN_LIGHTNESS * 2.55), 255)
-        floor = _MIN_SATURATION * self._saturations[word]
-        a, b = np.meshgrid(np.arange(256), np.arange(256), indexing='ij')
-        saturation = np.hypot(a - 128, b - 128) / (darkest * 100 / 255 + 16)
-        # a share of the core's, which is above the floor; less, for rounding
-        is_near = (self._word_of_ab == word) & (saturation > 0.99 * _STRONG_SHARE * floor)
-        rows, columns = np.flatnonzero(is_near.any(1)), np.flatnonzero(is_near.any(0))
-        if not len(rows):
-            return (255, 255, 255), (0, 0, 0)
-        low = darkest, int(rows[0]), int(columns[0])
-        return low, (255, int(rows[-1]), int(columns[-1]))
+    def _least_hsv(self, words: Sequence[str]) -> tuple[int, int, int]:
+        """8-bit hue, saturation and value that no pixel falls short of that may be of a word."""
+        floors = [_MIN_SATURATION * self._saturations[self._words.index(word)] for word in words]
+        least = 255 * _HSV_SHARE * _STRONG_SHARE * min(floors, default=1.0)
+        return 0, int(least), _MIN_LIGHTNESS_8BIT
 
     def segment(
         self,
@@ -146,34 +144,36 @@ class ColourSegmenter:
     def _look(self, frames: ByteArray, names: tuple[str, ...]) -> _Images:
         """Looks at (T, H, W, 3) frames for pixels of the hues that the names speak of.
 
-        All that are out of a word's box in CIELAB are too pale for `_pixels`: most of an image
-        is, and is looked at only once.
+        What is too pale or dark to be of a word shows in HSV, at a fifth of the cost of CIELAB:
+        most of an image is, and is looked at no further.
         """
         colours = [colour_of(name) for name in names]
         parts = [part_of(name, word) for name, word in zip(names, colours, strict=True)]
         wanted = sorted({word for word in (*colours, *parts) if word is not None})
-        nothing = (np.zeros(0, np.intp), np.zeros((0, 3), np.uint8))
+        least = self._least_hsv(wanted)
+        nothing = (np.zeros(0, np.intp), np.zeros(0, np.float32))
         found = {word: [nothing] for word in wanted}
-        num_pixels, width = frames[0, ..., 0].size, frames.shape[2]
-        for number, frame in enumerate(frames):
-            lab = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2LAB), np.uint8)
+        hsv = np.empty(frames.shape[1:], np.uint8)
+        for number, frame in enumerate(frames if wanted else ()):
+            cv2.cvtColor(frame, cv2.COLOR_RGB2HSV, dst=hsv)
+            at = np.flatnonzero(np.not_equal(cv2.inRange(hsv, least, (255, 255, 255)), 0))
+            if not len(at):
+                continue
+            rgb = frame.reshape(-1, 3).take(at, axis=0)
+            lightness, a, b = np.asarray(cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB))[0].T
+            ab = a.astype(np.intp) * 256 + b
+            saturation = self._chroma_of_ab.take(ab) / self._shade_of_lightness.take(lightness)
+            words = np.where(lightness >= _MIN_LIGHTNESS_8BIT, self._word_of_ab.take(ab), 255)
+            at += number * frame[..., 0].size
             for word, pieces in found.items():
-                index = self._words.index(word)
-                near = cv2.findNonZero(cv2.inRange(lab, *self._boxes[index]))
-                if near is None:
-                    continue
-                at = np.asarray(near, np.intp).reshape(-1, 2) @ np.array([1, width])
-                values = lab.reshape(-1, 3).take(at, axis=0)
-                is_word = self._word_of_ab[values[:, 1], values[:, 2]] == index
-                if not is_word.all():
-                    at, values = at[is_word], values[is_word]
-                pieces.append((at + number * num_pixels, values))
+                is_word = words == self._words.index(word)
+                pieces.append((at[is_word], saturation[is_word]))
         return _Images(
             frames=frames,
             background=_median(frames[:, ::4, ::4]),
             inside={
                 word: (np.concatenate([at for at, _ in pieces]),
-                       np.concatenate([values for _, values in pieces]))
+                       np.concatenate([saturation for _, saturation in pieces]))
                 for word, pieces in found.items()
             },
         )  # fmt: skip
@@ -181,8 +181,7 @@ class ColourSegmenter:
     def _pixels(self, images: _Images, word: str) -> BoolArray:
         """(T, H, W) pixels of a colour, down to where the object makes up half of a pixel."""
         floor = _MIN_SATURATION * self._saturations[self._words.index(word)]
-        inside, values = images.inside[word]
-        saturation = _saturation(_centred(values))
+        inside, saturation = images.inside[word]
         shape = images.frames.shape[:3]
         num_core = shape[0] * max(1, _TRACKING.min_area(shape) // 2)
         pixels = np.zeros(shape, np.bool_)
@@ -203,12 +202,12 @@ class _Images:
         frames: (T, H, W, 3) uint8 RGB.
         background: (3,) the median colour, RGB.
         inside: by word the N pixels of its hue, but for some of the palest: flat indices (N,)
-            into T, H, W, and (N, 3) uint8 CIELAB as OpenCV packs it.
+            into T, H, W, and saturations (N,).
     """
 
     frames: ByteArray
     background: Floats
-    inside: dict[str, tuple[NDArray[np.intp], ByteArray]]
+    inside: dict[str, tuple[NDArray[np.intp], Floats]]
 
 
 def _edge(colour: Floats, background: Floats, core: float) -> float:
@@ -223,10 +222,13 @@ def _edge(colour: Floats, background: Floats, core: float) -> float:
 
 def _median(pixels: ByteArray) -> Floats:
     """(3,) the median of (..., 3) uint8 by channel, which numpy takes longer to sort."""
-    channels = pixels.reshape(-1, 3).T
-    middle = [(channels.shape[1] - 1) // 2, channels.shape[1] // 2]
-    counts = [np.bincount(channel, minlength=256).cumsum() for channel in channels]
-    return np.array([np.searchsorted(count, middle, side='right').mean() for count in counts])
+    image = np.ascontiguousarray(pixels).reshape(1, -1, 3)
+    middle = [(image.shape[1] - 1) // 2, image.shape[1] // 2]
+    counts = [cv2.calcHist([image], [channel], None, [256], [0, 256]) for channel in range(3)]
+    return np.array([
+        np.searchsorted(np.cumsum(count, dtype=np.float64), middle, side='right').mean()
+        for count in counts
+    ])  # fmt: skip
 
 
 def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolArray | None:

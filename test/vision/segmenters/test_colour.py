@@ -272,14 +272,25 @@ def test_resized_mask_covers_half_pixels():
     assert small.tolist() == [[[True, True], [False, False]]]
 
 
-def test_no_pixel_that_may_count_is_left_out_by_its_words_box():
-    """Over all 8-bit CIELAB at four lightnesses: hue of the word, saturation near the floor."""
+def test_no_colour_that_may_count_is_left_out_by_its_saturation_in_hsv():
+    """Over all colours: hue of a word, and a saturation in CIELAB that may be an object's."""
     segmenter = ColourSegmenter()
-    a, b = np.meshgrid(np.arange(256), np.arange(256), indexing='ij')
-    for word, (low, high) in enumerate(segmenter._boxes):
-        floor = 0.8 * 0.3 * segmenter._saturations[word]
-        for lightness in (21, 60, 128, 255):
-            saturation = np.hypot(a - 128.0, b - 128.0) / (lightness / 2.55 + 16)
-            counts = (segmenter._word_of_ab == word) & (saturation > floor)
-            in_box = (a >= low[1]) & (a <= high[1]) & (b >= low[2]) & (b <= high[2])
-            assert low[0] <= 21 and not (counts & ~in_box).any(), word
+    words = list(PALETTE)
+    least = np.array([segmenter._least_hsv([word]) for word in words])
+    assert least[:, 1].min() > 10  # most of a grey image is left out
+    floors = np.append(0.8 * 0.3 * segmenter._saturations, np.inf)  # infinity: of no word
+    green, blue = np.meshgrid(np.arange(256), np.arange(256), indexing='ij')
+    for red in range(256):
+        rgb = np.stack([np.full_like(green, red), green, blue], -1).astype(np.uint8)
+        lab = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB))
+        lightness, a, b = np.moveaxis(lab.astype(np.float64), -1, 0)
+        word = segmenter._word_of_ab[lab[..., 1], lab[..., 2]]
+        saturation = np.hypot(a - 128, b - 128) / (lightness / 2.55 + 16)
+        counts = (lightness >= 20) & (saturation > 0.999 * floors[word])
+        hsv = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))[counts]
+        assert (hsv >= least[word[counts]]).all(), red
+        # pixels are looked at in rows of those that may count
+        row = rgb.reshape(1, -1, 3)[:, : red + 1]
+        assert np.array_equal(
+            cv2.cvtColor(row, cv2.COLOR_RGB2LAB)[0], lab.reshape(-1, 3)[: red + 1]
+        )
