@@ -20,6 +20,7 @@ PARAMETERS = {
     'calibration_file': (str, "YAML with every view's pose"),
     'compressed_input': (bool, '<camera>/image_raw/compressed instead of image_raw'),
     'num_inference_steps': (int, 'denoising steps a chunk'),
+    'autostart': (bool, 'false leaves the states to a lifecycle manager'),
     'mode': (str, 'observe or imagine'),
     'pace': (str, 'realtime or burst'),
 }

@@ -37,15 +37,32 @@ def launch(tmp_path):
         **os.environ, 'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }  # fmt: skip
 
+    started = []
+
     def launch(name, *arguments):
-        return subprocess.Popen(
+        started.append(subprocess.Popen(
             ['ros2', 'launch', 'mtv_world_ros', name, *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path,
             env=environment,
-        )  # fmt: skip
+        ))  # fmt: skip
+        return started[-1]
 
     launch.environment = environment
-    return launch
+    yield launch
+    for process in started:
+        if process.poll() is None:  # the test failed
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+
+
+def read_until(process, text):
+    """Reads what a launch says up to a text."""
+    said = []
+    for line in process.stdout:
+        said.append(line)
+        if text in line:
+            return
+    raise AssertionError(''.join(said))
 
 
 @pytest.fixture
@@ -72,9 +89,7 @@ def check_end(process):
 @pytest.mark.native_ros
 def test_node_starts_and_ends_on_ctrl_c(launch):
     process = launch('world_model.launch.py', 'mode:=imagine')
-    for line in process.stdout:
-        if 'ready: low, high' in line:
-            break
+    read_until(process, 'ready: low, high')
     process.send_signal(signal.SIGINT)
     check_end(process)
 
@@ -82,9 +97,7 @@ def test_node_starts_and_ends_on_ctrl_c(launch):
 @pytest.mark.native_ros
 def test_lifecycle_node_answers_the_command_line(launch, ros2):
     process = launch('world_model.launch.py', 'autostart:=false')
-    for line in process.stdout:
-        if 'waits for a lifecycle manager' in line:
-            break
+    read_until(process, 'waits for a lifecycle manager')
     assert 'unconfigured' in ros2('lifecycle', 'get', '/world_model')
     for transition, state in (('configure', 'inactive'), ('activate', 'active')):
         assert 'successful' in ros2('lifecycle', 'set', '/world_model', transition)
@@ -97,9 +110,7 @@ def test_lifecycle_node_answers_the_command_line(launch, ros2):
 @pytest.mark.control_msgs
 def test_action_answers_the_command_line(launch, ros2):
     process = launch('world_model.launch.py')
-    for line in process.stdout:
-        if 'ready: low, high' in line:
-            break
+    read_until(process, 'ready: low, high')
     name = '/world_model/follow_joint_trajectory'
     kind = 'control_msgs/action/FollowJointTrajectory'
     assert f'{name} [{kind}]' in ros2('action', 'list', '-t')
