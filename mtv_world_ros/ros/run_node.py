@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import ctypes
+import gc
 import os
 from pathlib import Path
 import signal
@@ -113,3 +114,4 @@ def _shut_down(node: Node | None) -> None:
         close = getattr(node, 'close', node.destroy_node)
         close()
     rclpy.try_shutdown()
+    gc.freeze()  # a last search for cycles in half a million objects takes Python a second or more

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import time
 
 import pytest
 
@@ -69,13 +70,20 @@ def read_until(process, text):
 def ros2(launch):
     """Runs the command line beside a launch; returns what it said."""
 
-    def ros2(*arguments):
-        return subprocess.run(
-            ['ros2', *arguments], env=launch.environment, capture_output=True, text=True,
-            timeout=180, check=True,
-        ).stdout  # fmt: skip
+    def ros2(*arguments, until=''):
+        """With `until` again and again, for a minute: discovery takes its time."""
+        end = time.monotonic() + 60
+        while True:
+            ran = subprocess.run(
+                ['ros2', *arguments], env=launch.environment, capture_output=True, text=True,
+                timeout=180, check=False,
+            )  # fmt: skip
+            if ran.returncode == 0 and until in ran.stdout:
+                return ran.stdout
+            assert until and time.monotonic() < end, (arguments, ran.stdout, ran.stderr)
 
-    return ros2
+    yield ros2
+    ros2('daemon', 'stop')
 
 
 def check_end(process):
@@ -98,6 +106,7 @@ def test_node_starts_and_ends_on_ctrl_c(launch):
 def test_lifecycle_node_answers_the_command_line(launch, ros2):
     process = launch('world_model.launch.py', 'autostart:=false')
     read_until(process, 'waits for a lifecycle manager')
+    ros2('lifecycle', 'nodes', until='/world_model')
     assert 'unconfigured' in ros2('lifecycle', 'get', '/world_model')
     for transition, state in (('configure', 'inactive'), ('activate', 'active')):
         assert 'successful' in ros2('lifecycle', 'set', '/world_model', transition)
@@ -113,7 +122,7 @@ def test_action_answers_the_command_line(launch, ros2):
     read_until(process, 'ready: low, high')
     name = '/world_model/follow_joint_trajectory'
     kind = 'control_msgs/action/FollowJointTrajectory'
-    assert f'{name} [{kind}]' in ros2('action', 'list', '-t')
+    ros2('action', 'list', '-t', until=f'{name} [{kind}]')
     points = '[{positions: [0.0], time_from_start: {sec: 1}}]'
     goal = f'{{trajectory: {{joint_names: [elbow], points: {points}}}}}'
     said = ros2('action', 'send_goal', name, kind, goal)
