@@ -375,7 +375,7 @@ class NodeProcess:
         return self._log.read()
 
 
-def start_node(folder, *parameters, script=FAKE, remaps=()):
+def start_node(folder, *parameters, program=(str(FAKE),), remaps=()):
     """Starts the node with `name:=value` parameters and remappings."""
     calibration = make_calibration(folder / 'calibration.yaml')
     values = (
@@ -388,7 +388,7 @@ def start_node(folder, *parameters, script=FAKE, remaps=()):
     )
     options = [part for value in values for part in ('-p', value)]
     options += [part for rule in remaps for part in ('-r', rule)]
-    command = [sys.executable, str(script), '--ros-args', *options]
+    command = [sys.executable, *program, '--ros-args', *options]
     return NodeProcess(command, folder / 'node.log')
 
 

@@ -1,11 +1,17 @@
 """The node as it is installed, with the bundled checkpoint and the bundled episode."""
 
+import importlib
+import os
+from pathlib import Path
+import resource
 import signal
 import subprocess
 import sys
 
+from action_msgs.msg import GoalStatus
 import numpy as np
 import pytest
+from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo, Image
 
 from mtv_world_ros.data.episode_reader import read_episode
@@ -15,6 +21,8 @@ from mtv_world_ros.ros.messages.image_messages import to_rgb
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 
 START_S = 120
+NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
+CHUNK_S = 3.2
 
 
 @pytest.fixture
@@ -70,3 +78,65 @@ def test_bundled_episode_is_imagined_over_the_middleware(bundled, ros, tmp_path)
             player.wait(timeout=20)
         client.close()
         assert process.stop(signal.SIGINT) == 0, process.output()
+
+
+@pytest.fixture
+def started(bundled, ros, tmp_path):
+    """The node with the bundled model, and a client that has shown it a scene."""
+    values = ('pace:=burst', 'max_image_age_s:=600.0', 'max_joint_state_age_s:=600.0',
+              'max_horizon_s:=600.0')  # fmt: skip
+    process = ros.start_node(tmp_path, *values, program=NODE)
+    client = ros.Client()
+    client.wait(client.diagnostic_values, 'the node', START_S)
+    client.connect_inputs(ros.INPUTS)
+    client.send_scene()
+    yield process, client
+    client.close()
+    assert process.stop() == 0, process.output()
+    assert 'Traceback' not in process.output(), process.output()
+
+
+def cpu_s(pid):
+    """CPU time that a process has used [s], all threads."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def ended_children_cpu_s():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def test_sigint_while_the_bundled_model_computes_ends_the_node(started):
+    process, client = started
+    client.send_trajectory(seconds=40 * CHUNK_S)
+    client.wait_for_state('chunk', 0)
+    said = process.output()
+    before_s = ended_children_cpu_s() + cpu_s(process.process.pid)
+    assert process.stop(signal.SIGINT) == 0, process.output()
+    # CPU time, since this machine may be busy; 0.2 s were measured
+    assert ended_children_cpu_s() - before_s < 1.0
+    assert len(process.output().splitlines()) <= len(said.splitlines()) + 1, process.output()
+
+
+@pytest.mark.control_msgs
+def test_a_goal_is_cancelled_while_the_bundled_model_computes(started, ros):
+    _, client = started
+    messages = importlib.import_module('control_msgs.action').FollowJointTrajectory
+    actions = ActionClient(client.node, messages, '/world_model/follow_joint_trajectory')
+    client.wait(actions.server_is_ready, 'the action')
+    feedback = []
+    trajectory = ros.make_trajectory(seconds=40 * CHUNK_S)
+    asked = actions.send_goal_async(messages.Goal(trajectory=trajectory), feedback.append)
+    client.wait(asked.done, 'acceptance')
+    handle = asked.result()
+    client.wait(lambda: feedback, 'a chunk')
+    answer, result = handle.cancel_goal_async(), handle.get_result_async()
+    client.wait(answer.done, 'an answer')
+    assert answer.result().goals_canceling
+    client.wait(result.done, 'a result')
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert 'of 40 chunks imagined' in result.result().result.error_string
+    assert client.wait_for_ends(1, 0)[0]['state'] == 'preempted'
+    actions.destroy()
+    assert client.imagine_one()['state'] == 'done'  # the node goes on
