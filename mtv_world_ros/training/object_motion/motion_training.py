@@ -38,8 +38,10 @@ _EMA_DECAY = 0.999
 _WIDTH, _HIDDEN = 128, 48
 #: steps between two savings, and of a row of the curve
 _SAVE_EVERY, _CURVE_EVERY = 500, 100
-#: an object has moved if it went further than this [m]
+#: an object has moved if it went further than this, and siblings have parted [m]
 _MOVED_M = 0.01
+#: of batches, the share drawn as groups of siblings, and the most siblings of a group
+_SIBLINGS_SHARE, _GROUP = 0.5, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +78,7 @@ class _Batch:
     rotations: Tensor
     known: Tensor
     turns_known: Tensor
+    parted: Tensor
 
 
 def read_tracks(
@@ -172,13 +175,18 @@ def _losses(
         network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4
     )
     most = max(len(track.features) for track in tracks)
+    scenes: dict[str, list[ObjectTracks]] = {}
+    for track in tracks:
+        if track.scene:
+            scenes.setdefault(track.scene, []).append(track)
+    siblings = [group for group in scenes.values() if len(group) > 1]
     if config.compile:
         network.step = torch.compile(network.step)
     for step in range(config.steps):
         for group in optimizer.param_groups:
             group['lr'] = _rate(step, config)
-        chosen = [tracks[k] for k in rng.integers(len(tracks), size=config.batch_size)]
-        batch = _turned(_windows(chosen, most, rng), rng)
+        groups = _drawn(tracks, siblings, config.batch_size, rng)
+        batch = _turned(_stacked([p for group in groups for p in _windows(group, most, rng)]), rng)
         forced = _forced(step / config.steps, config, batch, rng)
         loss = _loss(network(batch.scene, (batch.points, batch.rotations), forced), batch)
         if not math.isfinite(loss.item()):
@@ -242,25 +250,50 @@ def _forced(
     return torch.from_numpy(forced)
 
 
-def _windows(tracks: Sequence[ObjectTracks], most: int, rng: np.random.Generator) -> _Batch:
-    parts = []
-    for track in tracks:
-        last = len(track.points) - 1
-        start = 0
-        if last > _WINDOW and rng.random() >= _FROM_START:
-            start = int(rng.integers(0, last - _WINDOW))
+def _drawn(
+    tracks: Sequence[ObjectTracks],
+    siblings: Sequence[Sequence[ObjectTracks]],
+    size: int,
+    rng: np.random.Generator,
+) -> list[list[ObjectTracks]]:
+    """A batch of `size` tracks: some in groups of siblings if there are any, others alone."""
+    groups: list[list[ObjectTracks]] = []
+    left = size
+    while siblings and left > size * (1 - _SIBLINGS_SHARE):
+        family = siblings[rng.integers(len(siblings))]
+        picked = rng.permutation(len(family))[: min(_GROUP, left)]
+        groups.append([family[k] for k in picked])
+        left -= len(picked)
+    return groups + [[tracks[k]] for k in rng.integers(len(tracks), size=left)]
+
+
+def _windows(
+    group: Sequence[ObjectTracks], most: int, rng: np.random.Generator
+) -> list[dict[str, np.ndarray]]:
+    """Rows of a batch: windows of tracks of one scene that begin at the same time."""
+    parts, last = [], min(len(track.points) for track in group) - 1
+    start = 0
+    if last > _WINDOW and rng.random() >= _FROM_START:
+        start = int(rng.integers(0, last - _WINDOW))
+    wanted = np.arange(start, start + _WINDOW + 1)
+    shown = [np.minimum(wanted, len(track.points) - 1) for track in group]
+    points = np.stack([track.points[rows] for track, rows in zip(group, shown, strict=True)])
+    for track, rows, own in zip(group, shown, points, strict=True):
         order = rng.permutation(len(track.features))
-        rows = np.minimum(np.arange(start, start + _WINDOW + 1), last)
         noise = rng.normal(0.0, _PLACE_NOISE_M, (len(order), 3))
         scale = rng.normal(1.0, _SHAPE_NOISE, (len(order), 1, track.features.shape[2]))
-        parts.append(_part(track, rows, order, noise, scale, most))
-    return _stacked(parts)
+        parted = (np.linalg.norm(points - own, axis=-1) > _MOVED_M).any(0)
+        parts.append(_part(track, rows, order, noise, scale, most, parted))
+    return parts
 
 
 def _whole(track: ObjectTracks) -> _Batch:
     order = np.arange(len(track.features))
     rows = np.arange(len(track.points))
-    return _stacked([_part(track, rows, order, np.zeros((len(order), 3)), 1.0, len(order))])
+    parted = np.zeros((len(rows), len(order)), bool)
+    return _stacked(
+        [_part(track, rows, order, np.zeros((len(order), 3)), 1.0, len(order), parted)]
+    )
 
 
 def _part(
@@ -270,6 +303,7 @@ def _part(
     noise: np.ndarray,
     scale: np.ndarray | float,
     most: int,
+    parted: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """One row of a batch, padded to `most` objects."""
     extra = most - len(order)
@@ -286,6 +320,7 @@ def _part(
         'rotations': np.concatenate([track.rotations[rows][:, order], eye], axis=1),
         'known': np.pad(track.known[rows][:, order], ((0, 0), (0, extra))),
         'turns_known': np.array(track.turns_known),
+        'parted': np.pad(parted[:, order], ((0, 0), (0, extra))),
     }
 
 
@@ -307,6 +342,7 @@ def _stacked(parts: Sequence[dict[str, np.ndarray]]) -> _Batch:
         rotations=of('rotations'),
         known=of('known'),
         turns_known=of('turns_known'),
+        parted=of('parted'),
     )
 
 
@@ -349,5 +385,8 @@ def _loss(motion: Motion, batch: _Batch) -> Tensor:
     start = batch.points[:, :1]
     ways = torch.stack([batch.points - start, motion.points.detach() - start])
     moved = (ways.norm(dim=-1) > _MOVED_M).any(0)
-    weights = (batch.known & batch.scene.present[:, None]) * (1.0 + 3.0 * moved)
+    # and where the commands of siblings made the difference
+    weights = (batch.known & batch.scene.present[:, None]) * (
+        1.0 + 3.0 * moved + 4.0 * batch.parted
+    )
     return ((place + 0.3 * turn + 0.02 * doubt) * weights).sum() / weights.sum()

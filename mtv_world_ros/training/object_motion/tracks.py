@@ -37,6 +37,7 @@ class ObjectTracks:
         rotations: (T + 1, O, 3, 3) from the start.
         known: (T + 1, O) bool.
         turns_known: the rotations are recorded, not taken to be none.
+        scene: of siblings, whose rows are of the same times; empty = it has none, or begins later.
     """
 
     features: FloatArray
@@ -46,6 +47,7 @@ class ObjectTracks:
     rotations: FloatArray
     known: BoolArray
     turns_known: bool
+    scene: str = ''
 
 
 def object_tracks(
@@ -133,6 +135,7 @@ class _Recording:
             rotations=rotations,
             known=known & np.isfinite(start).all(-1),
             turns_known=self.episode.object_poses is not None,
+            scene='' if row else str(self.episode.info.metadata.get('scene', '')),
         )
 
     def _moved(self, start: FloatArray, row: int) -> tuple[FloatArray, FloatArray, BoolArray]:

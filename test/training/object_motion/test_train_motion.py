@@ -104,6 +104,25 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
         train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
+def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, robot, monkeypatch):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    assert track.scene == ''
+    away = track.points + np.linspace(0, 0.05, len(track.points))[:, None, None] * [1, 0, 0]
+    first, second = replace(track, scene='a'), replace(track, scene='a', points=away)
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(motion_training, '_FROM_START', 1.0)
+    groups = motion_training._drawn([track, first, second], [[first, second]], 8, rng)
+    assert [len(group) for group in groups] == [2, 2, 1, 1, 1, 1]
+    parts = motion_training._windows([first, second], len(track.features), rng)
+    shift = 0.05 * np.arange(len(track.points)) / (len(track.points) - 1)
+    for part in parts:
+        rows = np.arange(motion_training._WINDOW + 1)
+        np.testing.assert_array_equal(part['parted'].all(1), shift[rows] > 0.01)
+        np.testing.assert_array_equal(part['parted'].any(1), shift[rows] > 0.01)
+    (alone,) = motion_training._windows([first], len(track.features), rng)
+    assert not alone['parted'].any()
+
+
 def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
     with pytest.raises(TrainingError, match='no episode can be trained on'):
         read_tracks([tmp_path], robot, VIEWS)
