@@ -116,6 +116,45 @@ def test_lifecycle_node_answers_the_command_line(launch, ros2):
 
 
 @pytest.mark.native_ros
+def test_parameters_topics_and_services_answer_the_command_line(launch, ros2):
+    process = launch('world_model.launch.py', 'pace:=burst', 'namespace:=robot1')
+    read_until(process, 'ready: low, high')
+    node = '/robot1/world_model'
+    ros2('node', 'list', until=node)
+    assert 'String value is: burst' in ros2('param', 'get', node, 'pace')
+    assert 'successful' in ros2('param', 'set', node, 'pace', 'realtime')
+    assert 'failed' in ros2('param', 'set', node, 'calibration_file', '/nowhere')
+    said = ros2('param', 'describe', node, 'max_image_age_s')
+    assert 'Type: double' in said and 'Description: ' in said
+    kinds = ros2('topic', 'list', '-t')
+    assert f'{node}/success [std_msgs/msg/Float64]' in kinds
+    assert '/robot1/low/image_raw [sensor_msgs/msg/Image]' in kinds
+    health = ros2('topic', 'echo', '--once', '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray')
+    assert 'name: robot1/world_model' in health and 'hardware_id: robot1/' in health
+    assert 'no publisher' in health and '/robot1/joint_states' in health
+    said = ros2('service', 'call', f'{node}/reset', 'std_srvs/srv/Trigger')
+    assert 'success=True' in said
+    process.send_signal(signal.SIGINT)
+    check_end(process)
+
+
+@pytest.mark.native_ros
+def test_a_second_subscriber_hears_every_verdict(launch):
+    """Three plans of one chunk each; `ros2 topic echo` is there before the node is."""
+    command = ['ros2', 'topic', 'echo', '/world_model/success', 'std_msgs/msg/Float64']
+    echo = subprocess.Popen(
+        command, env=launch.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True,
+    )  # fmt: skip
+    try:
+        check_end(launch('replay.launch.py', 'pace:=realtime'))
+    finally:
+        echo.send_signal(signal.SIGINT)
+        said, _ = echo.communicate(timeout=60)
+    assert said.count('data: ') == 3, said
+
+
+@pytest.mark.native_ros
 @pytest.mark.control_msgs
 def test_action_answers_the_command_line(launch, ros2):
     process = launch('world_model.launch.py')
