@@ -96,6 +96,7 @@ def load_pipeline(
     dtype: str = 'auto',
     num_threads: int = 0,
     segmenter: str = 'auto',
+    describer: str | Path | None = None,
     serving: str = '',
     calibrated: bool = True,
     adapter: Path | None = None,
@@ -105,12 +106,14 @@ def load_pipeline(
     Args:
         checkpoint: folder, or `bundled`.
         robot: YAML file or name of a bundled robot; default: the one in the checkpoint.
-        objects: names of the objects; empty = those the instruction names.
+        objects: names of the objects; empty = the describer's.
         task: the task to judge, by name or YAML file; default: the one the instruction matches.
         device: `cpu`, `cuda`, ...
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
         num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
+        describer: YAML file of what names the objects of the first real frame; empty = the
+            words of the instruction.
         serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
             `ServingOptions`.
         calibrated: use the checkpoint's calibration of the success estimate, where it has one.
@@ -147,6 +150,7 @@ def load_pipeline(
         objects=objects,
         task=task,
         segmenter=assemble_segmenter(segmenter, device=device),
+        describer=asked_describer(describer),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
         object_motion=None if loaded.object_motion is None else load_network(loaded.object_motion),
@@ -161,6 +165,7 @@ def assemble(
     objects: tuple[str, ...] = (),
     task: str | None = None,
     segmenter: Segmenter | None = None,
+    describer: Describer | None = None,
     calibration: Calibration | None = None,
     horizon: HorizonCurve | None = None,
     object_motion: ObjectMotionNetwork | None = None,
@@ -179,6 +184,7 @@ def assemble(
         rendering=TrajectoryVideoConfig(**card.rendering),
         object_mask=card.object_mask,
         objects=objects,
+        describer=describer,
         horizon=horizon,
         object_motion=_predictor(object_motion, robot),
     )
@@ -310,6 +316,15 @@ def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMake
 def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:
     """Returns the segmenter of that name, see `choose_segmenter`; its `name` says which it is."""
     return choose_segmenter(choice, device=device)
+
+
+def asked_describer(file: str | Path | None) -> Describer | None:
+    """Returns the describer of `--describer` or the parameter `describer`; None = none is asked.
+
+    Raises:
+        ConfigError, CheckpointError: see `assemble_describer`.
+    """
+    return assemble_describer(file) if file else None
 
 
 def assemble_describer(config: DescriberConfig | str | Path | None = None) -> Describer:

@@ -38,7 +38,7 @@ from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.rollout_memory import footage_of
-from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
@@ -101,7 +101,8 @@ class Pipeline:
         estimator: judges the outcome.
         rendering: how trajectory videos look; must be what the model was trained with.
         object_mask: whether trajectory videos carry the object masks.
-        objects: names of the objects; empty = the ones the instruction names.
+        objects: names of the objects; empty = the describer's.
+        describer: names the objects of an episode's first frame; None = the instruction's words.
         horizon: how J falls with the horizon, where it was measured.
         object_motion: where objects go, for models whose trajectory videos show that; None = the
             trajectory video shows them where they were.
@@ -114,6 +115,7 @@ class Pipeline:
     rendering: TrajectoryVideoConfig
     object_mask: bool = True
     objects: tuple[str, ...] = ()
+    describer: Describer | None = None
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
 
@@ -209,7 +211,8 @@ class ImaginedEpisode:
     Attributes:
         pipeline: imagines and judges.
         instruction: what the robot was told; names the objects unless they are given.
-        objects: names of the objects; empty = the pipeline's, else those of the instruction.
+        objects: names of the objects; empty = the pipeline's, else its describer's, which is
+            asked once for each instruction, else those of the instruction.
         seed: of the noise; chunk k of rollout r uses `seed + k + r * SEED_STEP`.
         num_seeds: rollouts; each takes as long as one.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
@@ -228,6 +231,7 @@ class ImaginedEpisode:
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
     _rollouts: tuple[RolloutState, ...]
+    _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def observation(self) -> Observation:
@@ -236,8 +240,20 @@ class ImaginedEpisode:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the objects."""
-        return self.objects or self.pipeline.objects or objects_from_instruction(self.instruction)
+        """Names of the objects.
+
+        Raises:
+            DescriptionError: the describer failed.
+        """
+        if self.objects or self.pipeline.objects:
+            return self.objects or self.pipeline.objects
+        if self.instruction not in self._described:
+            self._described[self.instruction] = name_objects(
+                self.instruction,
+                describer=self.pipeline.describer,
+                first_frame=lambda: self._rollouts[0].source.frames[0],
+            )
+        return self._described[self.instruction]
 
     def extend(self, trajectory: JointTrajectory) -> Iterator[Prediction]:
         """Imagines a trajectory from where the episode stands; yields each chunk once it is ready.
@@ -250,6 +266,7 @@ class ImaginedEpisode:
         Raises:
             TrajectoryError: the trajectory does not fit the robot.
             CalibrationError: a lens' distortion moves a tool out of the middle of the image.
+            DescriptionError: the describer failed.
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """

@@ -27,6 +27,7 @@ from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.vision.describers.scene_objects import SceneObject
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
@@ -596,3 +597,30 @@ def test_a_lens_that_moves_the_tools_out_of_the_image_is_refused(
     episode = pipeline.begin(replace(start, cameras=(wrong, start.cameras[1])))
     with pytest.raises(CalibrationError, match="in the middle of view 'low', but its distortion"):
         list(episode.extend(commands(recording, 1.6)))
+
+
+def test_a_describer_is_asked_once_about_the_first_real_frame(
+    pipeline: Pipeline, recording: Recording
+) -> None:
+    shown = []
+
+    class Describer:
+        def describe(self, first_frame, instruction):
+            shown.append((first_frame, instruction))
+            return (SceneObject(id='a', name='blue block'),)
+
+    asking = replace(pipeline, describer=Describer())
+    observed = ObservedEpisode(asking)
+    for k in range(2):
+        moment = replace(observe(recording), stamp_ns=recording.stamp_ns + k)
+        episode = observed.begin(moment, instruction='tidy up')
+        chunks = list(episode.extend(commands(recording, 2.0)))
+        assert all(chunk.masks.names == ('blue block',) for chunk in chunks)
+    frame, instruction = shown[0]
+    assert len(shown) == 1 and instruction == 'tidy up'
+    np.testing.assert_array_equal(frame, recording.frames[0, 0])
+    episode.instruction = 'stop'  # goes on in the imagined frames, which are not shown
+    list(episode.extend(commands(recording, 1.0)))
+    np.testing.assert_array_equal(shown[1][0], recording.frames[0, 0])
+    named = asking.begin(observe(recording), instruction='tidy up', objects=('red block',))
+    assert named.names == ('red block',) and len(shown) == 2

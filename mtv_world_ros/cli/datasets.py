@@ -7,8 +7,11 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.shared_options import add_describer
+
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import BagMapping
+    from mtv_world_ros.importing.stored_objects import ObjectStage
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -54,6 +57,28 @@ def _recover(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _add_objects(parser: argparse.ArgumentParser) -> None:
+    add_describer(parser)
+    parser.add_argument(
+        '--segmenter',
+        choices=('auto', 'colour', 'sam2', 'sam3'),
+        help="stores the objects' masks with the episodes; default: none, or those recorded",
+    )
+    parser.add_argument('--device', default='cpu', help='of the segmenter')
+
+
+def _object_stage(arguments: argparse.Namespace) -> ObjectStage:
+    from mtv_world_ros.assembly import asked_describer, assemble_segmenter
+    from mtv_world_ros.importing.stored_objects import ObjectStage, stage_key
+
+    segmenter = arguments.segmenter and assemble_segmenter(arguments.segmenter, arguments.device)
+    return ObjectStage(
+        describer=asked_describer(arguments.describer),
+        segmenter=segmenter or None,
+        key=stage_key(arguments.describer, segmenter.name if segmenter else ''),
+    )
+
+
 def _add_import_bag(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'import-bag',
@@ -69,6 +94,7 @@ def _add_import_bag(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
     parser.add_argument('--out', type=Path, required=True)
+    _add_objects(parser)
     parser.set_defaults(handler=_import_bag)
 
 
@@ -91,6 +117,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         mapping,
         robot,
         calibration=arguments.calibration,
+        stage=_object_stage(arguments),
         progress=lambda paths: tqdm(paths, unit='bag'),
     )
     values = mapping.replace(robot='robot/robot.yaml').model_dump(
@@ -138,6 +165,7 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--mapping', type=Path, required=True, help='which feature is what')
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
+    _add_objects(parser)
     parser.set_defaults(handler=_import_dataset)
 
 
@@ -151,6 +179,7 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
         arguments.mapping,
         arguments.out,
         episodes=_numbers(arguments.episodes),
+        stage=_object_stage(arguments),
         progress=lambda numbers: tqdm(numbers, unit='ep'),
     )
     for number, lines in summary.warnings.items():

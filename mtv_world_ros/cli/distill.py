@@ -36,7 +36,12 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _distill(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
+    from mtv_world_ros.assembly import (
+        asked_describer,
+        assemble_segmenter,
+        checkpoint_path,
+        checkpoint_robot,
+    )
     from mtv_world_ros.data.splits import select
     from mtv_world_ros.training.training_config import load_training_config
 
@@ -59,7 +64,8 @@ def _distill(arguments: argparse.Namespace) -> int:
         run_of(arguments, config, paths),
         settings,
         robot=robot,
-        segmenter=assemble_segmenter(device=arguments.device),
+        segmenter=assemble_segmenter(arguments.segmenter, device=arguments.device),
+        describer=asked_describer(arguments.describer),
     )
     print(f'checkpoint for {settings.num_steps} denoising steps: {folder}')
     return 0

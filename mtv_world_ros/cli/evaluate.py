@@ -9,6 +9,7 @@ import re
 from typing import NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
+    add_describer,
     add_dtype,
     add_model_options,
     add_overwrite,
@@ -87,18 +88,13 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
     parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
-    parser.add_argument(
-        '--describer',
-        type=Path,
-        metavar='YAML',
-        help='how objects are named (see config/describer.yaml); default: by the episodes',
-    )
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_overwrite(parser)
     add_dtype(parser)
     add_model_options(parser)
     add_serving(parser)
     add_seeds(parser)
+    add_describer(parser)
     add_segmenter(parser)
     add_source(parser)
     add_task(parser)
@@ -192,7 +188,7 @@ def _slug(label: str) -> str:
 def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, out: Path
 ) -> Summary:
-    from mtv_world_ros.assembly import assemble_describer, fingerprint, load_pipeline
+    from mtv_world_ros.assembly import asked_describer, fingerprint, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
     from mtv_world_ros.evaluation.settings import EvaluationConfig
@@ -233,7 +229,7 @@ def _score(
             make_pipeline=partial(load, num_threads=threads),
             threads=threads,
         ),
-        describer=arguments.describer and assemble_describer(arguments.describer),
+        describer=asked_describer(arguments.describer),
         overwrite=arguments.overwrite,
     )
 

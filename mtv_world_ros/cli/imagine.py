@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 import sys
 
 from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
+    add_describer,
     add_dtype,
     add_model_options,
     add_overwrite,
@@ -43,6 +45,7 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
+    add_describer(parser)
     add_segmenter(parser)
     add_serving(parser)
     add_task(parser)
@@ -54,13 +57,14 @@ def _replay(arguments: argparse.Namespace) -> int:
         return _play(arguments)
     if not arguments.episode.exists():
         raise EpisodeError(f"there is no episode '{arguments.episode}'")
+    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.replay.offline import replay_offline
 
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
     check_free(out, arguments.overwrite)
     summary = replay_offline(
-        pipeline_of(arguments),
+        replace(pipeline_of(arguments), describer=asked_describer(arguments.describer)),
         arguments.episode,
         out,
         source=load_source(arguments.topics, arguments.calibration),
@@ -111,6 +115,7 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
     add_overwrite(parser)
     add_checkpoint(parser)
     add_model_options(parser)
+    add_describer(parser)
     add_segmenter(parser)
     parser.set_defaults(handler=_imagine)
 
@@ -141,6 +146,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
         num_threads=arguments.threads,
         num_inference_steps=arguments.steps,
         segmenter=arguments.segmenter,
+        describer=str(arguments.describer.absolute()) if arguments.describer else '',
     )
     results = imagine_episodes(options, arguments.out, overwrite=arguments.overwrite)
     from mtv_world_ros.viewing.sheets import write_pictures

@@ -105,6 +105,17 @@ def add_segmenter(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_describer(parser: argparse.ArgumentParser) -> None:
+    """Adds `--describer`."""
+    parser.add_argument(
+        '--describer',
+        type=Path,
+        metavar='YAML',
+        help='how objects are named (see config/describer.yaml); default: the names stored with '
+        'the episode, else the colour words of its instruction',
+    )
+
+
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     """Adds `--checkpoint`."""
     parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")

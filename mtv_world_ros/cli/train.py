@@ -10,7 +10,7 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_dtype, add_source
+from mtv_world_ros.cli.shared_options import add_describer, add_dtype, add_segmenter, add_source
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.evaluation.results import StoredRollout
     from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
     from mtv_world_ros.training.training_run import HeldOut, Judge
+    from mtv_world_ros.vision.describers.describer import Describer
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -101,6 +102,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
+    add_describer(parser)
+    add_segmenter(parser)
     add_dtype(parser)
     parser.add_argument(
         '--threads',
@@ -130,7 +133,12 @@ def _train(arguments: argparse.Namespace) -> int:
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
-    from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, robot_path
+    from mtv_world_ros.assembly import (
+        asked_describer,
+        assemble_segmenter,
+        checkpoint_path,
+        robot_path,
+    )
     from mtv_world_ros.model.card import read_card
 
     # importing torch takes seconds: what is often mistyped is checked before
@@ -159,7 +167,8 @@ def _train(arguments: argparse.Namespace) -> int:
     folder = train(
         run,
         robot=load_robot(robot_path(config.video.robot)),
-        segmenter=assemble_segmenter(device=arguments.device),
+        segmenter=assemble_segmenter(arguments.segmenter, device=arguments.device),
+        describer=asked_describer(arguments.describer),
         held_out=held_out(arguments, paths, dtype, source),
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
@@ -296,6 +305,7 @@ def held_out(
     """
     if not arguments.sample_every:
         return None
+    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.training.training_run import HeldOut, spread
 
     paths = spread(_paths(arguments), arguments.held_out_episodes)
@@ -312,6 +322,8 @@ def held_out(
         dtype,
         base=arguments.init,
         source=source,
+        segmenter=arguments.segmenter,
+        describer=asked_describer(arguments.describer),
     )
     return HeldOut(judge, arguments.sample_every)
 
@@ -339,6 +351,8 @@ def make_judge(
     dtype: torch.dtype,
     base: str | None = None,
     source: EpisodeSource | None = None,
+    segmenter: str = 'auto',
+    describer: Describer | None = None,
 ) -> Judge:
     """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
@@ -349,6 +363,8 @@ def make_judge(
         dtype: of the model.
         base: checkpoint that adapters are used on.
         source: how the episodes are read; None = they are this package's own.
+        segmenter: what finds the objects.
+        describer: what names them; None = the episodes, else their instructions.
     """
     import torch
 
@@ -369,12 +385,14 @@ def make_judge(
             device=device,
             dtype=str(dtype).removeprefix('torch.'),
             num_threads=torch.get_num_threads(),  # keep the training's threads
+            segmenter=segmenter,
         )
         summary = evaluate(
             pipeline,
             paths,
             folder,
             EvaluationConfig(actions=('true',), ceiling=False, source=source or EpisodeSource()),
+            describer=describer,
             show_progress=False,
         )
         for result in summary.results:

@@ -22,6 +22,8 @@ INSTRUCTION = '/instruction'
 OBJECT_POSES = '/object_poses'
 #: name of the MCAP metadata record with task, outcome and objects
 METADATA_NAME = 'mtv_world'
+#: key of the metadata that names the segmenter of the masks, where they are not the simulator's
+MASKS_BY = 'masks_by'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
 

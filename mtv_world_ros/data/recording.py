@@ -17,7 +17,7 @@ import numpy as np
 
 from mtv_world_ros.bounded_input import parse_json, read_arrays
 from mtv_world_ros.data.bag_mapping import EpisodeSource
-from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import (
     ByteArray,
@@ -26,12 +26,13 @@ from mtv_world_ros.data_types import (
     JointTrajectory,
     WorldModelSpec,
 )
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.errors import DescriptionError, EpisodeError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.images import resize_frames, resize_labels
+from mtv_world_ros.vision.describers.describer import Describer, name_objects
 
 DEFAULT = EpisodeSource()
 #: largest distance of a frame from the wanted time, as a share of the model's period
@@ -47,7 +48,9 @@ class Recording:
         task: its name.
         outcome: `success`, `failure` or `unknown`.
         instruction: what the robot was told.
-        objects: names of the objects.
+        objects: names of the objects by the episode; what `object_ids` stand for.
+        described: names of the objects by a describer; empty = none was asked.
+        masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
         cameras: V cameras at the model's size.
         times: (N,) [s] since the first frame, increasing.
         frames: (V, N, H, W, 3) uint8 RGB.
@@ -72,7 +75,14 @@ class Recording:
     commands: JointTrajectory
     stamp_ns: int
     object_poses: FloatArray | None = None
+    described: tuple[str, ...] = ()
+    masks_by: str = ''
     warnings: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects that are drawn and scored."""
+        return name_objects(self.instruction, given=self.described, stored=self.objects)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +91,8 @@ class Clip:
 
     Attributes:
         cameras: V cameras at the model's size.
-        objects: names of the objects.
+        objects: what `object_ids` stand for.
+        masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
         times: (1 + T,) [s] since the clip's start.
         frames: (V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (V, 1 + T, H, W) uint8 or None.
@@ -98,6 +109,7 @@ class Clip:
     positions: FloatArray
     object_poses: FloatArray | None = None
     origin: Origin | None = None
+    masks_by: str = ''
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,8 +201,33 @@ def load_recording(
         commands=stitch(matched, origin),
         stamp_ns=origin,
         object_poses=_object_poses(episode, stamps),
+        masks_by=episode.info.metadata.get(MASKS_BY, ''),
         warnings=episode.warnings,
     )
+
+
+def described_objects(
+    path: Path, describer: Describer, view: str, source: EpisodeSource = DEFAULT
+) -> tuple[str, ...]:
+    """Returns the names that a describer gives to the objects of an episode's first frame.
+
+    Raises:
+        EpisodeError: the episode cannot be read, the describer failed, or saw no object.
+    """
+    episode = read_episode(
+        path, views=[view], with_cameras=False, with_masks=False, mapping=source.mapping
+    )
+    try:
+        names = name_objects(
+            episode.info.instruction,
+            describer=describer,
+            first_frame=lambda: np.asarray(episode.images[view].frames[0]),
+        )
+    except DescriptionError as error:
+        raise EpisodeError(f'its objects could not be named ({error.status}): {error}') from error
+    if not names:
+        raise EpisodeError('no object was seen in its first frame')
+    return names
 
 
 def _on_clock(episode: Episode, view: str, stamps: np.ndarray, spec: WorldModelSpec) -> ByteArray:
@@ -289,6 +326,7 @@ def cut_clip(
         positions=commanded(recording, start, times),
         object_poses=None if recording.object_poses is None else recording.object_poses[index],
         origin=_origin(recording),
+        masks_by=recording.masks_by,
     )
 
 
@@ -395,6 +433,7 @@ def _save(file: BytesIO, recording: Recording) -> None:
         'outcome': recording.outcome,
         'instruction': recording.instruction,
         'objects': recording.objects,
+        'masks_by': recording.masks_by,
         'joint_names': commands.joint_names,
         'stamp_ns': recording.stamp_ns,
         'cameras': [
@@ -459,4 +498,5 @@ def _load(file: Path, path: Path) -> Recording:
         ),
         stamp_ns=text['stamp_ns'],
         object_poses=stored.get('object_poses'),
+        masks_by=text.get('masks_by', ''),
     )

@@ -43,7 +43,8 @@ class ImagineOptions:
         max_seconds: an episode takes at most, on the wall [s].
         instruction: empty = the recorded episode's.
         seed: episode k uses seed + 1000 k.
-        checkpoint, robot, device, num_threads, num_inference_steps, segmenter: of the world model.
+        checkpoint, robot, device, num_threads, num_inference_steps, segmenter, describer: of the
+            world model.
     """
 
     policy: str
@@ -60,6 +61,7 @@ class ImagineOptions:
     num_threads: int = 0
     num_inference_steps: int = 0
     segmenter: str = 'colour'
+    describer: str = ''
 
 
 def imagine_episodes(
@@ -157,6 +159,7 @@ def _world_model_command(options: ImagineOptions, views: Sequence[str]) -> list[
         'num_threads': options.num_threads,
         'num_inference_steps': options.num_inference_steps,
         'segmenter': options.segmenter,
+        'describer': options.describer,
     }
     return module_command('world_model.node', *ros_arguments(parameters, _REMAPS))
 

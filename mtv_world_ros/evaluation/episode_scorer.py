@@ -42,7 +42,6 @@ from mtv_world_ros.evaluation.results import (
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.jaccard import object_scores, ObjectScores
 
 #: what the time of an episode goes into
@@ -131,8 +130,7 @@ class EpisodeScorer:
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
         success = None
-        names = job.objects or self.pipeline.objects or recording.objects
-        names = names or objects_from_instruction(recording.instruction)
+        names = job.objects or self.pipeline.objects or recording.names
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
             success = chunks[-1].success
@@ -156,7 +154,7 @@ class EpisodeScorer:
             notes=tuple(found.notes),
             seconds_per_chunk=float(np.mean(found.chunk_seconds)),
             seconds=found.seconds,
-            has_ids=recording.object_ids is not None,
+            has_ids=recording.object_ids is not None and not recording.masks_by,
         )
 
     def _read(self, path: Path) -> Recording:

@@ -14,8 +14,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.errors import DescriptionError, EpisodeError, MtvWorldError
+from mtv_world_ros.data.recording import described_objects
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
 from mtv_world_ros.evaluation.metrics.frechet.feature_store import (
     distances,
@@ -34,7 +34,6 @@ from mtv_world_ros.files import check_same_settings, plain, write_json
 from mtv_world_ros.parallel import score_all, threads_each
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.vision.describers.describer import Describer
-from mtv_world_ros.vision.describers.scene_objects import names_of
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 DEFAULTS = EvaluationConfig()
@@ -250,17 +249,11 @@ class _Run:
         if self.describer is None:
             return job
         try:
-            source = self.config.source
-            episode = read_episode(job.path, with_cameras=False, mapping=source.mapping)
-            frame = np.asarray(episode.images[self.pipeline.spec.views[0]].frames[0])
-            found = self.describer.describe(frame, episode.info.instruction)
-        except DescriptionError as error:
-            return job, f'its objects could not be named ({error.status}): {error}'
+            view, source = self.pipeline.spec.views[0], self.config.source
+            found = described_objects(job.path, self.describer, view, source)
         except MtvWorldError as error:
             return job, str(error)
-        if not found:
-            return job, 'no object was seen in its first frame'
-        return replace(job, objects=names_of(found))
+        return replace(job, objects=found)
 
     def _scored(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, dict[str, Any] | str]]:
         if self.parallel is None or self.parallel.workers == 1:

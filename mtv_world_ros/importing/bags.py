@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -13,7 +14,7 @@ import yaml
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
-from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
@@ -29,6 +30,7 @@ from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML, save_robot
 from mtv_world_ros.geometry.robot_guess import guess_robot
 from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
 from mtv_world_ros.importing.mapping import digest_of
+from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
@@ -109,6 +111,7 @@ def import_bags(
     robot_file: Path,
     *,
     calibration: Path | None = None,
+    stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
 ) -> ImportSummary[Path]:
     """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
@@ -119,6 +122,7 @@ def import_bags(
         mapping: what the topics are, with views.
         robot_file: the robot's YAML.
         calibration: of the cameras; None = the bags' own.
+        stage: names the objects and finds their masks.
         progress: wraps the bags, e.g. in a progress bar.
 
     Raises:
@@ -128,10 +132,10 @@ def import_bags(
     inside = out / 'robot'
     if robot_file.parent.resolve() != inside.resolve():
         save_robot(robot_file, inside)
-    key = digest_of(robot_file, calibration, start=mapping.model_dump_json().encode())
+    key = digest_of(robot_file, calibration, start=stage.key + mapping.model_dump_json().encode())
 
     def convert(bag: Path, path: Path) -> tuple[str, ...]:
-        return convert_bag(bag, path, mapping, robot, calibration, key)
+        return convert_bag(bag, path, mapping, robot, calibration, key, stage)
 
     return import_each(progress(bags), key, lambda bag: out / _name(bag), convert)
 
@@ -147,6 +151,7 @@ def convert_bag(
     robot: RobotModel,
     calibration: Path | None,
     key: str = '',
+    stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
     """Writes a bag as an episode, whose folder appears when it is complete.
 
@@ -164,19 +169,33 @@ def convert_bag(
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
     warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
+    told = mapping.instruction or episode.info.instruction
+    names = stage.names(
+        told,
+        lambda: np.asarray(episode.images[episode.views[0]].frames[0]),
+        given=mapping.objects,
+        stored=episode.info.objects,
+    )
+    if episode.masks and (stage.segmenter is not None or names != episode.info.objects):
+        episode = replace(episode, masks=None)
+        warnings.append('recorded masks are of other objects, or are made anew, and are left out')
     with EpisodeWriter(
         out,
         task=mapping.task or episode.info.task,
-        instruction=mapping.instruction or episode.info.instruction,
+        instruction=told,
         robot=robot.name,
         cameras=[episode.cameras[view] for view in episode.views],
-        objects=mapping.objects or episode.info.objects,
-        metadata={'source': bag.name, MAPPING_KEY: key},
+        objects=names,
+        metadata=_metadata(episode, bag, key),
         jpeg_quality=mapping.jpeg_quality,
     ) as writer:
         writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
-        for write in _in_order(episode, writer, robot, stamps, positions, commands, mapping):
+        masks = stage.masks(writer)
+        for write in _in_order(
+            episode, writer, masks, robot, stamps, positions, commands, mapping
+        ):
             write()
+        masks.finish()
     return tuple(warnings)
 
 
@@ -226,6 +245,7 @@ def _check(robot: RobotModel, positions: FloatArray, mapping: BagMapping, what: 
 def _in_order(
     episode: Episode,
     writer: EpisodeWriter,
+    object_masks: MaskWriter,
     robot: RobotModel,
     stamps: np.ndarray,
     positions: FloatArray,
@@ -248,7 +268,7 @@ def _in_order(
     for view, stamp_ns, index in frames:
         stamp = int(stamp_ns)
         add(stamp, 3, writer.write_camera_info, view, stamp, episode.cameras[view])
-        add(stamp, 4, _write_frame, writer, episode, view, index)
+        add(stamp, 4, _write_frame, writer, object_masks, episode, view, index)
     masks = episode.masks or {}
     for view, stamp, index in ((v, s, i) for v in masks for i, s in enumerate(masks[v].stamps_ns)):
         add(int(stamp), 5, _write_mask, writer, view, int(stamp), masks[view].frames, index)
@@ -262,9 +282,20 @@ def _told(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[in
     return list(episode.instructions)
 
 
-def _write_frame(writer: EpisodeWriter, episode: Episode, view: str, index: int) -> None:
+def _metadata(episode: Episode, bag: Path, key: str) -> dict[str, str]:
+    """Where the episode is from, and who made its masks."""
+    values = {'source': bag.name, MAPPING_KEY: key}
+    by = episode.info.metadata.get(MASKS_BY, '')
+    return {**values, MASKS_BY: by} if episode.masks and by else values
+
+
+def _write_frame(
+    writer: EpisodeWriter, masks: MaskWriter, episode: Episode, view: str, index: int
+) -> None:
     track = episode.images[view]
-    writer.write_image(view, int(track.stamps_ns[index]), track.frames[index])
+    stamp, frame = int(track.stamps_ns[index]), track.frames[index]
+    writer.write_image(view, stamp, frame)
+    masks.add(view, stamp, frame)
 
 
 def _write_mask(writer: EpisodeWriter, view: str, stamp: int, frames: Any, index: int) -> None:

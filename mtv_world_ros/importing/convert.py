@@ -19,7 +19,8 @@ from mtv_world_ros.geometry.joint_columns import to_positions
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
 from mtv_world_ros.importing.camera_parameters import camera_model
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
-from mtv_world_ros.importing.mapping import DatasetMapping, load_mapping, Stream
+from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
+from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
 
 Item = TypeVar('Item')
 
@@ -80,6 +81,7 @@ def import_dataset(
     out: Path,
     *,
     episodes: Sequence[int] | None = None,
+    stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
 ) -> ImportSummary[int]:
     """Converts a LeRobot dataset into episodes `out/episode_<number>`.
@@ -89,6 +91,7 @@ def import_dataset(
         mapping: mapping file, see `load_mapping`.
         out: folder of the episodes.
         episodes: numbers of those wanted; None = all.
+        stage: names the objects and finds their masks.
         progress: wraps the numbers, e.g. in a progress bar.
 
     Raises:
@@ -105,11 +108,13 @@ def import_dataset(
             f'{known[0] if known else "-"} to {known[-1] if known else "-"}'
         )
 
+    key = digest_of(start=stage.key + chosen.key.encode()) if stage.key else chosen.key
+
     def convert(number: int, path: Path) -> tuple[str, ...]:
-        return convert_episode(source, source.episodes[number], chosen, path)
+        return convert_episode(source, source.episodes[number], chosen, path, stage, key)
 
     return import_each(
-        progress(wanted), chosen.key, lambda number: out / f'episode_{number:06d}', convert
+        progress(wanted), key, lambda number: out / f'episode_{number:06d}', convert
     )
 
 
@@ -132,7 +137,12 @@ MAPPING_KEY = 'import_mapping'
 
 
 def convert_episode(
-    dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping, out: Path
+    dataset: LeRobotDataset,
+    entry: EpisodeEntry,
+    mapping: DatasetMapping,
+    out: Path,
+    stage: ObjectStage = AS_RECORDED,
+    key: str = '',
 ) -> tuple[str, ...]:
     """Writes the episode's folder `out`, which appears when it is complete.
 
@@ -165,15 +175,18 @@ def convert_episode(
             instruction=texts[0],
             robot=mapping.robot.name,
             cameras=cameras,
-            objects=mapping.objects,
+            objects=stage.names(
+                texts[0], lambda: next(iter(first.values())), given=mapping.objects
+            ),
             metadata={
                 'source': dataset.root.resolve().name,
                 'source_episode': str(entry.index),
-                MAPPING_KEY: mapping.key,
+                MAPPING_KEY: key or mapping.key,
             },
             jpeg_quality=mapping.jpeg_quality,
         )
         stack.enter_context(writer)
+        masks = stage.masks(writer)
         writer.outcome = _outcome(rows, mapping)
         stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
         commands = dict(_commands(times, commanded, mapping, dataset.fps))
@@ -186,8 +199,10 @@ def convert_episode(
                 frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
                 writer.write_camera_info(view, stamp_ns, camera)
                 writer.write_image(view, stamp_ns, frame)
+                masks.add(view, stamp_ns, frame)
             if k in commands:  # after what it starts from, so that the episode can be played
                 writer.write_trajectory(stamp_ns, commands[k])
+        masks.finish()
     return *odd, *jumps(commands.values(), mapping.robot)
 
 

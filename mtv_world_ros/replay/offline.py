@@ -132,6 +132,7 @@ def replay_offline(
     if not episode.trajectories:
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
+    stored = episode.info.objects if pipeline.describer is None else ()
     limits, observed = limits or ReplayLimits(), ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
     bar = tqdm(total=len(starts), unit='trajectory', disable=not show_progress)
@@ -144,7 +145,8 @@ def replay_offline(
                 before = starts[index - 1] if index else stamp
                 for seen in _seen_between(episode, pipeline, before, stamp, limits):
                     observed.see(seen)
-                imagined = observed.begin(observation, instruction=instruction_at(episode, stamp))
+                told = instruction_at(episode, stamp)
+                imagined = observed.begin(observation, instruction=told, objects=stored)
                 imagined.seed = seed + 1000 * index
                 imagined.num_inference_steps = num_inference_steps
                 _write_rollout(writer, imagined.extend(shifted), summary, until, spec.fps)

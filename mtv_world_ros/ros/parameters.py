@@ -90,6 +90,11 @@ class Settings(NodeSettings):
         'auto',
         'What finds the objects; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
     )
+    describer: str = at_start(
+        '',
+        "YAML of what names the objects of an episode's first real frame where `objects` is "
+        "empty, like config/describer.yaml; empty = the instruction's colour words.",
+    )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'
@@ -124,7 +129,8 @@ class Settings(NodeSettings):
         '', 'What the robot is told until the topic `instruction` says so.'
     )
     objects: Names = parameter(
-        (), "Names of the objects, e.g. red block; `['']` = the ones the instruction names."
+        (),
+        "Names of the objects, e.g. red block; `['']` = the ones that `describer` names.",
     )
     seed: int = parameter(0, 'Seed of the noise; chunk k uses seed + k.', (0, 2**31 - 1))
     num_seeds: int = parameter(

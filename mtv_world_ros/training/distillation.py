@@ -60,6 +60,7 @@ from mtv_world_ros.training.training_config import (
     VideoConfig,
 )
 from mtv_world_ros.training.training_run import train
+from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 _SETTINGS = 'distillation.json'
@@ -223,6 +224,7 @@ def distill(
     *,
     robot: RobotModel,
     segmenter: Segmenter,
+    describer: Describer | None = None,
 ) -> Path:
     """Distils a checkpoint, resuming what `run.out` holds; returns the student's folder.
 
@@ -234,6 +236,7 @@ def distill(
         settings: numbers of steps.
         robot: of the episodes.
         segmenter: finds the objects of the first frames.
+        describer: names them; None = the episodes, else their instructions.
 
     Raises:
         CheckpointError: the teacher cannot be loaded.
@@ -245,6 +248,7 @@ def distill(
         run.replace(config=student_config(run.config, teacher), initial=checkpoint),
         robot=robot,
         segmenter=segmenter,
+        describer=describer,
         make_trainer=partial(DistillTrainer, teacher=teacher, distill=settings),
     )
 

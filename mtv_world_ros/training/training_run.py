@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 import math
 from pathlib import Path
@@ -18,7 +18,13 @@ from tqdm import tqdm
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes
-from mtv_world_ros.data.recording import cached_recording, clip_starts, DEFAULT, Recording
+from mtv_world_ros.data.recording import (
+    cached_recording,
+    clip_starts,
+    DEFAULT,
+    described_objects,
+    Recording,
+)
 from mtv_world_ros.data_types import CameraModel, WorldModelSpec
 from mtv_world_ros.errors import (
     ConfigError,
@@ -43,6 +49,7 @@ from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingRun
+from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -74,8 +81,18 @@ def load_recordings(
     robot: RobotModel,
     cache: Path,
     source: EpisodeSource = DEFAULT,
+    describer: Describer | None = None,
 ) -> tuple[list[Recording], dict[str, str]]:
     """Returns the usable recordings, and the reason for each one left out, by path.
+
+    Args:
+        paths: of the episodes.
+        spec: what the model takes and gives.
+        robot: of the episodes.
+        cache: folder of the decoded recordings.
+        source: how the episodes are read.
+        describer: names the objects; None = the names stored with the episodes, else those of
+            the instructions.
 
     Raises:
         TrainingError: none is usable.
@@ -87,6 +104,9 @@ def load_recordings(
             with disk_errors_named(cache):
                 recording = cached_recording(path, spec, robot, cache, source)
             check_clips(recording, spec)
+            if describer is not None:
+                named = described_objects(path, describer, spec.views[0], source)
+                recording = replace(recording, described=named)
         except DiskError:
             raise
         except MtvWorldError as error:
@@ -103,6 +123,7 @@ def train(
     *,
     robot: RobotModel,
     segmenter: Segmenter,
+    describer: Describer | None = None,
     held_out: HeldOut | None = None,
     make_trainer: Callable[..., Trainer] = Trainer,
 ) -> Path:
@@ -118,6 +139,7 @@ def train(
         run: the training.
         robot: of the episodes.
         segmenter: finds the objects of the first frames.
+        describer: names the objects; None = see `load_recordings`.
         held_out: scores checkpoints on held-out episodes and keeps the best.
         make_trainer: makes the trainer, with the arguments of `Trainer`.
 
@@ -142,6 +164,7 @@ def train(
             robot,
             run.cache or out / 'cache',
             run.source,
+            describer,
         )
         actions = kept_actions(
             out, config.video.control, recordings, config.spec, robot, initial=run.initial

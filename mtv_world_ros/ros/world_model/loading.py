@@ -33,6 +33,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
         device=settings.device,
         num_threads=settings.num_threads,
         segmenter=settings.segmenter,
+        describer=settings.describer or None,
         serving=settings.serving,
     )
 

@@ -35,7 +35,6 @@ from mtv_world_ros.training.clips.past import (
     Past,
 )
 from mtv_world_ros.training.training_config import TrainingConfig
-from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -199,10 +198,10 @@ class BatchSource:
         else:
             clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
         past = self._past(recording, start, lead, rng)
-        names = clip.objects or objects_from_instruction(recording.instruction)
+        names = recording.names
         if rng.random() < self._augment.name_dropout:
             names = tuple(name for name in names if rng.random() < 0.5)
-        trajectory, actions = self.controls.make(clip, names, clip.frames[:, 0])
+        trajectory, actions = self.controls.make(clip, names)
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
             colours = rng.permutation(3)

@@ -17,7 +17,7 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
-from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,21 +41,22 @@ class ControlMaker:
     _lock: Lock = field(default_factory=Lock)
 
     def make(
-        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray
+        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None = None
     ) -> tuple[ByteArray | None, np.ndarray | None]:
         """Returns the trajectory video (V, 1 + T, H, W, 3), or else the encoded actions.
 
         Args:
             clip: one chunk; its cameras, times and positions count.
             names: of the objects.
-            start_frame: (V, H, W, 3) uint8 RGB, first frame of the chunk; objects are
-                searched in it.
+            start_frame: (V, H, W, 3) uint8 RGB, an imagined first frame of the chunk; objects are
+                searched in it. None = the clip's own; its masks are those stored with the
+                episode if this segmenter made them.
         """
         if self.actions is not None:
             return None, self.actions.encode(self.robot, clip.positions)
         masks = None
         if self.object_mask:
-            masks = self._masks(start_frame, names)
+            masks = self._start_masks(clip, names, start_frame)
         video = render_trajectory_video(
             cameras=clip.cameras,
             robot=self.robot,
@@ -66,6 +67,21 @@ class ControlMaker:
             config=self.rendering,
         )
         return video.frames, None
+
+    def _start_masks(
+        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None
+    ) -> BoolArray:
+        """(V, O, H, W) of a clip's start frame, or of an imagined one in its place."""
+        if start_frame is not None:
+            return self._masks(start_frame, names)
+        ids = clip.object_ids
+        if (
+            ids is None
+            or clip.masks_by != self.segmenter.name
+            or not set(names) <= set(clip.objects)
+        ):
+            return self._masks(clip.frames[:, 0], names)
+        return masks_from_ids(ids[:, :1], clip.objects, names).masks[:, :, 0]
 
     def _masks(self, frames: ByteArray, names: tuple[str, ...]) -> BoolArray:
         """(V, O, H, W) of frames (V, H, W, 3)."""

@@ -33,7 +33,6 @@ from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.latent_cache.latent_store import digest_of, LatentCache
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.training_config import HistoryConfig, ObjectiveConfig, TrainingConfig
-from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
 #: to be increased when the stored data or their computation change
 _VERSION = 1
@@ -105,7 +104,7 @@ def _robot_digest(robot: RobotModel) -> str:
 
 
 def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[CachedClip]:
-    """Returns the clips of recordings, keyed by the content of their episode's files.
+    """Returns the clips of recordings, keyed by the content of their episode's files and names.
 
     Args:
         recordings: each with the frames that its clips start from.
@@ -113,6 +112,8 @@ def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[Cache
     clips = []
     for recording, starts in recordings:
         content = content_digest(recording.path)
+        if recording.described:
+            content = digest_of(content, *recording.described)
         clips += [
             CachedClip(recording=recording, start=int(s), key=digest_of(content, int(s)))
             for s in starts
@@ -128,8 +129,7 @@ def read_clip(
     Its anchor and history are drawn once, by its start.
     """
     cut = cut_clip(clip.recording, clip.start, spec)
-    names = cut.objects or objects_from_instruction(clip.recording.instruction)
-    trajectory, actions = controls.make(cut, names, cut.frames[:, 0])
+    trajectory, actions = controls.make(cut, clip.recording.names)
     parts = (cut.frames, cut.frames[:, 0], trajectory, cut.object_ids)
     frames, start, drawn, ids = (
         None if part is None else torch.from_numpy(np.array(part))[None] for part in parts

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import re
 from typing import Protocol
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.vision.colour_words import PALETTE
-from mtv_world_ros.vision.describers.scene_objects import check_objects, SceneObject
+from mtv_world_ros.vision.describers.scene_objects import check_objects, names_of, SceneObject
 
 #: colour words that name an object although the colour segmenter cannot find it
 OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', 'silver', 'gold'})
@@ -31,7 +32,7 @@ class Describer(Protocol):
             instruction: what the robot was told.
 
         Raises:
-            DescriptionError: they could not be had.
+            DescriptionError: naming them failed.
         """
         ...
 
@@ -46,6 +47,37 @@ class InstructionDescriber:
         return check_objects(
             [{'name': name, 'colour': name.split()[0]} for name in names], complete=False
         )
+
+
+def name_objects(
+    instruction: str,
+    *,
+    given: Sequence[str] = (),
+    describer: Describer | None = None,
+    first_frame: Callable[[], ByteArray] | None = None,
+    stored: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Returns the names of a scene's objects; empty if there are none.
+
+    Import, training, node, replay and evaluation all name objects by this rule: the names that
+    are `given`, else the describer's, else those `stored` with the episode, else those that the
+    instruction names by colour.
+
+    Args:
+        instruction: what the robot was told.
+        given: names that a user gave for every scene.
+        describer: what names the objects if the user asked for one.
+        first_frame: returns a real frame (H, W, 3) uint8 RGB; needed by a describer.
+        stored: names in the episode's metadata.
+
+    Raises:
+        DescriptionError: the describer failed.
+    """
+    if given:
+        return tuple(given)
+    if describer is not None and first_frame is not None:
+        return names_of(describer.describe(first_frame(), instruction))
+    return tuple(stored) or objects_from_instruction(instruction)
 
 
 def objects_from_instruction(instruction: str) -> tuple[str, ...]:
