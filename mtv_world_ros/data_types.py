@@ -217,7 +217,8 @@ class History:
             predicted: (V, T, H, W, 3) its frames.
             num_kept: most frames to keep.
         """
-        frames = np.concatenate([self.frames, start_frame[:, None], predicted[:, :-1]], axis=1)
+        newest = predicted[:, max(predicted.shape[1] - 1 - num_kept, 0) : -1]
+        frames = np.concatenate([self.frames, start_frame[:, None], newest], axis=1)
         return History(anchor=self.anchor, frames=frames[:, max(frames.shape[1] - num_kept, 0) :])
 
     def filled(self, num_frames: int) -> ByteArray:

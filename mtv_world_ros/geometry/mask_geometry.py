@@ -33,12 +33,16 @@ class Location:
 
 def centroids(masks: BoolArray) -> FloatArray:
     """Returns the (..., 2) mean x, y of masks (..., H, W) [px], NaN where empty."""
-    area = masks.sum((-2, -1)).astype(np.float64)
-    height, width = masks.shape[-2:]
-    x = (masks.sum(-2) * np.arange(width)).sum(-1)
-    y = (masks.sum(-1) * np.arange(height)).sum(-1)
-    known = np.where(area > 0, area, np.nan)
-    return np.stack([x / known, y / known], axis=-1)
+    centres = np.full((*masks.shape[:-2], 2), np.nan)
+    for index in np.ndindex(masks.shape[:-2]):
+        left, top, width, height = cv2.boundingRect(masks[index].view(np.uint8))
+        inside = masks[index][top : top + height, left : left + width]
+        if inside.size:
+            by_row, by_column = inside.sum(1), inside.sum(0)
+            x = by_column @ np.arange(left, left + width)
+            y = by_row @ np.arange(top, top + height)
+            centres[index] = np.array([x, y]) / by_row.sum()
+    return centres
 
 
 def locate(

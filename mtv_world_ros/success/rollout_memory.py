@@ -281,7 +281,7 @@ def _leans(masks: BoolArray, known: BoolArray) -> FloatArray:
     """(V, O) angles of the long axes from the image's vertical, in (-pi/2, pi/2] [rad]."""
     leans = np.full(masks.shape[:2], np.nan)
     for view, item in zip(*np.nonzero(known), strict=True):
-        moments = cv2.moments(masks[view, item].astype(np.uint8), binaryImage=True)
+        moments = cv2.moments(masks[view, item].view(np.uint8), binaryImage=True)
         leans[view, item] = 0.5 * np.arctan2(
             -2 * moments['mu11'], moments['mu02'] - moments['mu20']
         )

@@ -210,7 +210,7 @@ def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray)
         if areas.max() > largest:
             state.doubt('ambiguous')
         return False
-    if state.centre is None:
+    if state.centre is None or len(pieces) == 1:
         main = int(pieces[np.argmax(areas[pieces])])
     else:
         # sums of whole pixels, which are exact, so that the frame's edge does not matter
