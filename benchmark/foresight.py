@@ -132,12 +132,6 @@ class Robot:
         )
 
 
-def cpu_s(pid: int) -> float:
-    """CPU time that a process has used [s], all threads."""
-    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-
 def row(reports: list[dict[str, str]], pace: str, rate: float, node_cpu_s: float) -> list[str]:
     """One line of the table."""
     chunks = {r['rollout']: r for r in reports if r['state'] == 'chunk'}
@@ -185,9 +179,9 @@ def measure(options: argparse.Namespace) -> list[list[str]]:
             robot.connect()
             robot.live(2 * PLAN_S, 1 / PLAN_S)  # the first ones take longer
             for rate in RATES:
-                before_s = cpu_s(process.pid)
+                before_s = page.cpu_s(process.pid)
                 robot.live(options.seconds, rate)
-                rows.append(row(robot.reports, pace, rate, cpu_s(process.pid) - before_s))
+                rows.append(row(robot.reports, pace, rate, page.cpu_s(process.pid) - before_s))
                 print(*rows[-1], sep=' | ', flush=True)
         finally:
             node.destroy_node()

@@ -64,6 +64,12 @@ _MADE = re.compile(
 )
 
 
+def cpu_s(pid: int) -> float:
+    """CPU time that a process has used [s], all threads."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
 def parse_arguments(
     text: str | None,
     repeats: int,
