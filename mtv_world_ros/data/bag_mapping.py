@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
 from mtv_world_ros.data.episode import check_outcome
+from mtv_world_ros.data.tool_targets import ToolTargets
 
 STATE = 'state'
 #: parts of an image topic's name that say nothing of the view
@@ -27,6 +28,16 @@ class ViewTopics(Schema):
     camera_info: str = Field(default='', description='default: beside the images')
     frame: str = Field(
         default='', description="optical frame in TF; default: the CameraInfo's, or the images'"
+    )
+
+
+class ToolTopic(ToolTargets):
+    """Where the commanded poses of an arm's tool are from."""
+
+    topic: str = Field(description='of PoseStamped')
+    frame: str = Field(
+        default='',
+        description='link that poses are in; empty = that of their header, else the base link',
     )
 
 
@@ -54,6 +65,11 @@ class BagMapping(Schema):
         default='joint_trajectory',
         description='topic of the commanded positions (JointTrajectory or JointState); `state` = '
         'the measured ones that follow',
+    )
+    tools: dict[str, ToolTopic] = Field(
+        default={},
+        description='commanded poses of the tools of arms, in place of their joints; `action` '
+        'then has the other joints',
     )
     robot_description: str = 'robot_description'
     tf_prefix: str = Field(default='', description='of frame names in TF, removed')

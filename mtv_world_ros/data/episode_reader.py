@@ -28,7 +28,7 @@ from mtv_world_ros.data.bag.video_packets import (
     from_first_key,
     VideoFrames,
 )
-from mtv_world_ros.data.bag_mapping import BagMapping, STATE
+from mtv_world_ros.data.bag_mapping import BagMapping, STATE, ToolTopic
 from mtv_world_ros.data.episode import (
     CALIBRATION_FILE,
     Episode,
@@ -44,6 +44,7 @@ from mtv_world_ros.data.episode import (
     parse_info,
     Track,
 )
+from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, read_tree, TransformTree
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
@@ -190,6 +191,7 @@ class _EpisodeReader:
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
         wanted |= {self._camera_info(view, names) for view, names in self.topics.views.items()}
+        wanted |= {self.mapping.topic(tool.topic) for tool in self.mapping.tools.values()}
         for message in self.bag.messages(wanted):
             try:
                 parsed = messages.deserialize(message.msgtype, message.data)
@@ -255,7 +257,7 @@ class _EpisodeReader:
         taken = self._take(topic, messages.JOINT_STATE)
         states = merge_joint_states(topic, taken, self.warnings)
         if states is None:
-            others = [name for name, kind in self.types.items() if kind == messages.JOINT_STATE]
+            others = self._topics_of(messages.JOINT_STATE)
             if others and topic not in others:
                 self._warn_once(
                     f"no joint states at '{topic}'; there are some at {_listed(others)}: name "
@@ -268,6 +270,55 @@ class _EpisodeReader:
         return tuple(self.mapping.joints.get(name, name) for name in names)
 
     def _trajectories(self, states: JointStates | None) -> Stamped:
+        others = self._joint_commands(states)
+        if not self.mapping.tools or states is None or self.robot is None:
+            return others
+        targets = {
+            arm: self._tool_poses(arm, tool, self.robot)
+            for arm, tool in self.mapping.tools.items()
+        }
+        try:
+            led, odd = joints_of_tools(targets, self.robot, states, others)
+        except ValueError as error:
+            raise EpisodeError(f"'{self.path}': {error}") from error
+        self.warnings += odd
+        return following(led, self.mapping.chunk_s)
+
+    def _tool_poses(self, arm: str, tool: ToolTopic, robot: RobotModel) -> ToolTrack:
+        topic = self.mapping.topic(tool.topic)
+        good: Stamped = []
+        for stamp, message in self._take(topic, messages.POSE_STAMPED):
+            try:
+                good.append((stamp, (message.header.frame_id, messages.parse_pose(message.pose))))
+            except ValueError as error:
+                self._refuse(topic, EpisodeError(str(error)))
+        ordered = in_order(topic, good, self.warnings)
+        if not ordered:
+            raise EpisodeError(
+                f"'{self.path}' has no poses of arm '{arm}' at '{topic}'; its topics of "
+                f'PoseStamped are {_listed(self._topics_of(messages.POSE_STAMPED))}'
+            )
+        frames = {frame.lstrip('/').removeprefix(self.mapping.tf_prefix)
+                  for _, (frame, _) in ordered}  # fmt: skip
+        if not tool.frame and frames != {''}:
+            unknown = sorted(frames - set(robot.link_names))
+            if unknown or len(frames) > 1:
+                raise EpisodeError(
+                    f"'{self.path}': the poses at '{topic}' are in frame "
+                    f"'{(unknown or sorted(frames))[0]}', which is no link of robot "
+                    f"'{robot.name}' or not the only one; name the link in `tools: {arm}: frame`"
+                )
+            tool = tool.replace(frame=frames.pop())
+        return ToolTrack(
+            tool,
+            np.array([stamp for stamp, _ in ordered], np.int64),
+            np.stack([pose for _, (_, pose) in ordered]),
+        )
+
+    def _topics_of(self, kind: str) -> list[str]:
+        return [name for name, found in self.types.items() if found == kind]
+
+    def _joint_commands(self, states: JointStates | None) -> Stamped:
         topic = self.topics.joint_trajectory
         if self.mapping.action == STATE:
             return [] if states is None else following(states, self.mapping.chunk_s)

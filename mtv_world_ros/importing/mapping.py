@@ -18,6 +18,7 @@ from pydantic import (
 
 from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
 from mtv_world_ros.data.episode import check_outcome
+from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import nearest
 from mtv_world_ros.files import bundled
@@ -25,7 +26,7 @@ from mtv_world_ros.geometry.joint_columns import JointEntries, JointTable, to_po
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.importing.camera_parameters import CameraSource
-from mtv_world_ros.importing.tool_actions import add_tool_poses, led_joints, ToolPoses
+from mtv_world_ros.importing.tool_actions import ToolPoses
 
 
 class Stream(JointTable):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +82,12 @@ def record(
     prefix: str = 'lab_',
     urdf: str = URDF,
     frames: dict[str, ByteArray] | None = None,
+    more: Callable[[Bag], None] | None = None,
 ) -> Path:
     """A teleoperated recording in the namespace /cell: joints with a prefix, no commands.
 
     `door` has raw yuv422_yuy2 images and is fixed to the TF frame `ceiling`, `palm` has JPEG and
-    is fixed to a TF frame on the hand that the URDF does not have.
+    is fixed to a TF frame on the hand that the URDF does not have. `more` writes other topics.
     """
     frames = frames or {v: render(robot, c, positions) for v, c in cameras.items()}
     ceiling = np.diag([1.0, -1, -1, 1])
@@ -113,6 +115,8 @@ def record(
             bag.write('/tf', tf, stamp, messages.make(tf, transforms=moving))
             for view, camera in cameras.items():
                 _write_view(bag, stamp, view, camera, frames[view][k])
+        if more is not None:
+            more(bag)
     return path
 
 

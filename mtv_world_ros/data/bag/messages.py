@@ -27,6 +27,7 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 JOINT_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 STRING = 'std_msgs/msg/String'
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
+POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
 
 NANO = 1_000_000_000
@@ -192,12 +193,20 @@ def make_pose_array(stamp_ns: int, frame_id: str, poses: ArrayLike) -> Any:
 
 def parse_pose_array(message: Any) -> NDArray[np.float64]:
     """Poses (O, 4, 4) of a geometry_msgs/PoseArray."""
-    poses = np.tile(np.eye(4), (len(message.poses), 1, 1))
-    for pose, item in zip(poses, message.poses, strict=True):
-        p, q = item.position, item.orientation
-        pose[:3, :3] = rotation((q.x, q.y, q.z, q.w))
-        pose[:3, 3] = p.x, p.y, p.z
-    return poses
+    return np.array([parse_pose(item) for item in message.poses]).reshape(-1, 4, 4)
+
+
+def parse_pose(item: Any) -> NDArray[np.float64]:
+    """Pose (4, 4) of a geometry_msgs/Pose.
+
+    Raises:
+        ValueError: its quaternion is zero.
+    """
+    p, q = item.position, item.orientation
+    T = np.eye(4)
+    T[:3, :3] = rotation((q.x, q.y, q.z, q.w))
+    T[:3, 3] = p.x, p.y, p.z
+    return T
 
 
 def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:
