@@ -107,4 +107,8 @@ def _look_at(episode: ImaginedEpisode, observations: Sequence[Observation]) -> N
     if observations:
         frames = np.stack([observation.frames for observation in observations], axis=1)
         positions = [episode.observation, *observations]
-        episode.observe(frames, np.stack([observation.positions for observation in positions]))
+        episode.observe(
+            frames,
+            np.stack([observation.positions for observation in positions]),
+            observations[-1].cameras,
+        )

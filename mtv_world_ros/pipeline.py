@@ -284,13 +284,19 @@ class ImaginedEpisode:
             self.num_chunks += 1
             yield mean_of_seeds([prediction for prediction, _ in made])
 
-    def observe(self, frames: ByteArray, positions: FloatArray) -> ObservedChunk:
+    def observe(
+        self,
+        frames: ByteArray,
+        positions: FloatArray,
+        cameras: tuple[CameraModel, ...] | None = None,
+    ) -> ObservedChunk:
         """Takes real frames instead of imagining some; the episode then stands at the last one.
 
         Args:
             frames: (V, T, H', W', 3) uint8 RGB after `observation`, at the model's frame rate and
                 any size.
             positions: (1 + T, J) commanded [rad or m]; row 0 where the robot stood before.
+            cameras: as they are at the last frame, at the model's size; None = as before.
         """
         spec, state = self.pipeline.spec, self._rollouts[0]
         frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
@@ -299,7 +305,8 @@ class ImaginedEpisode:
         success, memory = self._judge(state, positions, start_masks, masks)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
         state = state.after(frames, positions[-1], stamp_ns, spec.num_history, memory)
-        self._rollouts = (replace(state, num_imagined=0, source=state.observation),)
+        last = replace(state.observation, cameras=cameras or state.observation.cameras)
+        self._rollouts = (replace(state, observation=last, num_imagined=0, source=last),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
 
     def branch(self, observation: Observation) -> ImaginedEpisode:

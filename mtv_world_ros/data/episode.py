@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -20,6 +20,8 @@ JOINT_TRAJECTORY = '/joint_trajectory'
 INSTRUCTION = '/instruction'
 #: object poses in the base frame, in the order of the names (from a simulator or markers)
 OBJECT_POSES = '/object_poses'
+#: poses of cameras that move against the robot's links
+TF = '/tf'
 #: name of the MCAP metadata record with task, outcome and objects
 METADATA_NAME = 'mtv_world'
 #: key of the metadata that names the segmenter of the masks, where they are not the simulator's
@@ -196,6 +198,8 @@ class Episode:
         masks: object masks of the views that have them; None where there are none.
         instructions: (stamp [ns], text), by stamp.
         object_poses: None if not recorded.
+        camera_tracks: (N, 4, 4) T_mount_camera [m] at the images of each view whose camera moves
+            against the robot's links; `cameras` has the first one.
         truncated: the recording is cut off.
         warnings: problems found and how they were handled, one line each; if
             `truncated`, the first says where the record was cut.
@@ -210,5 +214,11 @@ class Episode:
     masks: Mapping[str, Track] | None
     instructions: list[tuple[int, str]]
     object_poses: ObjectPoses | None = None
+    camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     truncated: bool = False
     warnings: tuple[str, ...] = ()
+
+    def camera(self, view: str, index: int) -> CameraModel:
+        """Returns the camera of a view as it is at one of its images."""
+        camera, track = self.cameras[view], self.camera_tracks.get(view)
+        return camera if track is None else replace(camera, T_mount_camera=track[index])

@@ -41,12 +41,13 @@ from mtv_world_ros.data.episode import (
     METADATA_NAME,
     OBJECT_POSES,
     ObjectPoses,
+    optical_frame,
     parse_info,
     Track,
 )
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
-from mtv_world_ros.data.transform_tree import Mount, read_tree, TransformTree
-from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
+from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled, with_camera_info
@@ -163,6 +164,7 @@ class _EpisodeReader:
         self.with_masks = with_masks
         self.received: dict[str, Stamped] = {}
         self.refused: dict[str, list[str]] = {}
+        self.tracks: dict[str, FloatArray] = {}
 
     def read(
         self, calibration: Path | str | None, with_cameras: bool, unknown_mount: str
@@ -173,17 +175,19 @@ class _EpisodeReader:
         masks = {view: self._masks(names) for view, names in topics.views.items()}
         instructions = [(s, m.data) for s, m in self._take(topics.instruction, messages.STRING)]
         states = self._states()
+        cameras = self._cameras(calibration, images, unknown_mount) if with_cameras else {}
         episode_info = _info(self.bag, instructions)
         return Episode(
             info=episode_info,
             views=tuple(topics.views),
-            cameras=self._cameras(calibration, images, unknown_mount) if with_cameras else {},
+            cameras=cameras,
             images=images,
             joint_states=states,
             trajectories=self._trajectories(states),
             masks={view: track for view, track in masks.items() if track} or None,
             instructions=instructions,
             object_poses=self._object_poses(len(episode_info.objects)),
+            camera_tracks=self.tracks,
             truncated=bool(self.bag.truncated),
             warnings=self._all_warnings(),
         )
@@ -377,24 +381,42 @@ class _EpisodeReader:
         cameras = {}
         for view, names in self.topics.views.items():
             if tree is not None:
-                known[view] = self._from_tree(tree, view, names, unknown_mount)
+                known[view] = self._from_tree(tree, view, names, unknown_mount, images[view])
             if view not in known:
                 raise CalibrationError(
                     f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}"
                 )
+            elif tree is None and not calibration:
+                known[view] = self._moving(known[view], images[view])
             camera = self._with_intrinsics(known[view], view, names)
             height, width = images[view].frames[0].shape[:2]
             cameras[view] = scaled(camera, width, height)
         return cameras
 
+    def _moving(self, camera: CameraModel, track: Track) -> CameraModel:
+        """The camera of an episode, with the poses that /tf has of its frame in its mount."""
+        frame = optical_frame(camera.view)
+        if not read_tree(self._tf()).moves_in(camera.mount_link, frame):
+            return camera
+        found = pose_track(self._tf(), frame, {camera.mount_link}, track.stamps_ns)
+        self.tracks[camera.view] = found.T_link_frame
+        return replace(camera, T_mount_camera=found.T_link_frame[0])
+
+    def _tf(self) -> list[Any]:
+        return [m for topic in TF_TOPICS for _, m in self._take(topic, messages.TF_MESSAGE)]
+
     def _tree(self) -> TransformTree:
-        taken = [m for topic in TF_TOPICS for _, m in self._take(topic, messages.TF_MESSAGE)]
-        tree = read_tree(taken, self.mapping.tf_prefix)
+        tree = read_tree(self._tf(), self.mapping.tf_prefix)
         self.warnings += tree.problems
         return tree
 
     def _from_tree(
-        self, tree: TransformTree, view: str, names: ViewTopics, unknown_mount: str
+        self,
+        tree: TransformTree,
+        view: str,
+        names: ViewTopics,
+        unknown_mount: str,
+        images: Track,
     ) -> CameraModel:
         """The camera's pose by TF; its intrinsics come from CameraInfo."""
         topic = self._camera_info(view, names)
@@ -416,6 +438,14 @@ class _EpisodeReader:
         links = () if self.robot is None else self.robot.link_names
         if unknown_mount and tree.name(frame) not in tree.frames:
             mount = Mount(unknown_mount, np.eye(4), None)
+        elif tree.is_moving(frame, links):
+            found = pose_track(self._tf(), frame, links, images.stamps_ns, self.mapping.tf_prefix)
+            mount = Mount(found.link, found.T_link_frame[0], None)
+            self.tracks[view] = found.T_link_frame
+            self._warn_once(
+                f"view '{view}': its camera moves against every link of the robot; its poses in "
+                f"'{found.link}' are those of /tf at each image"
+            )
         else:
             mount = tree.mount(frame, links)
         return CameraModel(

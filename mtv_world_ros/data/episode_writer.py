@@ -25,8 +25,9 @@ from mtv_world_ros.data.episode import (
     METADATA_NAME,
     OBJECT_POSES,
     optical_frame,
+    TF,
 )
-from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.rendering.images import encode_jpeg, encode_png
@@ -124,6 +125,13 @@ class EpisodeWriter(BagWriter):
         """Records the view's intrinsics."""
         message = messages.make_camera_info(stamp_ns, camera, optical_frame(view))
         self.write_message(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
+
+    def write_camera_pose(
+        self, view: str, stamp_ns: int, mount_link: str, T_mount_camera: FloatArray
+    ) -> None:
+        """Records where a camera is that moves against the robot's links, (4, 4) [m]."""
+        message = messages.make_tf(stamp_ns, mount_link, optical_frame(view), T_mount_camera)
+        self.write_message(TF, messages.TF_MESSAGE, stamp_ns, message)
 
     def write_joint_states(
         self,

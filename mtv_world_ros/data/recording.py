@@ -5,9 +5,9 @@ V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import hashlib
 from io import BytesIO
 import json
@@ -51,6 +51,8 @@ class Recording:
         objects: names of the objects by the episode; what `object_ids` stand for.
         described: names of the objects by a describer; empty = none was asked.
         masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
+        camera_tracks: (N, 4, 4) T_mount_camera [m] of views whose camera moves against the
+            robot's links; see `cameras_at`.
         cameras: V cameras at the model's size.
         times: (N,) [s] since the first frame, increasing.
         frames: (V, N, H, W, 3) uint8 RGB.
@@ -77,7 +79,20 @@ class Recording:
     object_poses: FloatArray | None = None
     described: tuple[str, ...] = ()
     masks_by: str = ''
+    camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:
+        """Returns the V cameras as they are at a frame.
+
+        What starts there is drawn as if they stayed there, in training as in serving: where a
+        camera that no joint of the robot moves will go is not known.
+        """
+        tracks = self.camera_tracks
+        return tuple(
+            replace(c, T_mount_camera=tracks[c.view][frame]) if c.view in tracks else c
+            for c in self.cameras
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -202,6 +217,10 @@ def load_recording(
         stamp_ns=origin,
         object_poses=_object_poses(episode, stamps),
         masks_by=episode.info.metadata.get(MASKS_BY, ''),
+        camera_tracks={
+            view: track[nearest_rows(np.asarray(episode.images[view].stamps_ns), stamps)]
+            for view, track in episode.camera_tracks.items()
+        },
         warnings=episode.warnings,
     )
 
@@ -318,7 +337,7 @@ def cut_clip(
     times = np.arange(count + 1) / spec.fps
     ids = recording.object_ids
     return Clip(
-        cameras=recording.cameras,
+        cameras=recording.cameras_at(start),
         objects=recording.objects,
         times=times,
         frames=recording.frames[:, index],
@@ -460,6 +479,8 @@ def _save(file: BytesIO, recording: Recording) -> None:
         arrays['object_poses'] = recording.object_poses
     if commands.velocities is not None:
         arrays['command_velocities'] = commands.velocities
+    for view, track in recording.camera_tracks.items():
+        arrays[f'track_{view}'] = track
     for index, camera in enumerate(recording.cameras):
         arrays[f'K_{index}'] = camera.K
         arrays[f'distortion_{index}'] = camera.distortion
@@ -499,4 +520,9 @@ def _load(file: Path, path: Path) -> Recording:
         stamp_ns=text['stamp_ns'],
         object_poses=stored.get('object_poses'),
         masks_by=text.get('masks_by', ''),
+        camera_tracks={
+            camera.view: stored[f'track_{camera.view}']
+            for camera in cameras
+            if f'track_{camera.view}' in stored
+        },
     )

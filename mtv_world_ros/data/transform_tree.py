@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import CalibrationError, nearest
@@ -20,6 +22,22 @@ STILL = 1e-4
 _MOST_FRAMES = 2000
 
 _Numbers = tuple[float, ...]
+
+
+#: a pose between two transforms that are further apart is not known [s]
+MAX_GAP_S = 0.5
+
+
+class PoseTrack(NamedTuple):
+    """A frame that moves against every link of the robot.
+
+    Attributes:
+        link: a link of the robot.
+        T_link_frame: (N, 4, 4) poses of the frame in it [m].
+    """
+
+    link: str
+    T_link_frame: FloatArray
 
 
 class Mount(NamedTuple):
@@ -95,7 +113,7 @@ class TransformTree:
             edge = self.name(item.header.frame_id), self.name(item.child_frame_id)
             p, q = item.transform.translation, item.transform.rotation
             numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-            is_pose = math.hypot(*numbers[3:]) > 0.5 and math.isfinite(sum(numbers))
+            is_pose = _is_pose(numbers)
             num_known = len(self._edges) + len(self._unusable)
             is_room = edge in self._edges or num_known < _MOST_FRAMES
             if edge[0] != edge[1] and is_pose and is_room:
@@ -177,6 +195,45 @@ class TransformTree:
             top = parents[top]
         return fixed[top]
 
+    def moving_mount(self, frame: str, links: Collection[str]) -> Mount:
+        """Returns the nearest of the robot's links that TF leads to, by the newest transforms.
+
+        Raises:
+            CalibrationError: TF does not lead from the frame to a link.
+        """
+        frame = self.name(frame)
+        for mount in self._reachable(frame, only_still=False):
+            if mount.link in links:
+                return mount
+        raise CalibrationError(f"/tf and /tf_static do not lead from frame '{frame}' to the robot")
+
+    def is_moving(self, frame: str, links: Collection[str]) -> bool:
+        """Tells whether TF leads from a frame to the robot's links, but to none that is fixed."""
+        fixed = self._reachable(self.name(frame), only_still=True)
+        return self.is_connected(frame, links) and all(m.link not in links for m in fixed)
+
+    def moves_in(self, link: str, frame: str) -> bool:
+        """Tells whether TF has a transform from a link to a frame that moves."""
+        edge = self._edges.get((self.name(link), self.name(frame)))
+        return edge is not None and not edge.is_still
+
+    def path(self, frame: str, link: str) -> list[tuple[str, str]]:
+        """Returns the transforms, (parent, child), that lead from a frame to a link."""
+        parents = self._parents()
+        chains = []
+        for name in (self.name(frame), link):
+            chain = [name]
+            while (above := parents.get(chain[-1])) is not None and above not in chain:
+                chain.append(above)
+            chains.append(chain)
+        common = next(name for name in chains[0] if name in chains[1])
+        return [
+            (above, name)
+            for chain in chains
+            for name, above in zip(chain, chain[1:], strict=False)
+            if chain.index(above) <= chain.index(common)
+        ]
+
     def is_connected(self, frame: str, links: Collection[str]) -> bool:
         """Tells whether TF leads from a frame to one of the links, moving or not."""
         frame = self.name(frame)
@@ -214,11 +271,94 @@ class TransformTree:
             for other, edge in neighbours[here.link]:
                 if other not in found:
                     is_parent = self._edges.get((other, here.link)) is edge
-                    T_other_here = edge.T if is_parent else inverse(edge.T)
+                    T = edge.T if edge.is_still else pose(edge.last[:3], edge.last[3:])
+                    T_other_here = T if is_parent else inverse(T)
                     stamps = [s for s in (here.stamp_ns, edge.stamp_ns) if s is not None]
                     T = T_other_here @ here.T_link_frame
                     found.add(other)
                     queue.append(Mount(other, T, min(stamps, default=None)))
+
+
+def _is_pose(numbers: _Numbers) -> bool:
+    return math.hypot(*numbers[3:]) > 0.5 and math.isfinite(sum(numbers))
+
+
+def pose_track(
+    messages: Sequence[Any],
+    frame: str,
+    links: Collection[str],
+    stamps_ns: NDArray[np.int64],
+    prefix: str = '',
+) -> PoseTrack:
+    """Returns the poses of a frame that moves against every link of the robot.
+
+    Args:
+        messages: TFMessages of /tf and /tf_static.
+        frame: e.g. a camera's optical frame.
+        links: of the robot; the nearest one counts.
+        stamps_ns: (N,) when the poses are wanted; between two transforms they are interpolated.
+        prefix: of frame names, removed.
+
+    Raises:
+        CalibrationError: TF does not lead to the robot, or has no transform near a stamp.
+    """
+    tree = read_tree(messages, prefix)
+    link = tree.moving_mount(frame, links).link
+    T = {name: np.tile(np.eye(4), (len(stamps_ns), 1, 1)) for name in (frame, link)}
+    series = _series(messages, tree, set(tree.path(frame, link)))
+    for start in (frame, link):
+        name = tree.name(start)
+        while True:
+            edge = next((edge for edge in series if edge[1] == name), None)
+            if edge is None:
+                break
+            T[start] = _interpolated(edge, series[edge], stamps_ns) @ T[start]
+            name = edge[0]
+    return PoseTrack(link, np.linalg.inv(T[link]) @ T[frame])
+
+
+def _series(
+    messages: Sequence[Any], tree: TransformTree, edges: set[tuple[str, str]]
+) -> dict[tuple[str, str], dict[int, FloatArray]]:
+    """Transforms by stamp [ns] of each edge; of one that never moves the first alone, at 0."""
+    found: dict[tuple[str, str], dict[int, FloatArray]] = {edge: {} for edge in edges}
+    for item in (item for message in messages for item in message.transforms):
+        edge = tree.name(item.header.frame_id), tree.name(item.child_frame_id)
+        if edge in found and (tree.moves_in(*edge) or not found[edge]):
+            p, q = item.transform.translation, item.transform.rotation
+            stamp = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+            if not _is_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w)):
+                continue
+            found[edge][stamp if tree.moves_in(*edge) else 0] = pose(
+                (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+            )
+    return found
+
+
+def _interpolated(
+    edge: tuple[str, str], known: dict[int, FloatArray], stamps_ns: NDArray[np.int64]
+) -> FloatArray:
+    """(N, 4, 4)."""
+    if list(known) == [0]:
+        return np.repeat(known[0][None], len(stamps_ns), axis=0)
+    times = np.array(sorted(known), np.int64)
+    after = np.searchsorted(times, stamps_ns).clip(0, len(times) - 1)
+    before = np.where(times[after] <= stamps_ns, after, (after - 1).clip(0))
+    apart_s = np.maximum(times[after] - stamps_ns, stamps_ns - times[before]) * 1e-9
+    lost = apart_s > MAX_GAP_S
+    if lost.any():
+        raise CalibrationError(
+            f"/tf has no transform from '{edge[0]}' to '{edge[1]}' within {MAX_GAP_S:g} s before "
+            f'and after {lost.sum()} of {len(stamps_ns)} images, the first at '
+            f'{stamps_ns[lost][0] * 1e-9:.3f} s; cut the recording there'
+        )
+    found = []
+    for stamp, low, high in zip(stamps_ns, before, after, strict=True):
+        ends = [pin.SE3(known[int(times[i])]) for i in (low, high)]
+        span = times[high] - times[low]
+        share = 0.0 if span <= 0 else float(np.clip((stamp - times[low]) / span, 0, 1))
+        found.append(pin.SE3.Interpolate(*ends, share).homogeneous)
+    return np.array(found)
 
 
 def read_tree(messages: Iterable[Any], prefix: str = '') -> TransformTree:

@@ -124,7 +124,7 @@ def imagine_stretch(
         joint_names=pipeline.robot.joint_names, times=times[1:], positions=positions[1:]
     )
     observation = Observation(
-        cameras=recording.cameras,
+        cameras=recording.cameras_at(stretch.start),
         frames=stretch.frames[:, 0],
         positions=recording.positions[stretch.start],
         stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),

@@ -268,6 +268,10 @@ def _in_order(
     for view, stamp_ns, index in frames:
         stamp = int(stamp_ns)
         add(stamp, 3, writer.write_camera_info, view, stamp, episode.cameras[view])
+        if view in episode.camera_tracks:
+            camera = episode.camera(view, index)
+            mount, T = camera.mount_link, camera.T_mount_camera
+            add(stamp, 3, writer.write_camera_pose, view, stamp, mount, T)
         add(stamp, 4, _write_frame, writer, object_masks, episode, view, index)
     masks = episode.masks or {}
     for view, stamp, index in ((v, s, i) for v in masks for i, s in enumerate(masks[v].stamps_ns)):

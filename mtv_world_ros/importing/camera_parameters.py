@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,6 +21,7 @@ from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
 
 #: names that a camera's four numbers go by
 _FOCAL_NAMES = (('fx', 'fy', 'cx', 'cy'), ('fx', 'fy', 'ppx', 'ppy'))
+_POSE_KEYS = ('extrinsics', 'rotation', 'translation')
 _PATHS = ('intrinsics', 'extrinsics', 'rotation', 'translation', 'distortion')
 
 
@@ -41,11 +43,18 @@ class CameraParameters(Schema):
     distortion_model: str | None = None
     size: Pair | None = Field(default=None, description='width and height that K is for [px]')
     mount_link: str
+    moves: bool = Field(
+        default=False,
+        description='the pose is a feature that changes from row to row: a camera that no joint '
+        'of the robot moves',
+    )
 
     @model_validator(mode='after')
     def _has_one_pose(self) -> Self:
         if bool(self.extrinsics) == bool(self.rotation and self.translation):
             raise ValueError("give either 'extrinsics', or 'rotation' and 'translation'")
+        if self.moves and self.file is not None:
+            raise ValueError("'moves' needs poses that are features: leave 'file' out")
         return self
 
 
@@ -106,6 +115,17 @@ def camera_model(
     Raises:
         CalibrationError: the parameters are missing or wrong, or change within the episode.
     """
+    return camera_track(source, dataset, episode_index, values, size)[0]
+
+
+def camera_track(
+    source: CameraSource,
+    dataset: Path,
+    episode_index: int,
+    values: Mapping[str, FloatArray],
+    size: tuple[int, int],
+) -> tuple[CameraModel, FloatArray | None]:
+    """Returns `camera_model` and, of a camera that moves, (T, 4, 4) T_mount_camera of the rows."""
     if source.calibration is not None:
         cameras = load_calibration(source.calibration)
         if source.view not in cameras:
@@ -113,23 +133,28 @@ def camera_model(
                 f"'{source.calibration}' has no view '{source.view}'"
                 f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
             )
-        return scaled(cameras[source.view], *size)
+        return scaled(cameras[source.view], *size), None
     row = source.camera
     assert row is not None
     look_up = _Lookup(source, dataset, episode_index, values)
+    K = _intrinsics(look_up('intrinsics'), source.where)
+    poses = [_pose(row, look_up, source.where)]
+    if row.moves:
+        count = len(next(iter(values.values())))
+        poses = [_pose(row, look_up.at(k), source.where) for k in range(count)]
     model = row.distortion_model or ('plumb_bob' if row.distortion else 'none')
     width, height = (int(n) for n in row.size or size)
     camera = CameraModel(
         view=source.view,
         width=width,
         height=height,
-        K=_intrinsics(look_up('intrinsics'), source.where),
+        K=K,
         distortion_model=model,
         distortion=np.ravel(look_up('distortion')) if row.distortion else np.zeros(0),
         mount_link=row.mount_link,
-        T_mount_camera=_pose(row, look_up, source.where),
+        T_mount_camera=poses[0],
     )
-    return scaled(camera, *size)
+    return scaled(camera, *size), np.stack(poses) if row.moves else None
 
 
 class _Lookup:
@@ -144,14 +169,23 @@ class _Lookup:
     ) -> None:
         assert source.camera is not None
         self._source, self._row, self._values = source, source.camera, values
+        self._at = 0
         self._file: Path | None = None
         self._document: Any = None
         if self._row.file is not None:
             self._file = dataset / _formatted(self._row.file, episode_index, source.where)
             self._document = _read_json(self._file, source.where)
 
+    def at(self, row: int) -> _Lookup:
+        """The same for the pose of another row."""
+        other = copy(self)
+        other._at = row
+        return other
+
     def __call__(self, key: str) -> Any:
         path = getattr(self._row, key)
+        if self._file is None and self._row.moves and key in _POSE_KEYS:
+            return self._values[path][self._at]
         if self._file is None:
             return self._constant(path)
         found = self._document
@@ -177,7 +211,8 @@ class _Lookup:
             frame = int(np.argmax(differs))
             raise CalibrationError(
                 f"{self._source.where}: feature '{feature}' changes at frame {frame}; a camera "
-                'that moves needs its pose in the link that carries it (mount_link)'
+                'that moves needs its pose in the link that carries it (mount_link), or, where no '
+                'link does, `moves: true`'
             )
         return values[0]
 

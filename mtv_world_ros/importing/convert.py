@@ -17,7 +17,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, Traje
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.joint_columns import to_positions
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
-from mtv_world_ros.importing.camera_parameters import camera_model
+from mtv_world_ros.importing.camera_parameters import camera_track
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
@@ -166,7 +166,7 @@ def convert_episode(
         for view, source in mapping.views.items()
     }
     first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
-    cameras = _cameras(dataset, entry, mapping, rows, first)
+    cameras, tracks = _cameras(dataset, entry, mapping, rows, first)
     texts = _instructions(dataset, rows, mapping)
     with ExitStack() as stack:
         writer = EpisodeWriter(
@@ -198,6 +198,8 @@ def convert_episode(
                 view = camera.view
                 frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
                 writer.write_camera_info(view, stamp_ns, camera)
+                if view in tracks:
+                    writer.write_camera_pose(view, stamp_ns, camera.mount_link, tracks[view][k])
                 writer.write_image(view, stamp_ns, frame)
                 masks.add(view, stamp_ns, frame)
             if k in commands:  # after what it starts from, so that the episode can be played
@@ -265,15 +267,18 @@ def _cameras(
     mapping: DatasetMapping,
     rows: dict[str, FloatArray],
     first: dict[str, ByteArray],
-) -> list[CameraModel]:
-    cameras = []
+) -> tuple[list[CameraModel], dict[str, FloatArray]]:
+    """The cameras at the first row, and the poses at all rows of those that move."""
+    cameras, tracks = [], {}
     for view, source in mapping.views.items():
         height, width = first[view].shape[:2]
-        camera = camera_model(source, dataset.root, entry.index, rows, (width, height))
+        camera, track = camera_track(source, dataset.root, entry.index, rows, (width, height))
+        if track is not None:
+            tracks[view] = track
         resting = np.zeros((1, len(mapping.robot.joint_names)))
         camera_poses(camera, mapping.robot, resting)  # names a mount_link that is not there
         cameras.append(camera)
-    return cameras
+    return cameras, tracks
 
 
 def _instructions(

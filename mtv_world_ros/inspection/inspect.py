@@ -24,6 +24,7 @@ from mtv_world_ros.geometry.robot_shape import (
     moving_links,
     RobotShape,
 )
+from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.inspection.clocks import (
     check_commands,
     check_joint_states,
@@ -52,6 +53,10 @@ from mtv_world_ros.rendering.trajectory_video import (
     TrajectoryVideoConfig,
 )
 
+#: why nothing is compared
+_MOVES = (
+    'calibration not checked against the images: the camera moves by itself, with the poses of /tf'
+)
 Checked = tuple[dict[str, str], list[Finding]]
 #: share of the frames in which at least one tool should be in the image
 _LEAST_IN_IMAGE = 0.5
@@ -116,16 +121,21 @@ class Inspector:
 
     def _view(self, episode: Episode, view: str, joints: JointTrack) -> Section:
         track, camera = episode.images[view], episode.cameras[view]
-        residual = self._residual(episode, view, joints)
-        if isinstance(residual, Finding):
-            measured: Checked = ({}, [residual])
-            notes: tuple[str, ...] = ()
+        measured: Checked
+        notes: tuple[str, ...] = ()
+        if view in episode.camera_tracks:
+            measured = {}, [not_checked(_MOVES)]
         else:
-            measured, notes = self._judge(residual, camera)
+            measured, notes = self._measured(episode, view, joints)
         return _section(
             view,
             [
-                check_visibility(camera, self.robot, joints.at(track.stamps_ns)),
+                check_visibility(
+                    camera,
+                    self.robot,
+                    joints.at(track.stamps_ns),
+                    episode.camera_tracks.get(view),
+                ),
                 measured,
                 check_rate('frames', track.stamps_ns),
                 check_skew(view, episode.images),
@@ -133,6 +143,14 @@ class Inspector:
             ],
             notes,
         )
+
+    def _measured(
+        self, episode: Episode, view: str, joints: JointTrack
+    ) -> tuple[Checked, tuple[str, ...]]:
+        residual = self._residual(episode, view, joints)
+        if isinstance(residual, Finding):
+            return ({}, [residual]), ()
+        return self._judge(residual, episode.cameras[view])
 
     def _residual(
         self, episode: Episode, view: str, joints: JointTrack
@@ -268,11 +286,20 @@ class ToolVisibility:
 
 
 def tool_visibility(
-    camera: CameraModel, robot: RobotModel, positions: FloatArray
+    camera: CameraModel,
+    robot: RobotModel,
+    positions: FloatArray,
+    T_mount_camera: FloatArray | None = None,
 ) -> ToolVisibility:
-    """Counts where the tool points fall for positions (T, J)."""
+    """Counts where the tool points fall for positions (T, J).
+
+    `T_mount_camera` (T, 4, 4) are the poses of a camera that moves by itself.
+    """
     points = robot.tool_poses(positions)[..., :3, 3]
-    pixels, depth = project(camera, camera_poses(camera, robot, positions), points)
+    poses = camera_poses(camera, robot, positions)
+    if T_mount_camera is not None:
+        poses = poses @ inverse(camera.T_mount_camera) @ T_mount_camera
+    pixels, depth = project(camera, poses, points)
     behind = depth <= 0
     size = np.array([camera.width, camera.height])
     inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=-1)  # NaN is not inside
@@ -280,10 +307,13 @@ def tool_visibility(
 
 
 def check_visibility(
-    camera: CameraModel, robot: RobotModel, positions: FloatArray
+    camera: CameraModel,
+    robot: RobotModel,
+    positions: FloatArray,
+    T_mount_camera: FloatArray | None = None,
 ) -> tuple[dict[str, str], list[Finding]]:
     """Shares of tool points behind the camera and outside the image, and findings from them."""
-    seen = tool_visibility(camera, robot, positions)
+    seen = tool_visibility(camera, robot, positions, T_mount_camera)
     measures = {
         f"tool '{tool.arm}'": f'{seen.behind[i]:.0%} behind the camera, '
         f'{seen.outside[i]:.0%} off the image'
@@ -347,11 +377,13 @@ def overlay_picture(
     Per arm the fading trail of the last seconds and a cross at the tool point; white the outline
     of the robot. Frames without joint states are drawn as they are.
     """
-    track, camera = episode.images[view], episode.cameras[view]
+    track = episode.images[view]
     covered = np.flatnonzero(joints.covers(track.stamps_ns))
     indices = covered if len(covered) else np.arange(len(track.stamps_ns))
     chosen = indices[np.linspace(0, len(indices) - 1, _NUM_FRAMES + 2).astype(int)[1:-1]]
-    tiles = [_tile(track, int(i), camera, robot, shapes, joints) for i in chosen]
+    tiles = [
+        _tile(track, int(i), episode.camera(view, int(i)), robot, shapes, joints) for i in chosen
+    ]
     rows = [np.hstack(tiles[i : i + 2]) for i in range(0, len(tiles), 2)]
     return np.ascontiguousarray(np.vstack(rows))
 

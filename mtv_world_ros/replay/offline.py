@@ -235,7 +235,7 @@ def observe(
     _check('the newest frames are', stamp_ns - min(stamps), limits.image_age_s, 'old')
     _check('the views are', max(stamps) - min(stamps), limits.view_skew_s, 'apart')
     return Observation(
-        cameras=tuple(episode.cameras[view] for view in views),
+        cameras=tuple(episode.camera(v, i) for v, i in zip(views, picked, strict=True)),
         frames=np.stack([episode.images[v].frames[i] for v, i in zip(views, picked, strict=True)]),
         positions=_positions(episode, pipeline, stamp_ns, limits),
         stamp_ns=min(stamps),

@@ -5,7 +5,7 @@ from types import SimpleNamespace as Message
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.transform_tree import TransformTree
+from mtv_world_ros.data.transform_tree import pose_track, TransformTree
 from mtv_world_ros.errors import CalibrationError
 
 LINKS = ('base', 'hand')
@@ -87,3 +87,26 @@ def test_memory_is_bounded_whatever_is_published():
     for k in range(5000):
         tree.add(message(edge('base', f'frame{k}'), edge('base', f'nan{k}', float('nan'))))
     assert len(tree.frames) + len(tree.problems) < 2100
+
+
+def test_a_camera_that_moves_is_where_the_newest_transform_says():
+    tree = TransformTree()
+    tree.add(message(edge('pan', 'optical', 0.1)), latched=True)
+    tree.add(message(edge('base', 'pan', stamp_s=1)))
+    assert not tree.is_moving('optical', LINKS)
+    tree.add(message(edge('base', 'pan', 0.5, stamp_s=2)))
+    assert tree.is_moving('optical', LINKS) and not tree.is_moving('nowhere', LINKS)
+    mount = tree.moving_mount('optical', LINKS)
+    assert (mount.link, mount.stamp_ns) == ('base', 2_000_000_000)
+    np.testing.assert_allclose(mount.T_link_frame[:3, 3], (0.6, 0, 0))
+
+
+def test_poses_between_two_transforms_are_interpolated_over_another_branch():
+    sent = [message(edge('map', 'base', 1.0), edge('pan', 'optical', 0.1))]
+    sent += [message(edge('map', 'pan', 0.2 * k, stamp_s=0.2 * k)) for k in range(6)]
+    stamps = np.array([0.0, 0.3, 1.0]) * 1e9
+    track = pose_track(sent, 'optical', LINKS, stamps.astype(np.int64))
+    assert track.link == 'base'
+    np.testing.assert_allclose(track.T_link_frame[:, 0, 3], np.array([0, 0.3, 1.0]) + 0.1 - 1.0)
+    with pytest.raises(CalibrationError, match='within 0.5 s before and after 1 of 2 images'):
+        pose_track(sent, 'optical', LINKS, np.array([0, 2 * 10**9]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import shutil
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[i
 from mtv_world_ros.config import validated
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError, ConfigError
-from mtv_world_ros.importing.camera_parameters import camera_model, CameraSource
+from mtv_world_ros.importing.camera_parameters import camera_model, camera_track, CameraSource
 from mtv_world_ros.importing.convert import import_dataset
 
 #: looks down from 2 m: x right, y down, z ahead in the camera
@@ -128,3 +129,44 @@ def test_a_pose_that_changes_within_the_episode_is_refused(tmp_path):
     values = {'K': np.repeat(np.array(K)[None], 4, axis=0), 'T': poses}
     with pytest.raises(CalibrationError, match="'T' changes at frame 2; a camera that moves"):
         camera_model(source, tmp_path, 0, values, (64, 48))
+
+
+def test_a_camera_that_moves_has_a_pose_a_row(tmp_path):
+    poses = np.repeat(POSE[None], 4, axis=0)
+    poses[:, 0, 3] += np.arange(4)
+    row = {**BASE, 'file': None, 'intrinsics': 'K', 'extrinsics': 'T', 'moves': True}
+    row = {key: value for key, value in row.items() if value is not None}
+    values = {'K': np.repeat(np.array(K)[None], 4, axis=0), 'T': poses}
+    source = source_of({'feature': 'image', 'camera': row}, tmp_path)
+    camera, track = camera_track(source, tmp_path, 0, values, (64, 48))
+    assert camera.T_mount_camera == pytest.approx(poses[0]) and track == pytest.approx(poses)
+    poses[2, :3, :3] *= 2
+    with pytest.raises(CalibrationError, match='not a rotation'):
+        camera_track(source, tmp_path, 0, values, (64, 48))
+    with pytest.raises(ConfigError, match="'moves' needs poses that are features"):
+        source_of({'feature': 'image', 'camera': {**BASE, 'moves': True}}, tmp_path)
+
+
+def test_the_poses_of_a_camera_that_moves_are_stored_with_the_episode(
+    datasets, make_mapping, tmp_path
+):
+    from pyarrow import array, parquet
+
+    root = tmp_path / 'moving'
+    shutil.copytree(datasets('v2.1'), root)
+    file = root / 'data/chunk-000/episode_000000.parquet'
+    table = parquet.read_table(file)
+    poses = np.repeat(POSE[None], len(table), axis=0)
+    poses[:, 0, 3] += 0.05 * np.arange(len(table))
+    at = table.column_names.index('sensors.top.pose')
+    parquet.write_table(table.set_column(at, 'sensors.top.pose', array(poses.tolist())), file)
+    camera = (
+        'camera: {intrinsics: sensors.top.K, extrinsics: sensors.top.pose, moves: true, '
+        'mount_link: base}'
+    )
+    mapping = make_mapping(('calibration: calibration.yaml', camera))
+    summary = import_dataset(root, mapping, tmp_path / 'out', episodes=[0])
+    assert summary.made == [0], summary.failed
+    episode = read_episode(tmp_path / 'out' / 'episode_000000')
+    np.testing.assert_allclose(episode.camera_tracks['front'], poses, atol=1e-9)
+    np.testing.assert_allclose(episode.camera('front', 3).T_mount_camera, poses[3], atol=1e-9)

@@ -83,11 +83,13 @@ def record(
     urdf: str = URDF,
     frames: dict[str, ByteArray] | None = None,
     more: Callable[[Bag], None] | None = None,
+    cart: FloatArray | None = None,
 ) -> Path:
     """A teleoperated recording in the namespace /cell: joints with a prefix, no commands.
 
     `door` has raw yuv422_yuy2 images and is fixed to the TF frame `ceiling`, `palm` has JPEG and
     is fixed to a TF frame on the hand that the URDF does not have. `more` writes other topics.
+    With `cart` (N, 4, 4) the TF frame `ceiling` is one that moves in `plinth` by these poses.
     """
     frames = frames or {v: render(robot, c, positions) for v, c in cameras.items()}
     ceiling = np.diag([1.0, -1, -1, 1])
@@ -104,6 +106,8 @@ def record(
                       inverse(adapter) @ cameras['palm'].T_mount_camera),
         ]  # fmt: skip
         tf = 'tf2_msgs/msg/TFMessage'
+        if cart is not None:
+            del fixed[0]
         bag.write('/tf_static', tf, START_NS, messages.make(tf, transforms=fixed))
         text = messages.make(messages.STRING, data=urdf)
         bag.write('/cell/robot_description', messages.STRING, START_NS, text)
@@ -112,6 +116,8 @@ def record(
             stamp = START_NS + round(k * 1e9 / FPS)
             _write_row(bag, stamp, prefix, robot, row)
             moving = [transform(stamp, 'plinth', 'hand', links['hand'][k])]
+            if cart is not None:
+                moving.append(transform(stamp, 'plinth', 'ceiling', cart[k]))
             bag.write('/tf', tf, stamp, messages.make(tf, transforms=moving))
             for view, camera in cameras.items():
                 _write_view(bag, stamp, view, camera, frames[view][k])

@@ -209,6 +209,24 @@ def parse_pose(item: Any) -> NDArray[np.float64]:
     return T
 
 
+def make_tf(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
+    """tf2_msgs/TFMessage with one transform."""
+    T = np.asarray(T_parent_child, np.float64)
+    x, y, z, w = quaternion(T[:3, :3]).tolist()
+    place = dict(zip('xyz', T[:3, 3].tolist(), strict=True))
+    transform = make(
+        'geometry_msgs/msg/TransformStamped',
+        header=make_header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=make(
+            'geometry_msgs/msg/Transform',
+            translation=make('geometry_msgs/msg/Vector3', **place),
+            rotation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+        ),
+    )
+    return make(TF_MESSAGE, transforms=[transform])
+
+
 def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:
     """trajectory_msgs/JointTrajectory that starts at `stamp_ns`."""
     empty = np.empty(0)

@@ -93,6 +93,11 @@ class Extrinsics:
             self._sources[view] = 'file'
             return None
         try:
+            if self._tree.is_moving(frame, self._links):
+                mount = self._tree.moving_mount(frame, self._links)
+                self._check_age(view, frame, mount, stamp_ns, settings.max_tf_age_s)
+                self._sources[view] = 'tf, moving'
+                return mount
             mount = self._tree.mount(frame, self._links)
         except CalibrationError as error:
             raise Rejection(
