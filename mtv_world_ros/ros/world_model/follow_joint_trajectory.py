@@ -262,7 +262,8 @@ def _verdict(ended: Ended) -> str:
     if ended.last is None:
         return 'nothing was imagined'
     prediction = ended.last.prediction
-    success, reasons = prediction.success, '; '.join(prediction.success.reasons)
+    success = prediction.success
+    reasons = '; '.join(success.reasons).removeprefix('abstains: ')
     known = f'{ended.num_chunks} of {prediction.num_chunks} chunks imagined'
     if isnan(success.probability):
         return f'{known}; the success estimate abstains: {reasons}'
