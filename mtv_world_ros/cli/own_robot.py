@@ -307,7 +307,7 @@ def estimate_camera(
     """
     from dataclasses import replace
 
-    from mtv_world_ros.errors import EpisodeError
+    from mtv_world_ros.errors import CalibrationError, EpisodeError
     from mtv_world_ros.geometry.robot_shape import moving_links
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.wrist_camera import (
@@ -318,6 +318,11 @@ def estimate_camera(
 
     if episode.joint_states is None:
         raise EpisodeError(f"'{episode.info.path}' has no joint_states")
+    if arguments.view in episode.camera_tracks:
+        raise CalibrationError(
+            f"'{episode.info.path}': the camera of view '{arguments.view}' moves by itself, with "
+            'the poses of /tf; one that stands still or is on the arm can be estimated'
+        )
     joints = JointTrack(episode.joint_states, robot)
     track, camera = episode.images[arguments.view], episode.cameras[arguments.view]
     link = arguments.mount_link or camera.mount_link

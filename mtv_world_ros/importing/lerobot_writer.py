@@ -114,6 +114,11 @@ def _rows(path: Path, robot: RobotModel, fps: int) -> _Rows:
         views=found.views, fps=fps, num_frames=1, width=width, height=height, robot=robot.name
     )
     recording = load_recording(path, spec, robot)
+    if recording.camera_tracks:
+        raise EpisodeError(
+            f"episode '{path}': the camera of view '{min(recording.camera_tracks)}' moves by "
+            'itself; a data set has one pose of each camera: leave the episode out'
+        )
     count = int(recording.times[-1] * fps + 1e-6) + 1
     times = np.arange(count) / fps
     nearest = nearest_rows(recording.times, times)

@@ -146,3 +146,14 @@ def test_a_camera_on_a_calibration_file_does_not_move(bag, robot):
     assert not episode.camera_tracks  # the user's own file goes before /tf
     np.testing.assert_allclose(episode.cameras['door'].T_mount_camera, truth()[0], atol=1e-6)
     assert episode.camera('door', 5) is episode.cameras['door']
+
+
+def test_what_takes_one_pose_of_a_camera_refuses_it(bag, robot, capsys, tmp_path):
+    path = imported(bag)
+    out = str(tmp_path / 'cameras.yaml')
+    command = ['calibrate-camera', str(path), '--view', 'door', '--robot', str(robot.file)]
+    assert main([*command, '--out', out]) == 1
+    assert "the camera of view 'door' moves by itself" in capsys.readouterr().err
+    command = ['export-dataset', str(path), '--robot', str(robot.file), '--fps', str(FPS)]
+    assert main([*command, '--out', str(tmp_path / 'set')]) == 1
+    assert "the camera of view 'door' moves by itself" in capsys.readouterr().err
