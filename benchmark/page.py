@@ -38,6 +38,7 @@ DESCRIBES = {
     'foresight': ('mtv_world_ros/ros',),
     'forward_kinematics': ('mtv_world_ros/geometry',),
     'interval_coverage': ('mtv_world_ros/evaluation/metrics',),
+    'learned_policies': ('mtv_world_ros/ranking', 'mtv_world_ros/policies', 'mtv_world_ros/sim'),
     'long_rollouts': ('mtv_world_ros/model',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),

@@ -212,6 +212,14 @@ def _add_export_dataset(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--fps', type=int, default=10, help='rows a second')
     parser.add_argument(
+        '--size', default='', metavar='WxH', help='of the images [px]; default: as recorded'
+    )
+    parser.add_argument(
+        '--images',
+        action='store_true',
+        help='PNG images in the tables in place of MP4: lossless, no video decoder is needed',
+    )
+    parser.add_argument(
         '--robot', default='yam_bimanual', help="a bundled robot's name, or a robot's YAML"
     )
     parser.set_defaults(handler=_export)
@@ -237,6 +245,19 @@ def _export(arguments: argparse.Namespace) -> int:
         named,
         arguments.fps,
         progress=lambda paths: tqdm(paths, unit='ep'),
+        size=_size(arguments.size),
+        as_videos=not arguments.images,
     )
     print(f'{count} episodes; mapping: {arguments.out / MAPPING}')
     return 0
+
+
+def _size(text: str) -> tuple[int, int] | None:
+    from mtv_world_ros.errors import ConfigError
+
+    if not text:
+        return None
+    width, _, height = text.partition('x')
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ConfigError(f"--size is '{text}'; it must be WIDTHxHEIGHT in pixels, e.g. 96x72")
+    return int(width), int(height)

@@ -210,6 +210,7 @@ def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:
 
 def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list[Job]:
     from mtv_world_ros.assembly import checkpoint_robot
+    from mtv_world_ros.ranking.policy_list import check_tasks, tasks_of
     from mtv_world_ros.ranking.policy_sets import BENCHMARK_TASKS, POLICY_SETS
     from mtv_world_ros.ranking.rollout_jobs import (
         DEFAULT_POLICIES,
@@ -223,15 +224,22 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
     policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
     if listed:
         policies = tuple(policy.name for policy in listed)
+        names = tasks_of(listed, DEFAULT_TASKS)
     elif arguments.policies is not None:
         policies = policies_named(arguments.policies)
     elif arguments.faults is not None:
         policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
+    check_tasks(listed, tasks)
     expert = Expert(checkpoint_robot(arguments.checkpoint, arguments.robot))
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
-    definitions = {policy.name: policy.definition for policy in listed}
-    jobs = [replace(job, definition=definitions.get(job.policy, '')) for job in jobs]
+    if listed:
+        of = {policy.name: policy for policy in listed}
+        jobs = [
+            replace(job, definition=of[job.policy].definition)
+            for job in jobs
+            if job.task in (of[job.policy].tasks or tasks)
+        ]
     print(f'{len(policies)} policies, {len(tasks)} tasks, {len(jobs)} rollouts in each world')
     return jobs
 

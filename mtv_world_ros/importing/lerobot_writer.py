@@ -1,4 +1,4 @@
-"""Writes episodes as a LeRobot dataset of format v3.0: parquet, MP4 and metadata.
+"""Writes episodes as a LeRobot dataset of format v3.0: parquet, MP4 or PNG, and metadata.
 
 Layout as in huggingface/lerobot 0.4 (`src/lerobot/datasets/utils.py`, `lerobot_dataset.py`): files
 of one episode each, which the format allows. Beside it stands a mapping, with which
@@ -8,7 +8,7 @@ of one episode each, which the format allows. Beside it stands a mapping, with w
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 import json
 from pathlib import Path
@@ -24,9 +24,11 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, WorldModelSpec
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free, write_json
+from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.importing.lerobot import pyarrow_modules
+from mtv_world_ros.rendering.images import encode_png, resize_frames
 
 #: files of a folder at most
 _CHUNK = 1000
@@ -72,6 +74,9 @@ def export_dataset(
     robot_name: str,
     fps: int,
     progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
+    *,
+    size: tuple[int, int] | None = None,
+    as_videos: bool = True,
 ) -> int:
     """Writes a dataset folder; returns the number of episodes.
 
@@ -85,6 +90,9 @@ def export_dataset(
         robot_name: its bundled name or file, for the mapping.
         fps: rows a second [Hz].
         progress: wraps the episodes, e.g. in a progress bar.
+        size: width and height of the images [px]; None = as recorded.
+        as_videos: MP4 files; else PNG images in the tables, lossless and read without a decoder
+            of videos.
 
     Raises:
         ConfigError: the folder exists, or pyarrow is not installed.
@@ -95,10 +103,10 @@ def export_dataset(
     pyarrow_modules()
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f'.{out.name}.') as folder:
-        writer = _Writer(Path(folder) / 'dataset', robot, robot_name, fps)
+        writer = _Writer(Path(folder) / 'dataset', robot, robot_name, fps, as_videos)
         writer.has_outcomes = all(read_info(path).outcome != 'unknown' for path in episodes)
         for path in progress(episodes):
-            writer.add(_rows(path, robot, fps))
+            writer.add(_resized(_rows(path, robot, fps), size))
         writer.finish()
         writer.root.rename(out)
     return writer.num_episodes
@@ -133,6 +141,16 @@ def _rows(path: Path, robot: RobotModel, fps: int) -> _Rows:
     )
 
 
+def _resized(rows: _Rows, size: tuple[int, int] | None) -> _Rows:
+    if size is None:
+        return rows
+    return replace(
+        rows,
+        frames=np.stack([resize_frames(frames, *size) for frames in rows.frames]),
+        cameras=tuple(scaled(camera, *size) for camera in rows.cameras),
+    )
+
+
 def _commanded(recording: Recording, times: FloatArray) -> FloatArray:
     """(T, J) commands; before the first one where the robot stood."""
     return resample(recording.commands, recording.positions[0], times)
@@ -147,9 +165,12 @@ class _Writer:
         has_outcomes: whether it is known of every episode if it succeeded.
     """
 
-    def __init__(self, root: Path, robot: RobotModel, robot_name: str, fps: int) -> None:
+    def __init__(
+        self, root: Path, robot: RobotModel, robot_name: str, fps: int, as_videos: bool
+    ) -> None:
         self.root, self.num_episodes, self.has_outcomes = root, 0, False
         self._robot, self._robot_name, self._fps = robot, robot_name, fps
+        self._as_videos = as_videos
         self._cameras: tuple[CameraModel, ...] = ()
         self._entries: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
@@ -175,7 +196,12 @@ class _Writer:
         if self.has_outcomes:
             is_last = np.arange(count) == count - 1
             columns['next.success'] = is_last & (rows.outcome == 'success')
-        _write_table(self.root / _DATA.format(**place), columns)
+        pictures = {
+            _image_key(camera): frames
+            for camera, frames in zip(rows.cameras, rows.frames, strict=True)
+        }
+        cells = {} if self._as_videos else {key: _cells(x) for key, x in pictures.items()}
+        _write_table(self.root / _DATA.format(**place), columns | cells)
         entry: dict[str, Any] = {
             'episode_index': number,
             'tasks': [rows.task],
@@ -187,13 +213,13 @@ class _Writer:
             'meta/episodes/chunk_index': 0,
             'meta/episodes/file_index': 0,
         }
-        for camera, frames in zip(rows.cameras, rows.frames, strict=True):
-            key = _image_key(camera)
-            path = self.root / _VIDEO.format(video_key=key, **place)
-            _write_video(path, frames, self._fps)
-            entry |= {f'videos/{key}/{name}': value for name, value in place.items()}
-            entry |= {f'videos/{key}/from_timestamp': 0.0}
-            entry |= {f'videos/{key}/to_timestamp': count / self._fps}
+        for key, frames in pictures.items():
+            if self._as_videos:
+                path = self.root / _VIDEO.format(video_key=key, **place)
+                _write_video(path, frames, self._fps)
+                entry |= {f'videos/{key}/{name}': value for name, value in place.items()}
+                entry |= {f'videos/{key}/from_timestamp': 0.0}
+                entry |= {f'videos/{key}/to_timestamp': count / self._fps}
             shown = frames[np.unique(np.linspace(0, count - 1, _STATISTICS_FRAMES).astype(int))]
             columns[key] = np.moveaxis(shown, -1, 0)[:, :, ::4, ::4].reshape(3, -1).T / 255.0
         for name, values in columns.items():
@@ -231,7 +257,8 @@ class _Writer:
                 f'episode {self.num_episodes} has the views {look(rows.cameras)}, the first one '
                 f'{look(self._cameras)}; a dataset has one set of views and sizes'
             )
-        if any(camera.width % 2 or camera.height % 2 for camera in rows.cameras):
+        is_odd = any(camera.width % 2 or camera.height % 2 for camera in rows.cameras)
+        if self._as_videos and is_odd:
             raise EpisodeError(
                 f'the images are {look(rows.cameras)}; MP4 needs an even width and height'
             )
@@ -242,16 +269,17 @@ class _Writer:
         features: dict[str, Any] = {'observation.state': vector, 'action': vector}
         for camera in self._cameras:
             features[_image_key(camera)] = {
-                'dtype': 'video',
+                'dtype': 'video' if self._as_videos else 'image',
                 'shape': [camera.height, camera.width, 3],
                 'names': ['height', 'width', 'channels'],
-                'info': {
+            }
+            if self._as_videos:
+                features[_image_key(camera)]['info'] = {
                     'video.height': camera.height, 'video.width': camera.width,
                     'video.codec': 'h264', 'video.pix_fmt': _PIXELS,
                     'video.is_depth_map': False, 'video.fps': self._fps,
                     'video.channels': 3, 'has_audio': False,
-                },
-            }  # fmt: skip
+                }  # fmt: skip
         if self.has_outcomes:
             features['next.success'] = {'dtype': 'bool', 'shape': [1], 'names': None}
         features['timestamp'] = {'dtype': 'float32', 'shape': [1], 'names': None}
@@ -269,7 +297,7 @@ class _Writer:
             'fps': self._fps,
             'splits': {'train': f'0:{self.num_episodes}'},
             'data_path': _DATA,
-            'video_path': _VIDEO,
+            'video_path': _VIDEO if self._as_videos else None,
             'features': features,
         }
 
@@ -344,6 +372,14 @@ def _write_table(
             arrays[name] = pyarrow.array(values)
     table = pyarrow.table(arrays)
     parquet.write_table(table.replace_schema_metadata(metadata) if metadata else table, path)
+
+
+def _cells(frames: ByteArray) -> list[dict[str, bytes | str]]:
+    """Images of a table, as `datasets.Image` stores them."""
+    return [
+        {'bytes': encode_png(frame), 'path': f'frame-{k:06d}.png'}
+        for k, frame in enumerate(frames)
+    ]
 
 
 def _write_video(path: Path, frames: ByteArray, fps: int) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.config import expected, ListOf, Positive, Schema
@@ -102,6 +102,14 @@ class ActionOutput(JointTable):
         description='actions a second; action k is where the joints are (k + 1) / rate_hz later'
     )
     relative: bool = Field(default=False, description='positions count from the observed ones')
+    clip: bool = Field(
+        default=False, description="beyond a joint's limits means at them, as in a robot's driver"
+    )
+    _limits: tuple[FloatArray, FloatArray] = PrivateAttr()
+
+    def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
+        self._limits = robot.lower, robot.upper
+        return super()._of(robot)
 
     def trajectory(self, actions: Any, observation: Observation) -> JointTrajectory:
         """The actions as commands.
@@ -129,6 +137,8 @@ class ActionOutput(JointTable):
         if self.relative:
             moving = [joint.column is not None for joint in self.columns]
             positions[:, moving] += observation.positions[moving]
+        if self.clip:
+            positions = positions.clip(*self._limits)
         return JointTrajectory(
             joint_names=tuple(joint.joint for joint in self.columns),
             times=np.arange(1, len(values) + 1) / self.rate_hz,

@@ -28,6 +28,7 @@ from mtv_world_ros.policies.server_process import PORT, ServerProcess
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import parse_variant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.tasks.tasks import tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
@@ -56,6 +57,9 @@ class PolicyEntry(Schema):
     start_timeout_s: Positive = Field(
         default=120.0, description='longest wait until the server listens [s]'
     )
+    tasks: ListOf[str] = Field(
+        default=(), description='that it is ranked on; empty = all of `--tasks`'
+    )
 
     @model_validator(mode='after')
     def _passes_the_port(self) -> Self:
@@ -79,6 +83,7 @@ class ListedPolicy:
         config: which policy.
         command: starts its server; empty = it has none, or it runs already.
         start_timeout_s: longest wait until the server listens [s].
+        tasks: that it is ranked on; empty = all that are asked for.
         definition: changes with everything that decides what the policy does.
     """
 
@@ -86,6 +91,7 @@ class ListedPolicy:
     config: PolicyConfig
     command: tuple[str, ...]
     start_timeout_s: float
+    tasks: tuple[str, ...]
     definition: str
 
 
@@ -128,6 +134,7 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
         config=config,
         command=entry.command,
         start_timeout_s=entry.start_timeout_s,
+        tasks=tuple(task.name for name in entry.tasks for task in tasks_named(name)),
         definition=hashlib.sha256(text.encode()).hexdigest()[:16],
     )
 
@@ -155,6 +162,31 @@ def _merged(values: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, A
             value = _merged(before, value)
         merged[key] = value
     return merged
+
+
+def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[str]) -> tuple[str, ...]:
+    """Returns the tasks that policies are ranked on where the user names none.
+
+    Args:
+        policies: of the file.
+        others: tasks of those policies that state none.
+    """
+    found = dict.fromkeys(task for policy in policies for task in policy.tasks or others)
+    return tuple(found)
+
+
+def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[str]) -> None:
+    """Refuses policies that would be ranked on nothing.
+
+    Raises:
+        ConfigError: a policy is for other tasks than those that are asked for.
+    """
+    for policy in policies:
+        if policy.tasks and not set(policy.tasks) & set(tasks):
+            raise ConfigError(
+                f"policy '{policy.name}' is for the tasks {', '.join(policy.tasks)}, --tasks is "
+                f"'{','.join(tasks)}'; name one of its tasks, or leave it out"
+            )
 
 
 def check_single_clients(policies: Sequence[ListedPolicy], workers: int) -> None:

@@ -146,6 +146,7 @@ def _rates(summary: Summary, task: str | None) -> Table:
             *(_rate(summary.judged_rate(policy, task, judge)) for judge in JUDGES),
         ]
         for policy in summary.policies
+        if summary.chosen(policy, task)
     ]
     head = ['policy', 'simulator', *JUDGES.values()]
     return Table(caption=f'Success rates, {task or ALL_TASKS}', head=head, rows=rows)
@@ -373,6 +374,8 @@ def _points(summary: Summary, judge: str, task: str | None) -> list[Point]:
     """Policies, numbered from the best one in the simulator on."""
     points = []
     for number, policy in enumerate(summary.policies):
+        if not summary.chosen(policy, task):
+            continue
         true = summary.true_rate(policy, task)
         judged = summary.judged_rate(policy, task, judge)
         points.append(

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[i
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.importing.lerobot import LeRobotDataset
 
 DEMO = share_path('resource', 'demo_episode')
@@ -75,3 +77,31 @@ def test_nothing_is_replaced_or_left_behind(exported, tmp_path, capsys):
     assert 'there is no episode to export' in capsys.readouterr().err
     assert main(['export-dataset', str(DEMO), '--out', str(tmp_path / 'new'), '--fps', '0']) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_small_png_images_are_imported_again_without_loss(tmp_path):
+    out = tmp_path / 'dataset'
+    wanted = ['--fps', '5', '--size', '95x72', '--images']
+    assert main(['export-dataset', str(DEMO), '--out', str(out), *wanted]) == 0
+    assert not (out / 'videos').exists()
+    mapping = str(out / 'meta/mapping.yaml')
+    again = tmp_path / 'again'
+    assert main(['import-dataset', str(out), '--mapping', mapping, '--out', str(again)]) == 0
+    (path,) = again.iterdir()
+    before, after = read_episode(DEMO), read_episode(path)
+    for view in before.views:
+        camera = scaled(before.cameras[view], 95, 72)
+        np.testing.assert_allclose(after.cameras[view].K, camera.K, rtol=1e-5)
+        dataset = LeRobotDataset(out)
+        key = f'observation.images.{view}'
+        first = next(iter(dataset.frames(dataset.episodes[0], key, np.zeros(1))))
+        real = before.images[view].frames[0]
+        wanted_image = cv2.resize(real, (95, 72), interpolation=cv2.INTER_AREA)
+        np.testing.assert_array_equal(first, wanted_image)
+
+
+@pytest.mark.parametrize('size', ['96', '0x72', '96x', 'small'])
+def test_a_wrong_size_is_refused(size, tmp_path, capsys):
+    out = str(tmp_path / 'new')
+    assert main(['export-dataset', str(DEMO), '--out', out, '--size', size]) == 1
+    assert f"--size is '{size}'; it must be WIDTHxHEIGHT" in capsys.readouterr().err

@@ -16,6 +16,7 @@ from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.policies.policy_config import load_policy_config
 
 SERVER = Path(__file__).with_name('lerobot_server.py')
 ROBOT = load_robot(robot_path('yam_bimanual'))
@@ -68,6 +69,18 @@ def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_pat
     tool = ROBOT.tools[0]  # 100 on the wire is open
     span = (tool.gripper_open - tool.gripper_closed) / 100
     np.testing.assert_allclose(moved[:, 6], span * np.arange(1, 7), atol=1e-6)
+
+
+def test_commands_beyond_the_limits_are_clipped_on_request():
+    path = share_path('config', 'policies', 'act_exported.yaml')
+    config = load_policy_config(path, ROBOT)
+    actions = np.tile([ROBOT.lower - 0.1, ROBOT.upper + 0.1], (2, 1))
+    commands = config.actions.trajectory(actions, observe())
+    assert commands.joint_names == ROBOT.joint_names
+    np.testing.assert_array_equal(commands.positions[:2], [ROBOT.lower, ROBOT.upper])
+    np.testing.assert_allclose(commands.times, [0.2, 0.4, 0.6, 0.8])
+    as_told = config.actions.model_copy(update={'clip': False})
+    np.testing.assert_array_equal(as_told.trajectory(actions, observe()).positions, actions)
 
 
 def test_observations_larger_than_a_message_are_sent_in_parts(tmp_path, server):

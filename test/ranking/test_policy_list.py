@@ -14,12 +14,14 @@ pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[p
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
 
 from mtv_world_ros.data_types import CameraModel, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.ranking.policy_list import (
     check_single_clients,
+    check_tasks,
     ListedPolicies,
     load_policy_list,
+    tasks_of,
 )
 
 #: a websocket server of openpi's protocol whose prompt says what goes wrong
@@ -111,6 +113,18 @@ def test_a_definition_changes_with_the_policy_and_not_with_patience(load):
     (slow,) = load({**OPENPI, 'change': {'timeout_s': 9.0}, 'start_timeout_s': 5.0})
     (other,) = load({**OPENPI, 'change': {'actions': {'rate_hz': 25}}})
     assert first.definition == slow.definition != other.definition
+
+
+def test_a_policy_is_ranked_on_its_own_tasks(load):
+    mine = {'name': 'mine', 'policy': 'expert', 'tasks': ['shake_bottle']}
+    listed = load(mine, {'name': 'any', 'policy': 'expert'})
+    assert tasks_of(listed, ('stack_blocks_two',)) == ('shake_bottle', 'stack_blocks_two')
+    assert tasks_of(listed[:1], ('stack_blocks_two',)) == ('shake_bottle',)
+    check_tasks(listed, ['shake_bottle', 'place_cup_plate'])
+    with pytest.raises(ConfigError, match="'mine' is for the tasks shake_bottle"):
+        check_tasks(listed, ['place_cup_plate'])
+    with pytest.raises(SimulatorError, match="'shake_botle' .did you mean 'shake_bottle'"):
+        load({**mine, 'tasks': ['shake_botle']})
 
 
 @pytest.mark.parametrize(
