@@ -150,7 +150,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     )
     # the benchmark of faults is about policies whose names say their faults
     optimism = {
-        name: Optimism.of(results, out / FOLDER, arguments.seed)
+        name: Optimism.of(results, out / FOLDER)
         for name, out, results in zip(names, folders, found, strict=True)
         if not listed
     }

@@ -15,18 +15,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.special import expit, logit
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
-from mtv_world_ros.evaluation.metrics.policy_agreement import (
-    agreement_interval,
-    mean_maximum_rank_violation,
-    pearson,
-    rates,
-)
+from mtv_world_ros.evaluation.metrics.policy_agreement import rate_agreement, rates
 from mtv_world_ros.evaluation.metrics.statistics import (
     clustered_wilson,
     Interval,
     MIN_SCENES,
+    t_quantile,
     UNKNOWN,
 )
 from mtv_world_ros.ranking.rollout_jobs import Judged, Result
@@ -41,8 +38,10 @@ JUDGES = {
 }
 #: what is measured of each judge, in the order of the tables
 MEASURES = {
-    'pearson': 'r, policies',
-    'mmrv': 'MMRV',
+    'pearson': 'r, observed',
+    'pearson_noise_free': 'r, noise-free',
+    'mmrv': 'MMRV, observed',
+    'mmrv_noise_free': 'MMRV, noise-free',
     'auroc': 'AUROC',
     'false_success': 'false success',
     'abstention': 'abstains',
@@ -50,8 +49,6 @@ MEASURES = {
     'flips': 'flips, all',
     'over_rule': 'AUROC - rule',
 }
-_NUM_RESAMPLES = 2000
-
 Scene = tuple[str, int]
 
 
@@ -97,17 +94,15 @@ class Optimism:
         flips: of rollouts whose true outcome is another than the expert's in the same scene, by
             `name_of`: whether the imagined last frame is nearer to what really happened than to
             what happened under the expert's commands.
-        seed: of the bootstrap.
     """
 
     results: Sequence[Result]
     flips: Mapping[str, bool]
-    seed: int = 0
 
     @classmethod
-    def of(cls, results: Sequence[Result], folder: Path, seed: int = 0) -> Optimism:
+    def of(cls, results: Sequence[Result], folder: Path) -> Optimism:
         """Returns the numbers of results whose last frames lie in a folder."""
-        return cls(results=results, flips=find_flips(results, folder), seed=seed)
+        return cls(results=results, flips=find_flips(results, folder))
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
@@ -161,16 +156,14 @@ class Optimism:
         """Pearson r and MMRV over the policies."""
         true = outcomes(results, lambda r: float(r.final))
         judged = outcomes(results, lambda r: judged_by(r, judge).success)
-        a, b = rates(judged), rates(true)
-        count = int((np.isfinite(a) & np.isfinite(b)).sum())
-        return {
-            name: Score(
-                value=score(a, b),
-                interval=agreement_interval(score, judged, true),
-                count=count,
+        count = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
+        found = {}
+        for name, score in rate_agreement(judged, true).items():
+            found[name] = Score(value=score.observed, count=count)
+            found[f'{name}_noise_free'] = Score(
+                value=score.noise_free, interval=score.interval, count=count
             )
-            for name, score in (('pearson', pearson), ('mmrv', mean_maximum_rank_violation))
-        }
+        return found
 
     def _auroc(self, results: Sequence[Result], judge: str) -> Score:
         """Over the rollouts that were judged."""
@@ -194,13 +187,8 @@ class Optimism:
         scenes = [(r.task, r.index) for r in results]
         if real.all() or not real.any():
             return Score(count=len(results))
-        weights = resampled_weights(scenes, self.seed)
-        areas = [areas_under_roc(one, real, weights) for one in said]
-        found = areas[0] - areas[1] if len(areas) > 1 else areas[0]
-        known = found[1:][np.isfinite(found[1:])]
-        enough = len(known) and len(set(scenes)) >= MIN_SCENES
-        low, high = np.percentile(known, [2.5, 97.5]) if enough else UNKNOWN
-        return Score(value=float(found[0]), interval=(float(low), float(high)), count=len(results))
+        value, interval = area_interval(said, real, scenes)
+        return Score(value=value, interval=interval, count=len(results))
 
 
 def name_of(result: Result) -> str:
@@ -244,16 +232,37 @@ def outcomes(results: Sequence[Result], outcome: Callable[[Result], float]) -> F
     return table
 
 
-def resampled_weights(scenes: Sequence[Scene], seed: int) -> FloatArray:
-    """Returns (1 + R, N) how often each rollout counts: once, then with scenes drawn anew.
+def area_interval(
+    said: Sequence[FloatArray], real: BoolArray, scenes: Sequence[Scene]
+) -> tuple[float, Interval]:
+    """Returns the area under the ROC and its 95 % t interval, from a jackknife over scenes.
 
-    All rollouts of a scene are drawn together.
+    Args:
+        said: (N,) estimates; of two, the first area less the second one is taken.
+        real: (N,) outcomes.
+        scenes: of the N rollouts; all of a scene are left out together.
+
+    Returns:
+        The area, its interval on the logit scale (of a difference: as it is); NaN for fewer than
+        `MIN_SCENES` scenes, or where no scene makes a difference.
     """
     names = list(dict.fromkeys(scenes))
     number = np.array([names.index(scene) for scene in scenes])
-    rng = np.random.default_rng(seed)
-    drawn = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), _NUM_RESAMPLES)
-    return np.concatenate([np.ones((1, len(scenes))), drawn[:, number].astype(np.float64)])
+    weights = np.concatenate([np.ones((1, len(scenes))), np.arange(len(names))[:, None] != number])
+    areas = [areas_under_roc(one, real, weights.astype(np.float64)) for one in said]
+    found = areas[0] if len(areas) == 1 else areas[0] - areas[1]
+    value, rest = float(found[0]), found[1:][np.isfinite(found[1:])]
+    num = len(rest)
+    error = np.sqrt((num - 1) / max(num, 1) * ((rest - rest.mean()) ** 2).sum()) if num else 0.0
+    if num < MIN_SCENES or error < 1e-9:
+        return value, UNKNOWN
+    half = float(t_quantile(num - 1)) * error
+    if len(areas) > 1:
+        return value, (max(value - half, -1.0), min(value + half, 1.0))
+    inner = np.clip(value, 0.5 / len(real), 1 - 0.5 / len(real))
+    half /= inner * (1 - inner)
+    low, high = expit(logit(inner) + np.array([-half, half]))
+    return value, (min(float(low), value), max(float(high), value))
 
 
 def areas_under_roc(said: FloatArray, real: BoolArray, weights: FloatArray) -> FloatArray:

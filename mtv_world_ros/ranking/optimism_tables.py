@@ -16,9 +16,9 @@ REMARK = (
     'nearer to what really happened than to what happened under the expert, over the pixels in '
     'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
     'frame alone: an object sticks to a gripper that closes near it. AUROC - rule: on the same '
-    'rollouts. Intervals, over scenes: of shares clustered Wilson, of r and MMRV of the true '
-    'rates (posterior), of AUROC bootstrap; none for few scenes, nor for r and MMRV of fewer than '
-    '3 policies. r, MMRV and AUROC of a kind: over its policies and the '
+    'rollouts. Intervals, over scenes: of shares clustered Wilson, of AUROC jackknife; none for '
+    'few scenes. r and MMRV, noise-free: estimated for endless scenes, posterior median and '
+    'interval; not below 3 policies. r, MMRV and AUROC of a kind: over its policies and the '
     'expert.'
 )
 

@@ -33,9 +33,10 @@ _CEILING = (
     "are the world model's."
 )
 _INTERVALS = (
-    'Intervals of rates: Wilson, 95 %. Intervals of r and MMRV: of the true rates, of '
-    'which few scenes are a noisy sample; none below 4 scenes or 3 policies. MMRV weighs '
-    'a wrongly ranked pair by how far its true rates lie apart; 0 is perfect.'
+    'Intervals of rates: Wilson, 95 %. The noise of few scenes makes the observed r too small and '
+    'the observed MMRV too large. Noise-free: what they would be on endless scenes, an estimate '
+    'and its 95 % interval; none below 4 scenes or 3 policies. MMRV weighs a wrongly ranked pair '
+    'by how far its true rates lie apart; 0 is perfect.'
 )
 
 
@@ -96,8 +97,8 @@ def _agreement_remark(summary: Summary) -> str:
         )
     if not low > 0:
         return (
-            'The interval of r reaches zero: these episodes do not show that imagination ranks '
-            'these policies better than chance.'
+            'The interval of the noise-free r reaches zero: these episodes do not show that '
+            'imagination ranks these policies better than chance.'
         )
     return ''
 
@@ -160,17 +161,21 @@ def _agreement(summary: Summary) -> Table:
             rows.append([label, JUDGES[judge], *_scores(scores)])
     return Table(
         caption='Agreement with the simulator, over the policies',
-        head=['task', 'judged on', "Pearson's r", 'MMRV', 'policies'],
+        head=[
+            'task', 'judged on', "Pearson's r", 'r, noise-free', 'MMRV', 'MMRV, noise-free',
+            'policies',
+        ],
         rows=rows,
         num_labels=2,
-    )
+    )  # fmt: skip
 
 
 def _scores(found: Mapping[str, Agreement]) -> list[str]:
-    cells = [
-        f'{a.value:.3f} {_interval(a.interval, 3)}' if isfinite(a.value) else 'not defined'
-        for a in found.values()
-    ]
+    cells = []
+    for one in found.values():
+        cells.append(f'{one.value:.3f}' if isfinite(one.value) else 'not defined')
+        free = f'{one.noise_free:.3f} {_interval(one.interval, 3)}'
+        cells.append(free if isfinite(one.noise_free) else '[n too small]')
     return [*cells, str(next(iter(found.values())).num_policies)]
 
 
@@ -346,7 +351,9 @@ def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
         }
         for who, found in judges.items():
             value = f'{found.value:.2f}' if isfinite(found.value) else DASH
-            below = _interval(found.interval) if isfinite(found.value) else 'not defined'
+            below = 'not defined' if value == DASH else '[n too small]'
+            if isfinite(found.noise_free):
+                below = f'noise-free {found.noise_free:.2f} {_interval(found.interval)}'
             tiles.append((f'{label}, {who}', value, below))
     return tiles
 

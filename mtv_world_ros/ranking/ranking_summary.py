@@ -12,11 +12,9 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.evaluation.metrics.policy_agreement import (
-    agreement_interval,
-    mean_maximum_rank_violation,
-    pearson,
     powered_mean,
     PoweredMean,
+    rate_agreement,
     rates,
 )
 from mtv_world_ros.evaluation.metrics.statistics import (
@@ -30,10 +28,6 @@ from mtv_world_ros.ranking.rollout_jobs import Job, Result
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'
-SCORES: dict[str, Callable[[FloatArray, FloatArray], float]] = {
-    'pearson': pearson,
-    'mmrv': mean_maximum_rank_violation,
-}
 #: who judges: name -> words
 JUDGES = {
     'imagined': 'imagined episodes',
@@ -83,15 +77,15 @@ class Agreement:
     """How well one judge's success rates of policies agree with the simulator's.
 
     Attributes:
-        score: `pearson` or `mmrv`.
-        value: NaN where it is not defined, e.g. all rates alike.
-        interval: 95 % interval of the score of the true rates; NaN for too few scenes or
-            policies.
+        value: score of the observed rates; NaN where it is not defined, e.g. all rates alike.
+        noise_free: estimate of the score without the noise of few scenes; NaN where there is no
+            interval.
+        interval: 95 % interval of `noise_free`; NaN for too few scenes or policies.
         num_policies: with a rate in both.
     """
 
-    score: str
     value: float
+    noise_free: float
     interval: Interval
     num_policies: int
 
@@ -99,6 +93,7 @@ class Agreement:
         """Returns plain values."""
         return {
             'value': self.value,
+            'noise_free': self.noise_free,
             'interval': self.interval,
             'num_policies': self.num_policies,
         }
@@ -201,15 +196,15 @@ class Summary:
         tasks = self.tasks if task is None else (task,)
         true = self._outcomes(tasks, lambda result: float(result.final))
         judged = self._outcomes(tasks, lambda result: judged_by(result, judge).success)
-        a, b = rates(judged), rates(true)
+        num = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
         return {
             name: Agreement(
-                score=name,
-                value=score(a, b),
-                interval=agreement_interval(score, judged, true),
-                num_policies=int((np.isfinite(a) & np.isfinite(b)).sum()),
+                value=found.observed,
+                noise_free=found.noise_free,
+                interval=found.interval,
+                num_policies=num,
             )
-            for name, score in SCORES.items()
+            for name, found in rate_agreement(judged, true).items()
         }
 
     def powered(self, policy: str) -> PoweredMean:

@@ -6,14 +6,13 @@ import pytest
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.ranking.flip_sheet import flip_sheet
 from mtv_world_ros.ranking.optimism import (
-    areas_under_roc,
+    area_interval,
     find_flips,
     is_nearer,
     last_frames_png,
     name_of,
     Optimism,
     read_last_frames,
-    resampled_weights,
 )
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.policy_sets import POLICY_SETS
@@ -79,17 +78,28 @@ def test_tables_fit_a_console(optimism):
     assert optimism_tables({}) == []
 
 
-def test_areas_agree_with_the_plain_one_and_scenes_are_drawn_whole():
+def test_areas_agree_with_the_plain_one_and_scenes_are_left_out_whole():
     rng = np.random.default_rng(0)
     said, real = rng.integers(0, 5, 40) / 4, rng.uniform(size=40) < 0.4
     scenes = [('stack', k // 4) for k in range(40)]
-    weights = resampled_weights(scenes, seed=1)
-    areas = areas_under_roc(said, real, weights)
-    assert areas[0] == pytest.approx(area_under_roc(said, real))
-    assert (weights.reshape(len(weights), 10, 4) == weights[:, ::4, None]).all()
-    assert (weights.sum(1) == 40).all() and len(weights) == 2001
-    rows = np.repeat(np.arange(40), weights[1].astype(int))
-    assert areas[1] == pytest.approx(area_under_roc(said[rows], real[rows]))
+    area, (low, high) = area_interval([said], real, scenes)
+    assert area == pytest.approx(area_under_roc(said, real)) and 0 < low < area < high < 1
+    # by hand: the spread of the areas without one scene each, on the logit scale
+    rest = [
+        area_under_roc(*(np.delete(one, range(4 * k, 4 * k + 4)) for one in (said, real)))
+        for k in range(10)
+    ]
+    error = np.sqrt(0.9 * ((rest - np.mean(rest)) ** 2).sum()) / (area * (1 - area))
+    ends = [
+        1 / (1 + np.exp(-(np.log(area / (1 - area)) + t * error))) for t in (-2.262157, 2.262157)
+    ]
+    assert (low, high) == pytest.approx(tuple(ends), abs=1e-6)
+    value, (low, high) = area_interval([said, said[::-1]], real, scenes)
+    assert (
+        value == pytest.approx(area - area_under_roc(said[::-1], real)) and -1 <= low < high <= 1
+    )
+    perfect, none = area_interval([real.astype(float)], real, scenes)
+    assert perfect == 1.0 and np.isnan(none).all()
 
 
 def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_path, make_result):

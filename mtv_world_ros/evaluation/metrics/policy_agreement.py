@@ -20,10 +20,9 @@ from mtv_world_ros.evaluation.metrics.statistics import (
 
 #: fewer policies than this have no interval of r or MMRV
 MIN_POLICIES = 3
-#: scales of the priors of the worse and the better end
-_PRIORS = (0.03, 0.003)
-#: what lies beyond either end
-_WORSE_TAIL, _BETTER_TAIL = 0.04, 0.01
+#: of the posterior beyond either end of an interval; with .025 an interval held the truth too
+#: rarely at 4 to 8 scenes (`benchmark/interval_coverage.py`)
+_TAIL = 0.0125
 
 
 def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray) -> float:
@@ -77,47 +76,66 @@ def rates(outcomes: FloatArray) -> FloatArray:
         return np.nanmean(flat, axis=1)
 
 
-def agreement_interval(
-    score: Callable[[FloatArray, FloatArray], float], judged: FloatArray, true: FloatArray
-) -> Interval:
-    """Returns the 95 % interval of a score of the policies' true rates, given few scenes.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreOfRates:
+    """A score of how well judged rates agree with true ones.
 
-    The rates are drawn from their posterior under two priors (`draw_rates`): the worse end (low
-    r, high MMRV) is the 4 % quantile where a judge is off by about .1, the better end the 1 %
-    quantile where it may be nearly perfect. The score of the observed rates, in which the noise
-    of few scenes is still contained, lies within. In simulated rankings it covers 94 to 99 %
-    (`benchmark/interval_coverage.py`).
+    Attributes:
+        observed: of the observed rates, as it is published elsewhere. The noise of few scenes is
+            contained in it: r is too small, MMRV too large.
+        noise_free: estimate of the score on endless scenes of the same kind: the median of its
+            posterior; NaN where there is no interval.
+        interval: 95 % interval of the latter; NaN for fewer than `MIN_SCENES` scenes or
+            `MIN_POLICIES` policies, where `observed` is not defined, or where all outcomes are
+            judged as they are.
+    """
+
+    observed: float
+    noise_free: float
+    interval: Interval
+
+
+def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRates]:
+    """Returns `pearson` and `mmrv` of the policies' success rates, over all tasks.
 
     Args:
-        score: `pearson` or `mean_maximum_rank_violation`.
         judged: (P, K, E) outcomes of P policies on E episodes of each of K tasks; NaN = none.
         true: (P, K, E) true outcomes.
-
-    Returns:
-        (low, high); NaN for fewer than `MIN_SCENES` scenes or `MIN_POLICIES` policies, where the
-        score is not defined, or where all outcomes are judged as they are.
     """
-    seen = np.isfinite(true).any(axis=0)
-    both = np.stack([judged[:, seen], true[:, seen]])
-    both = both[:, np.isfinite(both).any(axis=2).all(axis=0)]
-    if both.shape[1] < MIN_POLICIES or both.shape[2] < MIN_SCENES:
-        return UNKNOWN
-    whole = score(rates(both[0]), rates(both[1]))
-    if not np.isfinite(whole) or np.array_equal(both[0], both[1], equal_nan=True):
-        return UNKNOWN
-    of_draws, is_worse_low = _OF_DRAWS[score]
-    doubtful, trusting = (of_draws(*draw_rates(both[0], both[1], scale)) for scale in _PRIORS)
-    if is_worse_low:
-        low, high = np.quantile(doubtful, _WORSE_TAIL), np.quantile(trusting, 1 - _BETTER_TAIL)
-    else:
-        low, high = np.quantile(trusting, _BETTER_TAIL), np.quantile(doubtful, 1 - _WORSE_TAIL)
-    return min(float(low), whole), max(float(high), whole)
+    observed = {name: score(rates(judged), rates(true)) for name, (score, _) in _SCORES.items()}
+    draws = _draws(judged, true)
+    found = {}
+    for name, (_, score_of_draws) in _SCORES.items():
+        middle, interval = np.nan, UNKNOWN
+        if draws is not None and np.isfinite(observed[name]):
+            values = score_of_draws(*draws)
+            low, high = (float(end) for end in np.quantile(values, (_TAIL, 1 - _TAIL)))
+            if low < high:
+                middle, interval = float(np.median(values)), (low, high)
+        found[name] = ScoreOfRates(observed=observed[name], noise_free=middle, interval=interval)
+    return found
+
+
+def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:
+    """Rates (2, D, P) without the noise of few scenes; None where there is too little."""
+    both = np.stack([judged, true])
+    is_known = np.isfinite(both)
+    policies = is_known.any(axis=(2, 3)).all(axis=0)
+    scenes = is_known[1].any(axis=0)
+    if policies.sum() < MIN_POLICIES or scenes.sum() < MIN_SCENES:
+        return None
+    both = both[:, policies]
+    if np.array_equal(both[0], both[1], equal_nan=True):
+        return None
+    return draw_rates(both[0], both[1])
 
 
 def _pearson_of(judged: FloatArray, true: FloatArray) -> FloatArray:
     """(D,) of draws (D, P)."""
     a, b = (rates - rates.mean(axis=1, keepdims=True) for rates in (judged, true))
-    return (a * b).sum(axis=1) / np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
+    return (a * b).sum(axis=1) / np.maximum(
+        np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1)), 1e-12
+    )
 
 
 def _violation_of(judged: FloatArray, true: FloatArray) -> FloatArray:
@@ -127,10 +145,11 @@ def _violation_of(judged: FloatArray, true: FloatArray) -> FloatArray:
     return np.where(is_violated, np.abs(gaps), 0.0).max(axis=2).mean(axis=1)
 
 
-#: score -> the same of draws, and whether a low value is the worse one
-_OF_DRAWS: Mapping[object, tuple[Callable[[FloatArray, FloatArray], FloatArray], bool]] = {
-    pearson: (_pearson_of, True),
-    mean_maximum_rank_violation: (_violation_of, False),
+Score = Callable[[FloatArray, FloatArray], float]
+#: score of rates, and the same of draws
+_SCORES: Mapping[str, tuple[Score, Callable[[FloatArray, FloatArray], FloatArray]]] = {
+    'pearson': (pearson, _pearson_of),
+    'mmrv': (mean_maximum_rank_violation, _violation_of),
 }
 
 

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
-from scipy.special import ndtri
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.metrics.policy_agreement import (
-    agreement_interval,
     mean_maximum_rank_violation,
     pearson,
     powered_mean,
+    rate_agreement,
     rates,
 )
 from mtv_world_ros.evaluation.metrics.statistics import wilson
@@ -49,53 +48,62 @@ def test_wilson_interval_is_the_published_one():
     assert np.isnan(wilson(0, 0)).all()
 
 
-def test_interval_holds_the_score_and_narrows_with_episodes():
+def test_point_lies_within_its_interval_which_narrows_with_episodes():
     generator = np.random.default_rng(0)
     truth = np.linspace(0.1, 0.9, 6)[:, None, None]
 
     def outcomes(num):
-        uniform = generator.uniform(size=(6, 2, num))
-        return (uniform < truth).astype(float), (uniform < truth * 0.8).astype(float)
+        uniform = generator.uniform(size=(2, 6, 2, num))
+        return (uniform[0] < truth).astype(float), (uniform[1] < truth * 0.8).astype(float)
 
     widths = []
     for num in (8, 60):
         real, imagined = outcomes(num)
-        low, high = agreement_interval(pearson, imagined, real)
-        assert low <= pearson(rates(imagined), rates(real)) <= high <= 1.0
+        found = rate_agreement(imagined, real)
+        assert found['pearson'].observed == pearson(rates(imagined), rates(real))
+        assert found['mmrv'].observed == mean_maximum_rank_violation(rates(imagined), rates(real))
+        for name, least in (('pearson', -1.0), ('mmrv', 0.0)):
+            low, high = found[name].interval
+            assert least <= low <= found[name].noise_free <= high <= 1.0 and low < high
+        low, high = found['pearson'].interval
         widths.append(high - low)
     assert widths[1] < widths[0]
+
+
+def test_without_noise_r_is_larger_than_observed_and_mmrv_is_smaller():
+    """Two worlds of the same rates, whose luck is independent: r is 1 on endless scenes."""
+    rng = np.random.default_rng(2)
+    truth = np.linspace(0.2, 0.8, 12)[:, None, None]
+    real, imagined = (rng.uniform(size=(2, 12, 1, 20)) < truth).astype(float)
+    found = rate_agreement(imagined, real)
+    assert found['pearson'].observed < found['pearson'].noise_free
+    assert found['pearson'].interval[1] > 0.99
+    assert found['mmrv'].observed > found['mmrv'].noise_free
 
 
 def test_imagination_that_is_the_truth_has_no_interval_of_width_zero():
     """Without any scene the score is the same, so nothing is known of its spread."""
     real = np.random.default_rng(1).integers(0, 2, (5, 2, 10)).astype(float)
-    for score in (pearson, mean_maximum_rank_violation):
-        assert np.isnan(agreement_interval(score, real, real)).all()
-    nothing = np.full((5, 2, 10), np.nan)
-    assert np.isnan(agreement_interval(pearson, nothing, real)).all()
+    for judged in (real, np.full((5, 2, 10), np.nan)):
+        for found in rate_agreement(judged, real).values():
+            assert np.isnan(found.interval).all() and np.isnan(found.noise_free)
+    assert rate_agreement(real, real)['pearson'].observed == pytest.approx(1.0)
 
 
-def test_a_single_episode_of_each_task_is_too_few_for_an_interval():
+def test_too_few_scenes_or_policies_have_no_interval():
     rng = np.random.default_rng(0)
-    real, imagined = rng.integers(0, 2, (2, 6, 3, 1)).astype(float)
-    assert np.isnan(agreement_interval(pearson, imagined, real)).all()
+    for shape in ((6, 3, 1), (6, 1, 2), (2, 3, 10)):
+        real, imagined = rng.integers(0, 2, (2, *shape)).astype(float)
+        assert np.isnan(rate_agreement(imagined, real)['pearson'].interval).all()
 
 
-@pytest.mark.parametrize('num', [4, 8, 20])
-def test_intervals_of_r_cover_the_truth(num):
-    """Ten policies on three tasks; whether a rollout succeeds depends on its scene too."""
-    rng = np.random.default_rng(num)
-    covered = []
-    for _ in range(300):
-        true = rng.uniform(0.05, 0.95, 10)
-        said = np.clip(0.7 * true + 0.1 + rng.normal(0, 0.25, 10), 0.02, 0.98)
-        scene = rng.normal(size=(1, 3, num))
-        luck = (scene + rng.normal(size=(2, 10, 3, num))) / np.sqrt(2)
-        cut = ndtri(np.stack([said, true]))[:, :, None, None]
-        imagined, real = (luck < cut).astype(float)
-        low, high = agreement_interval(pearson, imagined, real)
-        covered.append(low <= pearson(said, true) <= high)
-    assert 0.9 <= np.mean(covered) <= 0.98
+def test_outcomes_that_are_missing_or_all_alike_do_no_harm():
+    rng = np.random.default_rng(4)
+    real, imagined = rng.integers(0, 2, (2, 6, 3, 4)).astype(float)
+    imagined[0], imagined[1, 0], imagined[2, :, 1] = np.nan, np.nan, np.nan
+    real[3], imagined[4] = 1.0, 0.0
+    low, high = rate_agreement(imagined, real)['pearson'].interval
+    assert -1.0 <= low < high <= 1.0
 
 
 def test_powered_mean_is_the_one_computed_by_hand():
