@@ -38,10 +38,10 @@ JUDGES = {
 }
 #: what is measured of each judge, in the order of the tables
 MEASURES = {
-    'pearson': 'r, observed',
-    'pearson_noise_free': 'r, noise-free',
-    'mmrv': 'MMRV, observed',
-    'mmrv_noise_free': 'MMRV, noise-free',
+    'pearson': 'r observed',
+    'pearson_noise_free': 'r noise-free',
+    'mmrv': 'MMRV observed',
+    'mmrv_noise_free': 'MMRV noise-free',
     'auroc': 'AUROC',
     'false_success': 'false success',
     'abstention': 'abstains',

@@ -13,6 +13,7 @@ from mtv_world_ros.documents import DASH, render, Table
 from mtv_world_ros.evaluation.metrics.statistics import MIN_SCENES
 from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
 from mtv_world_ros.files import write_json, write_whole
+from mtv_world_ros.ranking.optimism import JUDGES as SHORT_WORDS
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
 from mtv_world_ros.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
@@ -158,11 +159,11 @@ def _agreement(summary: Summary) -> Table:
     for label, task in {ALL_TASKS: None, **{name: name for name in summary.tasks}}.items():
         found = {judge: summary.agreement(judge, task) for judge in JUDGES}
         for judge, scores in found.items():
-            rows.append([label, JUDGES[judge], *_scores(scores)])
+            rows.append([label, SHORT_WORDS[judge], *_scores(scores)])
     return Table(
         caption='Agreement with the simulator, over the policies',
         head=[
-            'task', 'judged on', "Pearson's r", 'r, noise-free', 'MMRV', 'MMRV, noise-free',
+            'task', 'judged on', "Pearson's r", 'r noise-free', 'MMRV', 'MMRV noise-free',
             'policies',
         ],
         rows=rows,

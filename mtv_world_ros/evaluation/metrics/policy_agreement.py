@@ -85,7 +85,7 @@ class ScoreOfRates:
             contained in it: r is too small, MMRV too large.
         noise_free: estimate of the score on endless scenes of the same kind: the median of its
             posterior; NaN where there is no interval.
-        interval: 95 % interval of the latter; NaN for fewer than `MIN_SCENES` scenes or
+        interval: 95 % interval of the latter, widened to hold `observed`; NaN for fewer than `MIN_SCENES` scenes or
             `MIN_POLICIES` policies, where `observed` is not defined, or where all outcomes are
             judged as they are.
     """
@@ -110,6 +110,7 @@ def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRat
         if draws is not None and np.isfinite(observed[name]):
             values = score_of_draws(*draws)
             low, high = (float(end) for end in np.quantile(values, (_TAIL, 1 - _TAIL)))
+            low, high = min(low, observed[name]), max(high, observed[name])
             if low < high:
                 middle, interval = float(np.median(values)), (low, high)
         found[name] = ScoreOfRates(observed=observed[name], noise_free=middle, interval=interval)
