@@ -85,9 +85,9 @@ class ScoreOfRates:
             contained in it: r is too small, MMRV too large.
         noise_free: estimate of the score on endless scenes of the same kind: the median of its
             posterior; NaN where there is no interval.
-        interval: 95 % interval of the latter, widened to hold `observed`; NaN for fewer than `MIN_SCENES` scenes or
-            `MIN_POLICIES` policies, where `observed` is not defined, or where all outcomes are
-            judged as they are.
+        interval: 95 % interval of the latter, widened to hold `observed`; NaN for fewer than
+            `MIN_SCENES` scenes or `MIN_POLICIES` policies, where `observed` is not defined, or
+            where all outcomes are judged as they are.
     """
 
     observed: float
