@@ -253,7 +253,13 @@ def held(scores: list[tuple[ScoreOfRates, float]]) -> float:
 
 def main() -> None:
     """Simulates, and prints the page."""
-    options = parse_arguments(__doc__, repeats=1000)
+    options = parse_arguments(
+        __doc__,
+        repeats=1000,
+        more=lambda parser: parser.add_argument(
+            '--rankings', type=int, default=300, help='sets for r and MMRV, which take longer'
+        ),
+    )
     rows, errors = [], []
     for name in INTERVALS:
         for words, differs in POPULATIONS.items():
@@ -262,15 +268,16 @@ def main() -> None:
             found = [coverage(name, n, options.repeats, options.seed, differs) for n in SIZES]
             rows.append([name, words, *(_cell(*one) for one in found)])
     for words, differs in POPULATIONS.items():
-        by_size = [ranking_scores(n, options.repeats, options.seed, differs) for n in SIZES]
+        by_size = [ranking_scores(n, options.rankings, options.seed, differs) for n in SIZES]
         for name, (label, _) in SCORES.items():
             scores = [one[name] for one in by_size]
-            missing = [options.repeats - len(one) for one in scores]
+            missing = [options.rankings - len(one) for one in scores]
             covered = [held(one) for one in scores]
             rows.append([label, words, *map(_cell, covered, missing)])
             errors.append([label.rpartition(', ')[2], words, *map(_errors, scores)])
     body = (
-        f'Share of {options.repeats} simulated sets whose 95 % interval holds the truth, by the '
+        f'Share of {options.repeats} simulated sets (r and MMRV: {options.rankings}) whose 95 % '
+        'interval holds the truth, by the '
         'number n of episodes (means, shares, powered rates: true outcomes), of scenes (AUROC, '
         'differences, shares by scene) or of scenes of each task (r, MMRV; the mild population '
         'has ten policies and three tasks, the differing one 4 to 30 and one). In parentheses: '

@@ -90,7 +90,7 @@ def test_imagination_that_is_the_truth_has_no_interval_of_width_zero():
     assert rate_agreement(real, real)['pearson'].observed == pytest.approx(1.0)
 
 
-def test_too_few_scenes_or_policies_have_no_interval():
+def test_a_single_episode_of_each_task_is_too_few_for_an_interval():
     rng = np.random.default_rng(0)
     for shape in ((6, 3, 1), (6, 1, 2), (2, 3, 10)):
         real, imagined = rng.integers(0, 2, (2, *shape)).astype(float)
