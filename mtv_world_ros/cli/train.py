@@ -146,9 +146,11 @@ def _train(arguments: argparse.Namespace) -> int:
         select(arguments.dataset)  # says that it holds no episodes
     if arguments.init:
         read_card(checkpoint_path(arguments.init))
+    from mtv_world_ros.model.runtime import check_device, choose_dtype
+
+    check_device(arguments.device)
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.training_run import train
 

@@ -128,7 +128,8 @@ def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:
     both = both[:, policies]
     if np.array_equal(both[0], both[1], equal_nan=True):
         return None
-    return draw_rates(both[0], both[1])
+    # the same draws in whatever order the policies come
+    return draw_rates(*both[:, np.lexsort([rates(outcomes) for outcomes in both])])
 
 
 def _pearson_of(judged: FloatArray, true: FloatArray) -> FloatArray:
