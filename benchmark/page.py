@@ -28,6 +28,7 @@ from mtv_world_ros.files import content_digest
 ROOT = Path(__file__).resolve().parents[1]
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
+    'batching': ('mtv_world_ros/model',),
     'camera_calibration': ('mtv_world_ros/inspection',),
     'collect': ('mtv_world_ros/sim',),
     'control_representations': ('mtv_world_ros/training', 'mtv_world_ros/model'),
@@ -56,7 +57,8 @@ DESCRIBES = {
 }
 #: kinds of pages whose numbers are a checkpoint's; by default the bundled one's
 OF_A_CHECKPOINT = (
-    'denoising_steps', 'evaluation', 'foresight', 'policy_in_the_loop', 'ros_overhead', 'serving',
+    'batching', 'denoising_steps', 'evaluation', 'foresight', 'learned_policies',
+    'policy_in_the_loop', 'ros_overhead', 'serving',
 )  # fmt: skip
 _MADE = re.compile(
     r'^Made at commit `(\w+)(\+?)`, (?:no checkpoint|(\w+) checkpoint `(\w+)`)\. '
