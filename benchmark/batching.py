@@ -48,7 +48,7 @@ def main() -> None:
         rows.append([str(size), f'{each[0]:.0f}', spread, f'{alone / each[0]:.2f}'])
     head = ['chunks in a batch', 'CPU-ms a chunk, median', '5 to 95 %', 'times as fast as alone']
     size = f'{len(spec.views)} views x {spec.num_frames} frames of {spec.width}x{spec.height}'
-    body = f'A chunk: {size}; one denoising step; {options.threads} threads.'
+    body = f'A chunk: {size}; one denoising step; threads: {options.threads}.'
     command = f'python benchmark/batching.py --threads {options.threads}'
     versions = f'torch {torch.__version__}'
     publish('batching', 'Batches', command, f'{table(head, rows)}\n\n{body}', options, versions)
