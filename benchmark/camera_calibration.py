@@ -6,21 +6,25 @@ Each recording is a simulated scene of its own, with a speckled table, in which 
 robot move smoothly about their pose at rest for 10 s; the bundled robots' first view stands
 still, and a camera sits on the first arm's tool link. Estimates start from a guess that is 5
 degrees and 50 mm wrong, and from none. The errors are those of the poses; they are covered where
-they are within twice the stated standard error. --minutes ends a run early, with the n it got to.
+they are within twice the stated standard error. --minutes ends a run early, with the n it got to;
+with --kept FILE the same command goes on from there.
 """
 
 from __future__ import annotations
 
 from argparse import Namespace
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+import json
+from pathlib import Path
 import time
+from typing import Any
 
 import numpy as np
 from page import parse_arguments, publish, table
 
 from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.cli.own_robot import GOOD_MATCH
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import MtvWorldError
@@ -42,6 +46,8 @@ from mtv_world_ros.sim.world.scene import scene_xml
 from mtv_world_ros.sim.world.simulator import scene_generator
 from mtv_world_ros.sim.world.workcell import workcell_of
 
+#: of estimates
+KINDS = ('on the arm, guess', 'on the arm, no guess', 'fixed, guess', 'fixed, no guess')
 START_NS, FPS, SECONDS = 1_700_000_000_000_000_000, 10, 10
 CLOTH = (
     '<texture name="cloth" type="2d" builtin="flat" rgb1="0.62 0.6 0.55" mark="random" '
@@ -139,7 +145,7 @@ class Recording:
 
 
 def estimates(
-    robot: RobotModel, home: FloatArray, seed: int
+    robot: RobotModel, home: FloatArray, seed: int, with_fixed: bool = True
 ) -> Iterator[tuple[str, CameraModel, Callable[[], CameraEstimate]]]:
     """Name, truth and estimator of each kind."""
     recording = Recording(robot, home, seed)
@@ -153,6 +159,8 @@ def estimates(
             return WristCamera(tracks, start, robot).estimate(guess=guess)
 
         yield f'on the arm, {word}', wrist, on_arm
+    if not with_fixed:
+        return
     fixed = next(c for c in recording.scene.cameras if c.mount_link == robot.base_link)
     shown, parts = recording.film(fixed, every=4), load_shape(robot).parts
     for word, guess in (('guess', True), ('no guess', False)):
@@ -165,19 +173,49 @@ def estimates(
         yield f'fixed, {word}', fixed, standing
 
 
-def row(name: str, found: list[tuple[float, ...]], refused: int) -> list[str]:
+class Kept:
+    """Estimates in a file, a JSON line each, so that an interrupted run goes on.
+
+    Args:
+        file: None = in memory alone.
+    """
+
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        lines = file.read_text().splitlines() if file is not None and file.is_file() else []
+        self.results: list[dict[str, Any]] = [json.loads(line) for line in lines]
+
+    def has(self, name: str, number: int) -> bool:
+        """Whether the estimate of a recording is there."""
+        return any((r['name'], r['number']) == (name, number) for r in self.results)
+
+    def add(self, **result: Any) -> None:
+        """Keeps an estimate."""
+        print(json.dumps(result), flush=True)
+        self.results.append(result)
+        if self._file is not None:
+            with self._file.open('a') as out:
+                out.write(json.dumps(result) + '\n')
+
+
+def row(name: str, results: Sequence[Mapping[str, Any]]) -> list[str]:
     """A line of the table."""
-    if not found:
-        return [name, f'0 of {refused}', *['-'] * 5]
-    mm, degrees, std_mm, std_deg, seconds = np.array(found).T
+    good = [r for r in results if r['name'] == name and 'mm' in r]
+    count = sum(r['name'] == name for r in results)
+    if not good:
+        return [name, f'0 of {count}', *['-'] * 6]
+    keys = ('mm', 'deg', 'std_mm', 'std_deg', 'seconds')
+    mm, degrees, std_mm, std_deg, seconds = (np.array([r[k] for r in good]) for k in keys)
     covered = (mm <= 2 * std_mm) & (degrees <= 2 * std_deg)
+    doubted = np.array([r['doubted'] for r in good])
     return [
         name,
-        f'{len(mm)} of {len(mm) + refused}',
-        f'{np.median(mm):.1f} / {np.percentile(mm, 90):.1f}',
-        f'{np.median(degrees):.2f} / {np.percentile(degrees, 90):.2f}',
+        f'{len(mm)} of {count}',
+        f'{np.median(mm):.1f} / {np.percentile(mm, 90):.1f} / {mm.max():.1f}',
+        f'{np.median(degrees):.2f} / {np.percentile(degrees, 90):.2f} / {degrees.max():.2f}',
         f'{np.median(std_mm):.1f}, {np.median(std_deg):.2f}',
         f'{covered.sum()} of {len(mm)}',
+        f'{doubted.sum()}, of those not within: {(doubted & ~covered).sum()}',
         f'{np.median(seconds):.1f}',
     ]
 
@@ -187,30 +225,43 @@ def body(options: Namespace) -> str:
     ends = time.monotonic() + 60 * options.minutes
     robots = {name: load_robot(robot_path(name)) for name in options.robots.split(',')}
     homes = {name: Expert(robot).home for name, robot in robots.items()}
-    found: dict[str, list[tuple[float, ...]]] = defaultdict(list)
-    refused: dict[str, int] = defaultdict(int)
-    for number in range(options.repeats):
-        for robot_name, robot in robots.items():
-            for kind, truth, estimate in estimates(
-                robot, homes[robot_name], options.seed + number
-            ):
-                name = f'{robot_name}, {kind}'
-                if time.monotonic() > ends or (options.wrist_only and 'fixed' in kind):
-                    continue
-                begun = time.process_time()
-                try:
-                    result = estimate()
-                    errors = difference(result.camera.T_mount_camera, truth.T_mount_camera)
-                    spent = time.process_time() - begun
-                    found[name].append((*errors, result.std_mm, result.std_deg, spent))
-                    print(number, name, np.round(found[name][-1], 2), flush=True)
-                except MtvWorldError as error:
-                    refused[name] += 1
-                    print(number, name, error, flush=True)
-    names = sorted({*found, *refused})
-    head = ['robot, camera', 'estimated', 'error [mm] median / 90 %', 'error [degrees]',
-            'standard error [mm, degrees], median', 'within twice that', 'CPU [s]']  # fmt: skip
-    return table(head, [row(name, found[name], refused[name]) for name in names])
+    kept = Kept(options.kept)
+    cases = [(number, name) for number in range(options.repeats) for name in robots]
+    for number, robot_name in cases:
+        kinds = [kind for kind in KINDS if not (options.wrist_only and 'fixed' in kind)]
+        left = {kind for kind in kinds if not kept.has(f'{robot_name}, {kind}', number)}
+        if not left or time.monotonic() > ends:
+            continue
+        seed = options.seed + number
+        for kind, truth, estimate in estimates(
+            robots[robot_name], homes[robot_name], seed, 'fixed' in ' '.join(left)
+        ):
+            if kind in left and time.monotonic() < ends:
+                kept.add(name=f'{robot_name}, {kind}', number=number, **_measured(truth, estimate))
+    names = sorted({result['name'] for result in kept.results})
+    head = ['robot, camera', 'estimated', 'error [mm] median / 90 % / largest',
+            'error [degrees]', 'standard error [mm, degrees], median', 'within twice that',
+            f'said to be doubtful (correlation below {GOOD_MATCH:g})', 'CPU [s]']  # fmt: skip
+    return table(head, [row(name, kept.results) for name in names])
+
+
+def _measured(truth: CameraModel, estimate: Callable[[], CameraEstimate]) -> dict[str, Any]:
+    """Errors of an estimate, or why there is none."""
+    begun = time.process_time()
+    try:
+        result = estimate()
+    except MtvWorldError as error:
+        return {'refused': str(error)}
+    mm, degrees = difference(result.camera.T_mount_camera, truth.T_mount_camera)
+    return {
+        'mm': round(mm, 3),
+        'deg': round(degrees, 4),
+        'std_mm': round(result.std_mm, 3),
+        'std_deg': round(result.std_deg, 4),
+        'match': None if np.isnan(result.match) else round(result.match, 3),
+        'doubted': bool(result.match < GOOD_MATCH),
+        'seconds': round(time.process_time() - begun, 2),
+    }
 
 
 def main() -> None:
@@ -219,6 +270,7 @@ def main() -> None:
     def more(parser: object) -> None:
         parser.add_argument('--robots', default='franka,ur5e_pair,yam_bimanual')  # type: ignore[attr-defined]
         parser.add_argument('--minutes', type=float, default=1e9, help='stop starting after that')  # type: ignore[attr-defined]
+        parser.add_argument('--kept', type=Path, help='estimates so far; run again to go on')  # type: ignore[attr-defined]
         parser.add_argument('--wrist-only', action='store_true')  # type: ignore[attr-defined]
 
     options = parse_arguments(__doc__, 20, more)

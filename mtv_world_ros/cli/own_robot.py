@@ -391,14 +391,14 @@ def _estimate_text(estimate: CameraEstimate) -> str:
 _ROUGH_MM = 50.0
 #: correlation of drawn and seen motion below which a pose may be a wrong one: of five recorded
 #: tasks, those with .67, .76 and .82 ended 130 to 350 mm off, those with .86 and .91 10 and 21 mm
-_GOOD_MATCH = 0.85
+GOOD_MATCH = 0.85
 
 
 def _advice(estimate: CameraEstimate) -> str:
     doubts = []
-    if estimate.match < _GOOD_MATCH:
+    if estimate.match < GOOD_MATCH:
         doubts.append(
-            f'drawn and seen motion should correlate by {_GOOD_MATCH:g} or more: this may be a '
+            f'drawn and seen motion should correlate by {GOOD_MATCH:g} or more: this may be a '
             'wrong pose, and its error larger than said'
         )
     elif estimate.std_mm > _ROUGH_MM:
