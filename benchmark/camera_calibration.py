@@ -24,7 +24,7 @@ import numpy as np
 from page import parse_arguments, publish, table
 
 from mtv_world_ros.assembly import robot_path
-from mtv_world_ros.cli.own_robot import GOOD_MATCH
+from mtv_world_ros.cli.own_robot import GOOD_MATCH, is_doubtful
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import MtvWorldError
@@ -259,7 +259,7 @@ def _measured(truth: CameraModel, estimate: Callable[[], CameraEstimate]) -> dic
         'std_mm': round(result.std_mm, 3),
         'std_deg': round(result.std_deg, 4),
         'match': None if np.isnan(result.match) else round(result.match, 3),
-        'doubted': bool(result.match < GOOD_MATCH),
+        'doubted': is_doubtful(result),
         'seconds': round(time.process_time() - begun, 2),
     }
 

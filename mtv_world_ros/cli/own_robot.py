@@ -380,10 +380,15 @@ def _estimate_fixed(
 def _estimate_text(estimate: CameraEstimate) -> str:
     camera = estimate.camera
     x, y, z = (float(v) for v in camera.T_mount_camera[:3, 3])
+    meant = (
+        'of the right pose, if this is one'
+        if is_doubtful(estimate)
+        else ('95 % of errors are within twice that')
+    )
     return (
         f"view '{camera.view}' on link '{camera.mount_link}': at ({x:.3f}, {y:.3f}, {z:.3f}) m, "
-        f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees '
-        f'(95 % of errors are within twice that)\n{estimate.evidence}{_advice(estimate)}'
+        f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees ({meant})\n'
+        f'{estimate.evidence}{_advice(estimate)}'
     )
 
 
@@ -394,9 +399,14 @@ _ROUGH_MM = 50.0
 GOOD_MATCH = 0.85
 
 
+def is_doubtful(estimate: CameraEstimate) -> bool:
+    """Tells whether an estimate may be another place at which the robot moves alike."""
+    return estimate.match < GOOD_MATCH
+
+
 def _advice(estimate: CameraEstimate) -> str:
     doubts = []
-    if estimate.match < GOOD_MATCH:
+    if is_doubtful(estimate):
         doubts.append(
             f'drawn and seen motion should correlate by {GOOD_MATCH:g} or more: this may be a '
             'wrong pose, and its error larger than said'

@@ -26,7 +26,6 @@ from mtv_world_ros.inspection.camera_pose import (
     aligned,
     CameraEstimate,
     covered_frames,
-    grey,
     left_out,
     moved,
     shrunk,
@@ -43,8 +42,9 @@ _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
-#: grey levels from which a pixel counts as changed: so few that a pixel at the robot's edge does,
-#: as in the drawn silhouettes
+#: distance of two colours (root mean square of their channels) from which a pixel counts as
+#: changed: so small that one at the robot's edge does, as in the drawn silhouettes; grey levels
+#: alone do not tell a grey arm from a brown table
 _CHANGED = 12.0
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
 _NUM_TRIED, _NUM_KEPT = 1500, 6
@@ -167,10 +167,15 @@ class FixedCamera:
 
     def _changes(self, width: int, blur: float) -> _Changes:
         small = shrunk(self._camera, width)
-        greys = [grey(frame, small).astype(np.float32) for frame in self._frames]
+        size = small.width, small.height
+        colours = [
+            cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+            for frame in self._frames
+        ]
         seen = []
         for i, j in self._pairs:
-            changed = (np.abs(greys[i] - greys[j]) > _CHANGED).astype(np.uint8)
+            apart = np.sqrt(((colours[i] - colours[j]) ** 2).mean(axis=-1))
+            changed = (apart > _CHANGED).astype(np.uint8)
             changed = cv2.medianBlur(changed, 3).astype(np.float32)  # noise is single pixels
             seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
         return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
