@@ -42,10 +42,9 @@ _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
-#: distance of two colours (root mean square of their channels) from which a pixel counts as
-#: changed: so small that one at the robot's edge does, as in the drawn silhouettes; grey levels
-#: alone do not tell a grey arm from a brown table
-_CHANGED = 12.0
+#: distances of two colours (root mean square of their channels) from which a pixel may have
+#: changed, and from which it surely has; grey levels do not tell a grey arm from a brown table
+_CHANGED = (4.0, 16.0)
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
 _NUM_TRIED, _NUM_KEPT = 1500, 6
 #: measurements that the pixels of all frames are worth
@@ -175,8 +174,8 @@ class FixedCamera:
         seen = []
         for i, j in self._pairs:
             apart = np.sqrt(((colours[i] - colours[j]) ** 2).mean(axis=-1))
-            changed = (apart > _CHANGED).astype(np.uint8)
-            changed = cv2.medianBlur(changed, 3).astype(np.float32)  # noise is single pixels
+            changed = np.interp(apart, _CHANGED, (0.0, 1.0)).astype(np.float32)
+            changed = cv2.medianBlur(changed, 3)  # noise is single pixels
             seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
         return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
 
