@@ -46,18 +46,19 @@ SAVED = 8
 #: stands for the demonstrations of the expert, and of one whose grippers close late [s]
 EXPERT, LATE = 'expert', 'expert-late-0.6'
 
+#: the policy, as `act_start.py` takes it
 ACT = {
-    'policy.type': 'act',
+    'chunk_size': CHUNK,
+    'n_action_steps': CHUNK,
+    'dim_model': 128,
+    'n_heads': 4,
+    'dim_feedforward': 512,
+    'n_encoder_layers': 2,
+    'use_vae': False,  # the expert does the same in the same scene
+}
+TRAINING = {
     'policy.device': 'cpu',
     'policy.push_to_hub': 'false',
-    'policy.pretrained_backbone_weights': 'null',  # nothing is downloaded
-    'policy.chunk_size': CHUNK,
-    'policy.n_action_steps': CHUNK,
-    'policy.dim_model': 128,
-    'policy.n_heads': 4,
-    'policy.dim_feedforward': 512,
-    'policy.n_encoder_layers': 2,
-    'policy.use_vae': 'false',  # the expert does the same in the same scene
     'batch_size': 16,
     'num_workers': 0,
     'eval_freq': 0,
@@ -153,17 +154,22 @@ def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None
     out, steps = _run(root, task, run), options.steps // run.step_share
     if _checkpoint(out, steps).exists():
         return
+    out.parent.mkdir(parents=True, exist_ok=True)
     last = out / 'checkpoints/last/pretrained_model/train_config.json'
     if last.exists():
         arguments: dict[str, Any] = {'config_path': last, 'resume': 'true', 'steps': steps}
     else:
         shutil.rmtree(out, ignore_errors=True)
+        dataset, start = _dataset(root, task, run), out.with_name(f'{out.name}_start')
+        values = {**ACT, 'views': run.views, 'seed': options.seed}
+        script = Path(__file__).with_name('act_start.py')
+        _call([options.lerobot, str(script), str(dataset), str(start), json.dumps(values)])
         arguments = {
+            'policy.path': start,
             'dataset.repo_id': f'local/{task}',
-            'dataset.root': _dataset(root, task, run),
+            'dataset.root': dataset,
             'dataset.episodes': list(range(options.demos // run.demo_share)),
-            'policy.input_features': json.dumps(_features(run)),
-            **ACT,
+            **TRAINING,
             'scheduler.num_decay_steps': steps,
             'output_dir': out,
             'steps': steps,
@@ -173,7 +179,6 @@ def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None
         }
     words = [f'--{key}={value}' for key, value in arguments.items()]
     log = root / f'runs/{task}_{run.name}.log'
-    log.parent.mkdir(parents=True, exist_ok=True)
     _call([options.lerobot, '-m', 'lerobot.scripts.lerobot_train', *words], log=log)
 
 
@@ -231,7 +236,7 @@ def _body(
     yield (
         f'ACT of LeRobot (ResNet-18 from scratch, {WIDTH} x {HEIGHT} px, {FPS} Hz, answers of '
         f'{CHUNK / FPS:g} s), {options.demos} demonstrations a task, {options.steps} steps of '
-        f'{ACT["batch_size"]}; half of these for the runs other than `full`.'
+        f'{TRAINING["batch_size"]}; half of these for the runs other than `full`.'
     )
     yield table(
         ['policy', 'simulator', 'imagined', "estimator on the simulator's frames"],
@@ -280,14 +285,6 @@ def _share(found: dict[str, Any]) -> str:
         return '-'
     low, high = found['interval']
     return f'{found["rate"]:.2f} [{low:.2f}, {high:.2f}] of {found["judged"]}'
-
-
-def _features(run: Run) -> dict[str, Any]:
-    image = {'type': 'VISUAL', 'shape': [3, HEIGHT, WIDTH]}
-    return {
-        'observation.state': {'type': 'STATE', 'shape': [14]},
-        **{f'observation.images.{view}': image for view in run.views},
-    }
 
 
 def _episodes(root: Path, task: str, run: Run) -> Path:
