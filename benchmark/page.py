@@ -41,6 +41,7 @@ DESCRIBES = {
     'interval_coverage': ('mtv_world_ros/evaluation/metrics',),
     'learned_policies': ('mtv_world_ros/ranking', 'mtv_world_ros/policies', 'mtv_world_ros/sim'),
     'long_rollouts': ('mtv_world_ros/model',),
+    'outcome_sensitivity': ('mtv_world_ros/sim',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),
     'ros_publishing': ('mtv_world_ros/ros',),

@@ -36,6 +36,7 @@ class Comparison:
         trajectory: (V, T, H, W, 3) uint8 RGB trajectory video.
         imagined: (V, T, H, W, 3) uint8 RGB predicted frames.
         captions: (V, T) short texts under the imagined frames, e.g. their J; empty = none.
+        kinds: of `KINDS`, those that are there and shown.
     """
 
     views: tuple[str, ...]
@@ -44,6 +45,7 @@ class Comparison:
     trajectory: ByteArray
     imagined: ByteArray
     captions: tuple[tuple[str, ...], ...] = ()
+    kinds: tuple[str, ...] = KINDS
 
     def __post_init__(self) -> None:
         shape = (len(self.views), len(self.times), *self.real.shape[2:])
@@ -119,9 +121,9 @@ def _view_band(
     """The rows of one view: real, trajectory, imagined, and the captions if there are any."""
     height, width = _tile_size(comparison.real.shape[2:4], tile_width)
     captions = _HEAD - 8 if comparison.captions else 0
-    total = len(KINDS) * (height + _GAP) + captions + 2 * _GAP
+    total = len(comparison.kinds) * (height + _GAP) + captions + 2 * _GAP
     band = _blank(total, _MARGIN + len(columns) * (width + _GAP))
-    for row, kind in enumerate(KINDS):
+    for row, kind in enumerate(comparison.kinds):
         y = row * (height + _GAP)
         _text(band, comparison.views[view], (8, y + height // 2 - 8), scale=0.55)
         _text(band, kind, (8, y + height // 2 + 12), colour=_FAINT)
@@ -145,11 +147,11 @@ def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
     num_views, num_frames = len(comparison.views), len(comparison.times)
     total = (
         _even(num_views * (_HEAD + height) + _GAP),
-        _even(len(KINDS) * (width + _GAP) + _GAP),
+        _even(len(comparison.kinds) * (width + _GAP) + _GAP),
     )
     video = np.stack([_blank(*total)] * num_frames)
     for frame in range(num_frames):
-        for column, kind in enumerate(KINDS):
+        for column, kind in enumerate(comparison.kinds):
             x = _GAP + column * (width + _GAP)
             for v in range(num_views):
                 y = v * (_HEAD + height) + _HEAD
@@ -160,10 +162,11 @@ def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
 
 
 def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
-    if kind == 'real':
-        return f'{comparison.views[view]}: {kind}  {comparison.times[frame]:+.1f} s'
     caption = comparison.captions[view][frame] if comparison.captions else ''
-    return f'{kind}  {caption}' if kind == 'imagined' else kind
+    heading = f'{kind}  {caption}' if kind == 'imagined' else kind
+    if kind == comparison.kinds[0]:
+        return f'{comparison.views[view]}: {heading}  {comparison.times[frame]:+.1f} s'
+    return heading
 
 
 def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> None:

@@ -52,7 +52,9 @@ def write_pictures(bags: Sequence[Path], out: Path, title: str = '') -> list[Pat
 
 
 def compared(streams: Streams) -> Comparison:
-    """Returns the imagined frames beside those of the same times; grey where there are none.
+    """Returns the imagined frames beside those of the same times; grey where one is missing.
+
+    Kinds without any frame at these times are not shown.
 
     Raises:
         EpisodeError: nothing was imagined.
@@ -73,6 +75,7 @@ def compared(streams: Streams) -> Comparison:
         real=frames['real'],
         trajectory=frames['trajectory'],
         imagined=frames['imagined'],
+        kinds=tuple(kind for kind in KINDS if (frames[kind] != _BLANK).any()),
     )
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import av
 import cv2
 import numpy as np
@@ -84,3 +86,10 @@ def test_video_plays_with_every_frame(comparison, tmp_path):
     assert len(played) == 9
     assert np.abs(np.array(played, float) - frames).mean() < 6
     assert [path.name for path in tmp_path.iterdir()] == ['side.mp4']
+
+
+def test_kinds_that_are_not_there_take_no_room(comparison):
+    alone = replace(comparison, kinds=('imagined',))
+    whole, sheet = contact_sheet(comparison), contact_sheet(alone)
+    assert sheet.shape[0] < whole.shape[0] / 2 and sheet.shape[1] == whole.shape[1]
+    assert side_by_side(alone).shape[2] < side_by_side(comparison).shape[2] / 2
