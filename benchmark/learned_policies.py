@@ -2,7 +2,8 @@
 
     python benchmark/learned_policies.py --lerobot ENV/bin/python [--data out/learned]
         [--tasks shake_bottle,place_cup_plate,place_bread_plate] [--demos 200] [--steps 2400]
-        [--scenes 20] [--until rank] [--checkpoint bundled] [--out benchmark/results]
+        [--scenes 20] [--workers 1] [--until rank] [--checkpoint bundled]
+        [--out benchmark/results]
 
 From an empty folder to a ranking: collects demonstrations of every task, exports them as LeRobot
 datasets, trains LeRobot's own ACT by its own command line in an environment of its own
@@ -129,6 +130,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--steps', type=int, default=2400, help='training steps of the full run')
     parser.add_argument('--scenes', type=int, default=20, help='of each task, for the ranking')
     parser.add_argument('--max-chunks', type=int, default=3, help='answers of a policy at most')
+    parser.add_argument('--workers', type=int, default=1, help='of the ranking; .6 GB a policy')
     parser.add_argument('--until', choices=STAGES, default='rank')
     parser.add_argument('--checkpoint', default='bundled', help='the world model')
 
@@ -186,18 +188,23 @@ _STAGES = {'collect': _collect, 'export': _export, 'train': _train}
 
 
 def _rank(root: Path, tasks: Sequence[str], options: argparse.Namespace) -> None:
-    policies = [entry for task in tasks for entry in _policies(root, task, options)]
-    if not policies:
+    """Ranks task by task, so that the servers of one task alone are alive, then all together."""
+    found = {task: list(_policies(root, task, options)) for task in tasks}
+    lists = {f'policies_{task}.yaml': entries for task, entries in found.items() if entries}
+    if not lists:
         sys.exit('there is no checkpoint yet')
-    listed, out = root / 'policies.yaml', root / 'ranking'
-    listed.write_text(yaml.safe_dump({'policies': policies}, sort_keys=False), encoding='utf-8')
-    _mtv_world(
-        'rank', '--policies', str(listed), '--episodes', str(options.scenes),
-        '--max-chunks', str(options.max_chunks), '--seed', str(SCENE_SEED),
-        '--checkpoint', options.checkpoint, '--out', str(out),
-    )  # fmt: skip
+    lists['policies.yaml'] = [entry for entries in found.values() for entry in entries]
+    for name, entries in lists.items():
+        text = yaml.safe_dump({'policies': entries}, sort_keys=False)
+        (root / name).write_text(text, encoding='utf-8')
+        _mtv_world(
+            'rank', '--policies', str(root / name), '--episodes', str(options.scenes),
+            '--max-chunks', str(options.max_chunks), '--seed', str(SCENE_SEED),
+            '--workers', str(options.workers), '--checkpoint', options.checkpoint,
+            '--out', str(root / 'ranking'),
+        )  # fmt: skip
     options.repeats = options.scenes
-    ranking = json.loads((out / 'ranking.json').read_text(encoding='utf-8'))
+    ranking = json.loads((root / 'ranking/ranking.json').read_text(encoding='utf-8'))
     body = '\n\n'.join(_body(ranking, root, tasks, options))
     command = 'python benchmark/learned_policies.py --lerobot ENV/bin/python'
     publish('learned_policies', 'Learned policies', command, body, options, _versions(options))
