@@ -23,6 +23,7 @@ from page import publish, table
 
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot_file import load_robot
@@ -65,10 +66,14 @@ def main() -> None:
     for path in paths:
         info = read_episode(path, with_cameras=False).info
         name = info.metadata.get('policy') or 'expert'
-        policy = scripted_policy(name, info.task, info.seed, expert)
-        policy.reset(seed=info.seed)
         sim = SimEpisode(robot, expert.home, rendering=False)
-        sim.reset(info.seed, info.task)
+        try:
+            policy = scripted_policy(name, info.task, info.seed, expert)
+            policy.reset(seed=info.seed)
+            sim.reset(info.seed, info.task)
+        except SimulatorError as error:  # drawn for other cameras
+            print(f'left out: {path}: {error}')
+            continue
         scene, recorded = sim.scene, info.outcome == 'success'
         undisturbed = _succeeds(sim, scene, info.task, policy.plan.positions)
         found = Counter(
