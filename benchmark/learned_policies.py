@@ -1,7 +1,7 @@
 """Does imagination rank learned policies as the simulator does?
 
     python benchmark/learned_policies.py --lerobot ENV/bin/python [--data out/learned]
-        [--tasks shake_bottle,place_cup_plate,place_bread_plate] [--demos 200] [--steps 2400]
+        [--tasks shake_bottle,place_cup_plate,place_bread_plate] [--demos 200] [--steps 4000]
         [--scenes 20] [--workers 1] [--until rank] [--checkpoint bundled]
         [--out benchmark/results]
 
@@ -47,19 +47,19 @@ SAVED = 8
 #: stands for the demonstrations of the expert, and of one whose grippers close late [s]
 EXPERT, LATE = 'expert', 'expert-late-0.6'
 
-#: the policy, as `act_start.py` takes it
-ACT = {
-    'chunk_size': CHUNK,
-    'n_action_steps': CHUNK,
-    'dim_model': 128,
-    'n_heads': 4,
-    'dim_feedforward': 512,
-    'n_encoder_layers': 2,
-    'use_vae': False,  # the expert does the same in the same scene
-}
+#: arguments of LeRobot's trainer
 TRAINING = {
+    'policy.type': 'act',
     'policy.device': 'cpu',
     'policy.push_to_hub': 'false',
+    'policy.pretrained_backbone_weights': 'null',  # nothing is downloaded
+    'policy.chunk_size': CHUNK,
+    'policy.n_action_steps': CHUNK,
+    'policy.dim_model': 128,
+    'policy.n_heads': 4,
+    'policy.dim_feedforward': 512,
+    'policy.n_encoder_layers': 2,
+    'policy.use_vae': 'false',  # the expert does the same in the same scene
     'batch_size': 16,
     'num_workers': 0,
     'eval_freq': 0,
@@ -127,7 +127,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--tasks', default=TASKS)
     parser.add_argument('--runs', default=','.join(run.name for run in RUNS))
     parser.add_argument('--demos', type=int, default=200, help='demonstrations of each task')
-    parser.add_argument('--steps', type=int, default=2400, help='training steps of the full run')
+    parser.add_argument('--steps', type=int, default=4000, help='training steps of the full run')
     parser.add_argument('--scenes', type=int, default=20, help='of each task, for the ranking')
     parser.add_argument('--max-chunks', type=int, default=3, help='answers of a policy at most')
     parser.add_argument('--workers', type=int, default=1, help='of the ranking; .6 GB a policy')
@@ -162,15 +162,11 @@ def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None
         arguments: dict[str, Any] = {'config_path': last, 'resume': 'true', 'steps': steps}
     else:
         shutil.rmtree(out, ignore_errors=True)
-        dataset, start = _dataset(root, task, run), out.with_name(f'{out.name}_start')
-        values = {**ACT, 'views': run.views, 'seed': options.seed}
-        script = Path(__file__).with_name('act_start.py')
-        _call([options.lerobot, str(script), str(dataset), str(start), json.dumps(values)])
         arguments = {
-            'policy.path': start,
             'dataset.repo_id': f'local/{task}',
-            'dataset.root': dataset,
+            'dataset.root': _dataset(root, task, run),
             'dataset.episodes': list(range(options.demos // run.demo_share)),
+            'policy.input_features': json.dumps(_features(run)),
             **TRAINING,
             'scheduler.num_decay_steps': steps,
             'output_dir': out,
@@ -292,6 +288,14 @@ def _share(found: dict[str, Any]) -> str:
         return '-'
     low, high = found['interval']
     return f'{found["rate"]:.2f} [{low:.2f}, {high:.2f}] of {found["judged"]}'
+
+
+def _features(run: Run) -> dict[str, Any]:
+    image = {'type': 'VISUAL', 'shape': [3, HEIGHT, WIDTH]}
+    return {
+        'observation.state': {'type': 'STATE', 'shape': [14]},
+        **{f'observation.images.{view}': image for view in run.views},
+    }
 
 
 def _episodes(root: Path, task: str, run: Run) -> Path:
