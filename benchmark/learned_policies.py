@@ -162,10 +162,12 @@ def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None
         arguments: dict[str, Any] = {'config_path': last, 'resume': 'true', 'steps': steps}
     else:
         shutil.rmtree(out, ignore_errors=True)
+        card = (_dataset(root, task, run) / 'meta/info.json').read_text(encoding='utf-8')
+        count = json.loads(card)['total_episodes'] // run.demo_share
         arguments = {
             'dataset.repo_id': f'local/{task}',
             'dataset.root': _dataset(root, task, run),
-            'dataset.episodes': list(range(options.demos // run.demo_share)),
+            'dataset.episodes': list(range(count)),
             'policy.input_features': json.dumps(_features(run)),
             **TRAINING,
             'scheduler.num_decay_steps': steps,
