@@ -45,6 +45,7 @@ DESCRIBES = {
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),
     'ros_publishing': ('mtv_world_ros/ros',),
+    'recorder_faults': ('mtv_world_ros/ros/bags', 'mtv_world_ros/data/bag'),
     'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
     'self_rollout': ('mtv_world_ros/training',),

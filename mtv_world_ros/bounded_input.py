@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 import stat
 import struct
+import sys
 from typing import Any, BinaryIO
 import zipfile
 import zlib
@@ -172,9 +173,16 @@ def parse_json(text: str | bytes, what: str) -> Any:
         ValueError: it is not JSON, or too deeply nested.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=_whole_number)
     except RecursionError:
         raise LimitError(f'{what} is nested too deeply') from None
+
+
+def _whole_number(digits: str) -> int:
+    """A number that a float can hold: more digits are no count and no measure of anything."""
+    if len(digits) > sys.float_info.max_10_exp:
+        raise LimitError(f'a whole number has {len(digits)} digits')
+    return int(digits)
 
 
 def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:

@@ -189,15 +189,15 @@ def to_columns(
     count = len(names) or 1 + max(
         (j.column for j in used if isinstance(j.column, int)), default=-1
     )
-    values = np.full(count, np.nan)
+    values = {}
     for joint in used:
         assert joint.column is not None
         column = column_number(joint.column, names, count, 'state', f"joint '{joint.joint}'")
         values[column] = (positions[joint.joint] - joint.offset) / joint.factor
-    empty = np.flatnonzero(np.isnan(values))
-    if len(empty):
-        raise ConfigError(f'columns {empty.tolist()} of {count} get no joint; name one for each')
-    return values
+    empty = [column for column in range(min(count, 2 * len(used) + 1)) if column not in values]
+    if empty:
+        raise ConfigError(f'columns {empty} of {count} get no joint; name one for each')
+    return np.array([values[column] for column in range(count)], float)
 
 
 def column_number(

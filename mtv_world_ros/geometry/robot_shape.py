@@ -159,7 +159,13 @@ def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkSh
         geometry = element.find('geometry')
         if geometry is None or len(geometry) == 0:
             continue
-        points = _points(geometry[0], urdf)
+        try:
+            points = _points(geometry[0], urdf)
+        except KeyError as error:
+            name = link.attrib['name']
+            raise RobotError(
+                f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
+            ) from error
         pose = _origin(element.find('origin'))
         yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import json
 from math import prod
+from os.path import isfile
 from pathlib import Path
 import re
 from typing import Any
@@ -113,7 +114,7 @@ def _open_index(path: Path) -> dict[str, StoredTensor]:
         files = sorted({path.parent / Path(name).name for name in places.values()})
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CheckpointError(f"'{path}' is no index of shards: {error}") from error
-    missing = sorted(file.name for file in files if not file.is_file())
+    missing = sorted(file.name for file in files if not isfile(file))
     if missing:
         raise CheckpointError(
             f"'{path.parent}' lacks the shards {missing} that '{path.name}' names; copy them there"

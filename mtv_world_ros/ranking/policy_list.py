@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import hashlib
 import json
+from os.path import isfile
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -146,7 +147,7 @@ def _values(policy: str | dict[str, Any], folder: Path) -> dict[str, Any]:
     if policy.startswith('expert'):
         return {'kind': 'scripted', 'variant': policy}
     beside = folder / policy
-    file = beside if beside.is_file() else bundled('policies', policy, 'policy')
+    file = beside if isfile(beside) else bundled('policies', policy, 'policy')
     values = read_yaml(file, 'policy file', 'policy')
     if not isinstance(values, dict):
         raise ConfigError(f'{file}: expected keys and values')

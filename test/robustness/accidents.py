@@ -8,6 +8,7 @@ from contextlib import closing
 import io
 import json
 from pathlib import Path
+import re
 import sqlite3
 import struct
 import tempfile
@@ -138,6 +139,12 @@ def os_system() -> bytes:
     return b"cos\nsystem\n(S'touch /tmp/owned'\ntR."
 
 
+def altered(kind: str, pattern: bytes, instead: bytes) -> bytes:
+    """The first sample of a kind that holds the pattern, with all that fits it replaced."""
+    samples = (re.subn(pattern, instead, sample) for sample in KINDS[kind].samples())
+    return next(sample for sample, count in samples if count)
+
+
 def joints(**changes: Any) -> Any:
     """A joint state with some fields of its own."""
     message = whole('joints')
@@ -213,6 +220,35 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         'data set card',
         lambda: b'dataset.json\n{"splits": {}, "episodes": [{"name": "a", "scene": ["x"]}]}',
     ),
+    'state of 142 billion columns': (
+        'policy',
+        lambda: altered('policy', rb'left_joint1: 0', b'left_joint1: 142949672961'),
+    ),
+    'policy whose name is no file name': (
+        'policy list',
+        lambda: f'policies:\n- policy: {"9" * 400}a.yaml\n'.encode(),
+    ),
+    'box of 400 digits': (
+        'answer, language model',
+        lambda: altered('answer, language model', rb'\[\d+, ', b'[' + b'9' * 400 + b', '),
+    ),
+    'box of 400 digits that was kept': (
+        'kept description',
+        lambda: altered('kept description', rb'412.0', b'9' * 400),
+    ),
+    'Jaccard index of 400 digits': (
+        'ranking',
+        lambda: altered('ranking', rb'"jaccard": \[\s*\[\s*[\d.]+', b'"jaccard": [[' + b'9' * 400),
+    ),
+    'clip of 400 digits': (
+        'action statistics',
+        lambda: altered('action statistics', rb'"clip": [\d.]+', b'"clip": ' + b'9' * 400),
+    ),
+    'shard whose name is no file name': (
+        'weights in shards',
+        lambda: altered('weights in shards', rb'"model-00002', b'"' + b'9' * 400),
+    ),
+    'mesh without a file': ('mesh', lambda: altered('mesh', rb'filename=', b'file=')),
     'nested answer': ('answer, msgpack', nested_answer),
     'vast answer': ('answer, msgpack', vast_answer),
     'tensor of stride 0': ('answer, pickle', stride_zero),

@@ -1,10 +1,12 @@
 """Kills of recorder, player, policy node and world model at random moments: `make kills`.
 
-Nothing older than a second may be lost, whoever is left goes on, and whoever starts again works:
-a killed recording is recovered and read by rosbags, and the node that is started after a killed
-one answers a plan with one end. The processes are forked from one that has imported everything
-(so that starting hundreds is cheap), and are killed up to
-`--longest` seconds after their start, or after they are at work.
+Nothing that was received more than a second ago may be lost, whoever is left goes on, and whoever
+starts again works: a killed recording is recovered and read by rosbags, and the node that is
+started after a killed one answers a plan with one end. The processes are forked from one that has
+imported everything (so that starting hundreds is cheap), and are killed up to `--longest` seconds
+after their start, or after they are at work.
+The recorder notes what it receives before it does anything with it, so that a message that the
+middleware had not delivered yet is told from one that the recorder lost.
 Prints a table; the exit status is 1 if anything was lost, hung or ended with a traceback. What was
 interrupted goes on where it was, if it is called with the same `--out`.
 """
@@ -37,6 +39,8 @@ sys.path.insert(0, str(ROOT / 'test' / 'ros'))
 #: a busy machine takes long to start a node
 START_S = 180.0
 PERIOD_S = 0.01
+#: ending of the file of stamps and times of what a recorder received, beside its log
+RECEIVED = '.received'
 #: share of the kills that come while the process starts
 STARTING = 0.3
 
@@ -71,15 +75,44 @@ def run_forked(name: str, words: list[str], log: str) -> None:
     os.dup2(descriptor, 2)
     sys.argv = [name, *words]
     main: Any = imported()[name]
+    if name == 'recorder':
+        note_received(f'{log}{RECEIVED}')
     sys.exit(main(words) if name in ('recorder', 'player') else main())
 
 
+def note_received(path: str) -> None:
+    """Lets the recorder of this process note stamp and time [ns] of messages as they come."""
+    from mtv_world_ros.ros.bags.recorder import Recorder
+
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    handler = Recorder._handler
+
+    def noting(recorder: Recorder, *words: Any) -> Callable[[bytes], None]:
+        write = handler(recorder, *words)
+
+        def take(data: bytes) -> None:
+            os.write(descriptor, np.array([read_stamp(data), time.time_ns()]).tobytes())
+            write(data)
+
+        return take
+
+    Recorder._handler = noting  # type: ignore[method-assign]
+
+
 class Killed(NamedTuple):
-    """One kill: when [s after the start], what was wrong (empty = nothing), seconds to be well."""
+    """One kill.
+
+    Attributes:
+        after_s: when [s after the start, or after it was at work].
+        problem: what was wrong; empty = nothing.
+        seconds: until all was well.
+        undelivered: messages sent to a recorder more than a second before, which never reached it.
+    """
 
     after_s: float
     problem: str
     seconds: float
+    undelivered: int
 
 
 class Kills:
@@ -102,6 +135,7 @@ class Kills:
         self._heard = 0
         #: longest that a thread of the process waited for a processor, while it was at work
         self._starved_s = 0.0
+        self._undelivered = 0
         self._client: Any = None
         self.renew_client()
         self._episode = self._write_episode()
@@ -120,7 +154,7 @@ class Kills:
         log = self._out / f'{name}.log'
         process = self._start(name, words(self), log)
         self._sent.clear()
-        problem = ''
+        problem, self._undelivered = '', 0
         if not is_starting:
             end = time.monotonic() + START_S
             while not is_ready(self, log) and process.exitcode is None:
@@ -143,7 +177,7 @@ class Kills:
             problem = f'{type(error).__name__}: {error}'
         if 'Traceback' in log.read_text(errors='replace'):
             problem = log.read_text(errors='replace')[-2000:]
-        return Killed(after_s, problem, time.monotonic() - begin)
+        return Killed(after_s, problem, time.monotonic() - begin, self._undelivered)
 
     def renew_client(self) -> None:
         """One that never knew who was killed: others take 20 s to forget a node."""
@@ -206,26 +240,25 @@ class Kills:
         return [str(self._out / 'bag'), '/joints']
 
     def check_recorder(self, log: Path, killed_ns: int) -> None:
-        """Every message from the announcement to a second before the kill is in the bag."""
+        """Every message that was received until a second before the kill is in the bag."""
         if ': recording' not in log.read_text(errors='replace'):
             return  # killed while starting
         announced = re.search(r'\[(\d+)\.(\d{9})\] \[recorder\]: recording', log.read_text())
         assert announced is not None
         begin_ns = int(announced[1]) * 10**9 + int(announced[2])
-        sent = [at for at in self._sent if begin_ns < at < killed_ns]
-        # where the machine stops everything for a while, messages are older before they are sent
-        age_s = 1.0 + max(np.diff([begin_ns, *sent, killed_ns]), default=0) / 1e9
-        age_s += self._starved_s
-        until = killed_ns - round(age_s * 1e9)
+        until = killed_ns - round((1.0 + self._starved_s) * 1e9)
+        notes = np.fromfile(f'{log}{RECEIVED}', np.int64)
+        received = dict(notes[: len(notes) // 2 * 2].reshape(-1, 2).tolist())
+        self._undelivered = sum(begin_ns < at < until and at not in received for at in self._sent)
         bags = [recover(source) for source in find_damaged(self._out / 'bag')]
         with AnyReader([bags[0].path]) as bag:
             got = {read_stamp(data) for _, _, data in bag.messages()}
-        due = [at for at in sent if at < until]
-        lost = [index for index, at in enumerate(due) if at not in got]
+        due = [stamp for stamp, at in received.items() if at < until]
+        lost = [index for index, stamp in enumerate(due) if stamp not in got]
         assert not lost, (
-            f'{len(lost)} of {len(due)} messages older than {age_s:.2f} s are lost: {lost[:20]}; '
-            f'{len(got)} are there, {sum(at < begin_ns for at in got)} from before it began; '
-            f'a thread of it waited {self._starved_s:.2f} s for a processor'
+            f'{len(lost)} of {len(due)} messages received more than a second ago are lost: '
+            f'{lost[:20]}; {len(got)} are there; a thread of it waited {self._starved_s:.2f} s '
+            'for a processor'
         )
 
     def says(self, text: str, log: Path) -> bool:
@@ -341,20 +374,25 @@ def main() -> int:
         done = kills.kill(name, number)
         row['tried'] += 1
         row['worst_s'] = max(row['worst_s'], done.seconds)
+        row['undelivered'] += bool(done.undelivered)
         if done.problem:
             row['failures'][str(number)] = done.problem
             print(f'kill {number}, {name}: {done.problem}', flush=True)
         file.write_text(json.dumps(list(rows.values()), indent=1))
     kills.close()
     for row in rows.values():
-        print(f'{row["kind"]}: {row["tried"]} tried, {len(row["failures"])} failed', flush=True)
+        print(
+            f'{row["kind"]}: {row["tried"]} tried, {len(row["failures"])} failed; in '
+            f'{row["undelivered"]}, messages older than a second had not been delivered',
+            flush=True,
+        )
     return int(any(row['failures'] for row in rows.values()))
 
 
 def new_row(name: str, seed: int) -> dict[str, Any]:
     """The row of what was not killed yet."""
     return {'kind': f'kill of {name}', 'seed': seed, 'commit': commit(), 'tried': 0,
-            'worst_s': 0.0, 'failures': {}}  # fmt: skip
+            'worst_s': 0.0, 'undelivered': 0, 'failures': {}}  # fmt: skip
 
 
 if __name__ == '__main__':

@@ -21,6 +21,7 @@ TINY = (
     'transformer.freq_dim=16 video.num_frames=2 video.width=48 video.height=40 '
     'optimizer.batch_size=1 optimizer.warmup_steps=1 optimizer.steps=2'
 )
+ONE_STEP = ['--steps', '1', '--threads', '1']
 SETTINGS = [word for value in TINY.split() for word in ('--set', value)]
 
 #: command -> its words, of the folder on the full disk
@@ -40,6 +41,25 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
     'recover': lambda out: ['recover', str(EPISODE), '--out', str(out / 'bag')],
     'collect': lambda out: [
         'collect', '--task', 'stack_blocks_two', '--episodes', '1', '--out', str(out / 'set')],
+    'evaluate': lambda out: [
+        'evaluate', 'bundled', str(EPISODE.parent), '--actions', 'true', '--no-ceiling',
+        '--out', str(out / 'evaluation'), *ONE_STEP],
+    'calibrate': lambda out: [
+        'calibrate', 'bundled', str(EPISODE.parent), '--no-store',
+        '--out', str(out / 'calibration'), *ONE_STEP],
+    'rank': lambda out: [
+        'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', 'stack_blocks_two',
+        '--episodes', '1',
+        '--max-chunks', '1', '--out', str(out / 'ranking'), *ONE_STEP],
+    'distill': lambda out: [
+        'distill', 'bundled', str(EPISODE.parent), '--out', str(out / 'student'), '--dtype',
+        'float32', '--threads', '1', '--set', 'optimizer.steps=2', '--set',
+        'optimizer.batch_size=1'],
+    'train-motion': lambda out: [
+        'train-motion', str(EPISODE.parent), '--out', str(out / 'motion'), '--steps', '2',
+        '--batch-size', '2', '--threads', '1'],
+    'calibrate-camera': lambda out: [
+        'calibrate-camera', str(EPISODE), '--view', 'high', '--out', str(out / 'high.yaml')],
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.files import write_json
+from mtv_world_ros.files import whole_folder, write_json
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
@@ -168,12 +168,11 @@ def _tensor(values: FloatArray) -> Tensor:
 
 
 def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
-    """Writes a network into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Writes a network into a folder; one that was there stays until the new one is complete."""
     tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-    with disk_errors():
-        save_file(tensors, folder / _WEIGHTS)
-    write_json(folder / _CONFIG, network.config)
+    with disk_errors(), whole_folder(folder) as partial:
+        save_file(tensors, partial / _WEIGHTS)
+        write_json(partial / _CONFIG, network.config)
 
 
 def load_network(folder: Path) -> ObjectMotionNetwork:

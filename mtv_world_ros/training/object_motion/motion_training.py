@@ -121,12 +121,14 @@ def train_motion(
         init: network to go on from.
 
     Raises:
-        TrainingError: the folder is there already, `init` is wider than wanted, or the loss is not
-            finite.
+        TrainingError: no tracks, the folder is there already, `init` is wider than wanted, or the
+            loss is not finite.
     """
     folder = Path(out) / OBJECT_MOTION_FOLDER
     if folder.exists():
         raise TrainingError(f"'{folder}' exists; choose another --out, or remove it")
+    if not tracks:
+        raise TrainingError('no episode is left to train on beside those held out; give more')
     torch.manual_seed(config.seed)
     network = _network(init, num_features(tracks[0].features.shape[1]), config)
     averaged = torch.optim.swa_utils.AveragedModel(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from math import isfinite
 import re
 from typing import Any
 
@@ -143,7 +142,7 @@ def _box(value: Any) -> str:
 def _is_coordinate(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    return isfinite(value) and 0 <= value <= BOX_SCALE
+    return 0 <= value <= BOX_SCALE
 
 
 _CHECKS: dict[str, Callable[[Any], str]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+import resource
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
-from mtv_world_ros.model.object_motion.predictor import load_network
+from mtv_world_ros.model.object_motion.predictor import load_network, save_network
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
@@ -126,6 +127,24 @@ def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, rob
 def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
     with pytest.raises(TrainingError, match='no episode can be trained on'):
         read_tracks([tmp_path], robot, VIEWS)
+    with pytest.raises(TrainingError, match='no episode is left to train on'):
+        train_motion([], tmp_path / 'b', MotionTraining())
+
+
+def test_a_full_disk_leaves_the_last_network_whole(tmp_path):
+    """Files may not grow beyond a limit here, which fails at the same calls as a full disk."""
+    first, second = (ObjectMotionNetwork(width=24, hidden=8) for _ in range(2))
+    save_network(first, tmp_path / 'object_motion')
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        with pytest.raises(OSError, match="too large|No space"):
+            save_network(second, tmp_path / 'object_motion')
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == ['object_motion']
+    kept, wanted = load_network(tmp_path / 'object_motion').state_dict(), first.state_dict()
+    assert all(torch.equal(kept[name], value) for name, value in wanted.items())
 
 
 def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, robot):
