@@ -195,7 +195,7 @@ def main() -> int:
         for process in busy:
             process.kill()
         shutil.rmtree(folder)
-    head = ('recorder', 'n', 'messages due', 'lost', 'in the bags', 'last message before the end [s]',
+    head = ('recorder', 'n', 'messages due', 'lost', 'in the bags', 'age of the last [s]',
             'longest stop [s]')  # fmt: skip
     rows = [
         [name, str(len(own)), str(sum(r.due for r in own)), str(sum(r.lost for r in own)),
@@ -207,8 +207,8 @@ def main() -> int:
     body = (
         f'{table(head, rows)}\n\nPublished all the time: joint states at 100 Hz and images of '
         f'30 kB at 50 Hz; {options.busy} processes that only compute beside it. Due = sent after '
-        '`recording` was said, up to the last message in the bag, which is at most so old when the '
-        'recorder is killed, told to stop, or finds the disk full. Every bag was read with '
+        '`recording` was said, up to the last message in the bag, which is at most so old when '
+        'the recorder is killed, told to stop, or finds the disk full. Every bag was read with '
         f'rosbags.\n\nThe first log of each, folder left out.\n\n{chr(10).join(logs)}'
     )
     body = body.replace(f'{folder}/', '')

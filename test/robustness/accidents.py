@@ -244,6 +244,10 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         'action statistics',
         lambda: altered('action statistics', rb'"clip": [\d.]+', b'"clip": ' + b'9' * 400),
     ),
+    'focal length of 400 digits': (
+        'camera parameters',
+        lambda: altered('camera parameters', rb'70\.0', b'9' * 400),
+    ),
     'shard whose name is no file name': (
         'weights in shards',
         lambda: altered('weights in shards', rb'"model-00002', b'"' + b'9' * 400),

@@ -10,6 +10,7 @@ doubled, the node died by itself, or memory grows.
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 import csv
 import importlib.util
 import json
@@ -257,7 +258,8 @@ def main() -> int:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     soak = Soak(load_client(), arguments.out, arguments.seed)
-    soak.run(arguments.rollouts, arguments.kill_every)
+    with suppress(KeyboardInterrupt):  # what was measured until then is written
+        soak.run(arguments.rollouts, arguments.kill_every)
     with (arguments.out / 'soak.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, soak.rows[0])
         writer.writeheader()
@@ -266,7 +268,7 @@ def main() -> int:
     grown = growth(soak.rows)
     summary = {
         'seed': arguments.seed,
-        'rollouts': arguments.rollouts,
+        'rollouts': int(soak.rows[-1]['rollout']) + 1,
         'kills': soak.kills,
         'memory_growth_mb_per_1000': grown,
         'problems': soak.problems,
