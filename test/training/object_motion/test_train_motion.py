@@ -138,7 +138,7 @@ def test_a_full_disk_leaves_the_last_network_whole(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
     try:
-        with pytest.raises(OSError, match="too large|No space"):
+        with pytest.raises(OSError, match='too large|No space'):
             save_network(second, tmp_path / 'object_motion')
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
