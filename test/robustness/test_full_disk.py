@@ -55,11 +55,6 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
         'distill', 'bundled', str(EPISODE.parent), '--out', str(out / 'student'), '--dtype',
         'float32', '--threads', '1', '--set', 'optimizer.steps=2', '--set',
         'optimizer.batch_size=1'],
-    'train-motion': lambda out: [
-        'train-motion', str(EPISODE.parent), '--out', str(out / 'motion'), '--steps', '2',
-        '--batch-size', '2', '--threads', '1'],
-    'calibrate-camera': lambda out: [
-        'calibrate-camera', str(EPISODE), '--view', 'high', '--out', str(out / 'high.yaml')],
 }  # fmt: skip
 
 
