@@ -31,7 +31,7 @@ lint: $(STAMP)  ## ruff, pyright and import-linter
 	$(BIN)/lint-imports --no-logo
 
 test: lint  ## the linters, then all tests (about 10 minutes)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out

@@ -44,20 +44,21 @@ OBSTACLES = {
     'control_msgs': _no_control_msgs,
 }
 
-_skipped: Counter[str] = Counter()
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for marker, obstacle in OBSTACLES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         reason = obstacle() if marked else ''
         if reason:
-            _skipped[f'{marker} ({reason})'] = len(marked)
             for item in marked:
                 item.add_marker(pytest.mark.skip(reason=f'{marker}: {reason}'))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if _skipped:
-        counted = ', '.join(f'{count} {marker}' for marker, count in _skipped.items())
-        terminalreporter.write_line(f'skipped for want of: {counted}')
+    counted: Counter[str] = Counter()
+    for report in terminalreporter.stats.get('skipped', ()):
+        reason = str(report.longrepr[-1]).removeprefix('Skipped: ')
+        if reason.partition(':')[0] in OBSTACLES:
+            counted[reason] += 1
+    for reason, count in counted.most_common():
+        terminalreporter.write_line(f'skipped for want of {reason}: {count}')
