@@ -98,6 +98,7 @@ def main() -> None:
         'failures that succeed now',
         'not as recorded',
     )
+    options.repeats = counts['all']['tried']
     publish(
         'outcome_sensitivity',
         f'Outcomes when objects lie {options.noise_mm:g} mm elsewhere',
