@@ -15,6 +15,8 @@ from mkdocs.structure.pages import Page
 
 #: a Markdown link that leaves docs/, up to the path's end
 _LINK = re.compile(r'(\]\()\.\./([^)#\s]+)')
+#: a picture that lies beside the page that shows it
+_PICTURE = re.compile(r'!\[[^\]]*\]\(([^)/:]+)\)')
 _FOLDER = 'repository'
 
 
@@ -22,7 +24,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the files that pages link to; a missing one is left to MkDocs' own check of links."""
     root = Path(config.docs_dir).parent
     texts = [page.content_string for page in files.documentation_pages()]
-    for name in sorted({match[2] for text in texts for match in _LINK.finditer(text)}):
+    names = {match[2] for text in texts for match in _LINK.finditer(text)}
+    for name in [name for name in names if name.endswith('.md') and (root / name).is_file()]:
+        shown = _PICTURE.findall((root / name).read_text())
+        names.update(str(Path(name).with_name(picture)) for picture in shown)
+    for name in sorted(names):
         if (root / name).is_file():
             source = str(root / name)
             files.append(File.generated(config, f'{_FOLDER}/{name}', abs_src_path=source))
