@@ -10,6 +10,7 @@ for all policies. Sets without an interval (all values equal, say) are left out 
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from functools import cache
 
@@ -209,7 +210,7 @@ def differing_ranking(rng: np.random.Generator, num: int) -> tuple[np.ndarray, .
     policies = int(rng.integers(4, 31))
     correlation = rng.choice([0.3, 0.7, 0.95, 0.998])
     first, other = rng.normal(size=(2, policies))
-    kind = rng.integers(3)
+    kind = int(rng.integers(3))
     true, judged = (
         _marginal(kind, z)
         for z in (first, correlation * first + np.sqrt(1 - correlation**2) * other)
@@ -251,14 +252,18 @@ def held(scores: list[tuple[ScoreOfRates, float]]) -> float:
     return float(np.mean([s.interval[0] <= true <= s.interval[1] for s, true in scores]))
 
 
+def _add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--rankings', type=int, default=300, help='sets for r and MMRV, which take longer'
+    )
+
+
 def main() -> None:
     """Simulates, and prints the page."""
     options = parse_arguments(
         __doc__,
         repeats=1000,
-        more=lambda parser: parser.add_argument(
-            '--rankings', type=int, default=300, help='sets for r and MMRV, which take longer'
-        ),
+        more=_add,
     )
     rows, errors = [], []
     for name in INTERVALS:

@@ -65,12 +65,14 @@ def main() -> None:
     counts: dict[str, Counter[str]] = {}
     for path in paths:
         info = read_episode(path, with_cameras=False).info
+        seed = info.seed
+        assert seed is not None, f'{path} is of no simulated scene'
         name = info.metadata.get('policy') or 'expert'
         sim = SimEpisode(robot, expert.home, rendering=False)
         try:
-            policy = scripted_policy(name, info.task, info.seed, expert)
-            policy.reset(seed=info.seed)
-            sim.reset(info.seed, info.task)
+            policy = scripted_policy(name, info.task, seed, expert)
+            policy.reset(seed=seed)
+            sim.reset(seed, info.task)
         except SimulatorError as error:  # drawn for other cameras
             print(f'left out: {path}: {error}')
             continue

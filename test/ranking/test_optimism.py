@@ -85,19 +85,22 @@ def test_areas_agree_with_the_plain_one_and_scenes_are_left_out_whole():
     area, (low, high) = area_interval([said], real, scenes)
     assert area == pytest.approx(area_under_roc(said, real)) and 0 < low < area < high < 1
     # by hand: the spread of the areas without one scene each, on the logit scale
-    rest = [
-        area_under_roc(*(np.delete(one, range(4 * k, 4 * k + 4)) for one in (said, real)))
-        for k in range(10)
-    ]
+    rest = np.array(
+        [
+            area_under_roc(*(np.delete(one, range(4 * k, 4 * k + 4)) for one in (said, real)))
+            for k in range(10)
+        ],
+        float,
+    )
     error = np.sqrt(0.9 * ((rest - np.mean(rest)) ** 2).sum()) / (area * (1 - area))
     ends = [
         1 / (1 + np.exp(-(np.log(area / (1 - area)) + t * error))) for t in (-2.262157, 2.262157)
     ]
     assert (low, high) == pytest.approx(tuple(ends), abs=1e-6)
+    other = area_under_roc(said[::-1], real)
+    assert other is not None
     value, (low, high) = area_interval([said, said[::-1]], real, scenes)
-    assert (
-        value == pytest.approx(area - area_under_roc(said[::-1], real)) and -1 <= low < high <= 1
-    )
+    assert value == pytest.approx(area - other) and -1 <= low < high <= 1
     perfect, none = area_interval([real.astype(float)], real, scenes)
     assert perfect == 1.0 and np.isnan(none).all()
 

@@ -248,7 +248,9 @@ class Kills:
         begin_ns = int(announced[1]) * 10**9 + int(announced[2])
         until = killed_ns - round((1.0 + self._starved_s) * 1e9)
         notes = np.fromfile(f'{log}{RECEIVED}', np.int64)
-        received = dict(notes[: len(notes) // 2 * 2].reshape(-1, 2).tolist())
+        received = {
+            int(stamp): int(at) for stamp, at in zip(notes[::2], notes[1::2], strict=False)
+        }
         self._undelivered = sum(begin_ns < at < until and at not in received for at in self._sent)
         bags = [recover(source) for source in find_damaged(self._out / 'bag')]
         with AnyReader([bags[0].path]) as bag:

@@ -54,7 +54,7 @@ def draw_rates(
     # of each group in each grouping (2, Q, P), at each point of the grid
     weight = np.einsum('gqp,cpn->cgqn', members.astype(float), precision, optimize=True)
     weighted = np.einsum('gqp,cpn->cgqn', members.astype(float), pull, optimize=True)
-    is_there = members.any(axis=2)[..., None]
+    is_there = np.asarray(members.any(axis=2))[..., None]
     scatter = _inverse(np.where(is_there, weight, np.array([1.0, 0.0, 1.0])[:, None, None, None]))
     means = _times(scatter, weighted)
     # the means are integrated over all pairs of rates, [0, pi] x [0, pi]

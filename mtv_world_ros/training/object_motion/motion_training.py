@@ -262,7 +262,7 @@ def _drawn(
     groups: list[list[ObjectTracks]] = []
     left = size
     while siblings and left > size * (1 - _SIBLINGS_SHARE):
-        family = siblings[rng.integers(len(siblings))]
+        family = siblings[int(rng.integers(len(siblings)))]
         picked = rng.permutation(len(family))[: min(_GROUP, left)]
         groups.append([family[k] for k in picked])
         left -= len(picked)

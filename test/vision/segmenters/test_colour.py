@@ -284,7 +284,7 @@ def test_no_colour_that_may_count_is_left_out_by_its_saturation_in_hsv():
         rgb = np.stack([np.full_like(green, red), green, blue], -1).astype(np.uint8)
         lab = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB))
         lightness, a, b = np.moveaxis(lab.astype(np.float64), -1, 0)
-        word = segmenter._word_of_ab[lab[..., 1], lab[..., 2]]
+        word = segmenter._word_of_ab[lab[..., 1].astype(int), lab[..., 2].astype(int)]
         saturation = np.hypot(a - 128, b - 128) / (lightness / 2.55 + 16)
         counts = (lightness >= 20) & (saturation > 0.999 * floors[word])
         hsv = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))[counts]
