@@ -230,12 +230,16 @@ def encode_video(
         frames: what to show; of even size unless `full_colour`.
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
-        full_colour: keep colour at every pixel (4:4:4), which not every browser plays.
+        full_colour: keep colour at every pixel (4:4:4), which not every browser plays; the same
+            frames may then give another file.
     """
     rate = Fraction(fps).limit_denominator(1000)
-    # with several threads, or with x264's macroblock tree, the same frames now and then gave
-    # another file on a busy machine: 12 of 240 with the tree, 0 of 480 without it (PyAV 18)
-    options = {'crf': str(crf), 'preset': 'veryfast', 'threads': '1', 'x264-params': 'mbtree=0'}
+    options = {'crf': str(crf), 'preset': 'veryfast', 'threads': '1'}
+    if not full_colour:
+        # with several threads, or with x264's macroblock tree, the same frames now and then gave
+        # another file on a busy machine: 12 of 240 with the tree, 0 of 480 without it (PyAV 18);
+        # without it files are a fifth larger
+        options['x264-params'] = 'mbtree=0'
     file = io.BytesIO()
     with av.open(file, 'w', format='mp4') as container:
         stream = container.add_stream('libx264', rate=rate, options=options)
