@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+import errno
 import hashlib
 import json
 import math
@@ -100,6 +101,23 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
     is_free = not any(path.iterdir()) if path.is_dir() else not path.exists()
     if not (overwrite or is_free):
         raise ConfigError(f"'{path}' exists; give another {instead}, or --overwrite to replace it")
+
+
+def check_room(folder: Path, num_bytes: int) -> None:
+    """Refuses a disk that is as good as full, before processes are started that write to it.
+
+    Args:
+        folder: is made where it is missing.
+        num_bytes: free space that is needed at least.
+
+    Raises:
+        OSError: the disk has less.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        text = f'{os.strerror(errno.ENOSPC)}: {free} bytes are free, {num_bytes} are needed'
+        raise OSError(errno.ENOSPC, text, str(folder))
 
 
 def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: bool) -> None:

@@ -68,6 +68,12 @@ def last_line(log: Path, otherwise: str) -> str:
     return lines[-1] if lines else otherwise
 
 
+def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str:
+    """Returns with which status a process of `start_process` ended, and what it said last."""
+    text = last_line(logs / f'{name}.log', 'its log is empty')
+    return f"'{name}' ended with status {process.returncode}: {text} (logs are in '{logs}')"
+
+
 def stop_process(process: subprocess.Popen[bytes] | None) -> None:
     """Ends a node with SIGINT and waits for it; kills it where that does not help."""
     if process is None or process.poll() is not None:

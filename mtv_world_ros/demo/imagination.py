@@ -14,11 +14,12 @@ import time
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
+from mtv_world_ros.demo.node_processes import ROOM_BYTES
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.files import check_free
+from mtv_world_ros.files import check_free, check_room
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.processes import (
-    last_line,
+    how_it_ended,
     module_command,
     private_domain,
     ros_arguments,
@@ -79,8 +80,10 @@ def imagine_episodes(
 
     Raises:
         ConfigError: `out` holds episodes, and `overwrite` is not set.
-        EpisodeError: a process failed; the message names its log.
+        EpisodeError: a process failed; the message says what it said last and names its log.
+        OSError: the disk is full.
     """
+    check_room(out, ROOM_BYTES)
     for bag in sorted(out.glob('episode_*')):
         check_free(bag, overwrite)
         shutil.rmtree(bag)
@@ -103,12 +106,8 @@ def imagine_episodes(
         # the runner first: it closes its record
         for name in reversed(commands):
             stop_process(started.get(name))
-    status = started['runner'].returncode
-    if status != 0:
-        text = last_line(logs / 'runner.log', 'silently')
-        raise EpisodeError(
-            f"the episode runner ended with status {status}: {text} (logs are in '{logs}')"
-        )
+    if started['runner'].returncode != 0:
+        raise EpisodeError(how_it_ended('runner', started['runner'], logs))
     try:
         return list(read_json(out / 'episodes.json'))
     except (OSError, ValueError, TypeError) as error:
@@ -124,11 +123,11 @@ def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:
         time.sleep(0.2)
         dead = [n for n, p in processes.items() if p is not runner and p.poll() is not None]
         if dead and not (logs.parent / 'episodes.json').is_file():
-            text = last_line(logs / f'{dead[0]}.log', 'silently')
+            said = how_it_ended(dead[0], processes[dead[0]], logs)
             if any(logs.parent.glob('.episode_*')):  # the runner notices, and closes the record
                 with suppress(subprocess.TimeoutExpired):
                     runner.wait(60.0)
-            raise EpisodeError(f"'{dead[0]}' ended: {text} (logs are in '{logs}')")
+            raise EpisodeError(said)
 
 
 def _common(options: ImagineOptions, views: Sequence[str]) -> dict[str, object]:

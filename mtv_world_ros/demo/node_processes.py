@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 import subprocess
 import time
 
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import check_room
 from mtv_world_ros.processes import (
+    how_it_ended,
     module_command,
     private_domain,
     ros_arguments,
@@ -21,6 +23,8 @@ STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw
 TOPICS = ('predicted/joint_states', 'success', 'jaccard', 'report')
 NODE = '/world_model'
 _NODE_START_S = 120.0
+#: of logs and bag, before anything is started
+ROOM_BYTES = 8 * 2**20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +51,10 @@ def record_through_node(
     nothing). Logs of the processes go to `out/logs`.
 
     Raises:
-        EpisodeError: a process failed; the message names its log.
+        EpisodeError: a process failed; the message says what it said last and names its log.
+        OSError: the disk is full.
     """
+    check_room(out, ROOM_BYTES)
     logs = out / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
     environment = private_domain()
@@ -68,14 +74,12 @@ def record_through_node(
         )
         command += ['--wait-timeout', str(_NODE_START_S), '--answer-timeout', '300']
         player = start_process('player', command, logs, environment)
-        _wait(player, (node, recorder), logs)
+        _wait(player, {'node': node, 'recorder': recorder}, logs)
     finally:
         stop_process(recorder)
         stop_process(node)
     if recorder is not None and recorder.returncode != 0:
-        raise EpisodeError(
-            f"the recorder ended with status {recorder.returncode}; see '{logs / 'recorder.log'}'"
-        )
+        raise EpisodeError(how_it_ended('recorder', recorder, logs))
 
 
 def _node_command(options: DemoOptions) -> list[str]:
@@ -97,12 +101,13 @@ def _node_command(options: DemoOptions) -> list[str]:
 
 
 def _wait(
-    player: subprocess.Popen[bytes], others: Sequence[subprocess.Popen[bytes]], logs: Path
+    player: subprocess.Popen[bytes], others: Mapping[str, subprocess.Popen[bytes]], logs: Path
 ) -> None:
     while player.poll() is None:
-        if any(process.poll() is not None for process in others):
-            stop_process(player)
-            raise EpisodeError(f"node or recorder ended early; see the logs in '{logs}'")
+        for name, process in others.items():
+            if process.poll() is not None:
+                stop_process(player)
+                raise EpisodeError(how_it_ended(name, process, logs))
         time.sleep(0.1)
     if player.returncode != 0:
-        raise EpisodeError(f"the player ended with status {player.returncode}; see '{logs}'")
+        raise EpisodeError(how_it_ended('player', player, logs))

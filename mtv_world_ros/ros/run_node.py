@@ -74,6 +74,7 @@ def run(
     _find_log_folder()
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
+    failure = ''
     try:
         node = make()
         starting.is_over = True  # from now on rclpy's handler, or the node's own, ends it
@@ -85,11 +86,11 @@ def run(
             return 0
         if not isinstance(error, (MtvWorldError, OSError)):
             raise
-        sys.stderr.write(f'{type(error).__name__}: {error}\n')
-        return 1
+        failure = f'{type(error).__name__}: {error}\n'
     finally:
         _shut_down(node)
-    return 0
+    sys.stderr.write(failure)  # the last line of a log is why the process ended
+    return int(bool(failure))
 
 
 def _find_log_folder() -> None:

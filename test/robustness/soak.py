@@ -20,13 +20,22 @@ import sys
 import time
 from typing import Any
 
+from node_messages import commit, ROOT
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 OUT_OF_MEMORY, CRASHES = 1100, 1300
 #: growth that is allowed [MB for 1,000 rollouts]
 MOST_GROWTH_MB = 1.0
+#: column of the CSV -> label in the plot
+LABELS = {
+    'memory_mb': 'memory [MB]',
+    'threads': 'threads',
+    'descriptors': 'file descriptors',
+    'latency_s': 'plan to last end [s]',
+}
+#: rollouts after which all is written again
+WRITE_EVERY = 500
 #: rollouts before memory counts: caches and pools fill
 WARM = 200
 
@@ -53,27 +62,48 @@ class Soak:
     def __init__(self, ros: Any, out: Path, seed: int) -> None:
         self._ros, self._out = ros, out
         self.latency_s = 0.0
-        self._rng = np.random.default_rng(seed)
+        self._seed, self._rng = seed, np.random.default_rng(seed)
         self._client = ros.Client()
         self._node: Any = None
         self._extra: list[Any] = []
         self.rows: list[dict[str, float]] = []
-        self.kills = 0
+        self.kills = self.num_rollouts = 0
         self.problems: list[str] = []
 
     def run(self, count: int, kill_every: int) -> None:
-        """Sends `count` plans."""
+        """Sends `count` plans; what was measured is written now and then."""
         self._start()
         for index in range(count):
             if kill_every and index and index % kill_every == 0:
                 self._kill()
             self._one(index)
+            self.num_rollouts += 1
             if index % 10 == 0:
                 self.rows.append({'rollout': index, **self._usage()})
+            if self.num_rollouts % WRITE_EVERY == 0:
+                self.write()
         code = self._node.stop()
         if code:
             self.problems.append(f'the node ended with {code}')
         self._client.close()
+
+    def write(self) -> dict[str, Any]:
+        """Writes rows, plot and summary; returns the summary."""
+        with (self._out / 'soak.csv').open('w', newline='') as file:
+            writer = csv.DictWriter(file, self.rows[0])
+            writer.writeheader()
+            writer.writerows(self.rows)
+        plot(self.rows, self._out / 'soak.png')
+        summary = {
+            'seed': self._seed,
+            'commit': commit(),
+            'rollouts': self.num_rollouts,
+            'kills': self.kills,
+            'memory_growth_mb_per_1000': growth(self.rows),
+            'problems': self.problems,
+        }
+        (self._out / 'summary.json').write_text(json.dumps(summary, indent=1))
+        return summary
 
     def _start(self) -> None:
         self._node = self._ros.start_node(self._out, 'pace:=burst')
@@ -240,10 +270,12 @@ def plot(rows: list[dict[str, float]], path: Path) -> None:
 
     figure, axes = pyplot.subplots(4, sharex=True, figsize=(9, 8))
     x = [row['rollout'] for row in rows]
-    for axis, key in zip(axes, ('memory_mb', 'threads', 'descriptors', 'latency_s'), strict=True):
-        axis.plot(x, [row[key] for row in rows], '.-', linewidth=0.5)
-        axis.set_ylabel(key)
-    axes[-1].set_xlabel('rollout')
+    for axis, (key, label) in zip(axes, LABELS.items(), strict=True):
+        axis.plot(x, [row[key] for row in rows], '.', markersize=2)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axes[-1].set_xlabel('rollout (the node is killed and started again where memory drops)')
     figure.savefig(path, bbox_inches='tight')
     pyplot.close(figure)
 
@@ -260,21 +292,9 @@ def main() -> int:
     soak = Soak(load_client(), arguments.out, arguments.seed)
     with suppress(KeyboardInterrupt):  # what was measured until then is written
         soak.run(arguments.rollouts, arguments.kill_every)
-    with (arguments.out / 'soak.csv').open('w', newline='') as file:
-        writer = csv.DictWriter(file, soak.rows[0])
-        writer.writeheader()
-        writer.writerows(soak.rows)
-    plot(soak.rows, arguments.out / 'soak.png')
-    grown = growth(soak.rows)
-    summary = {
-        'seed': arguments.seed,
-        'rollouts': int(soak.rows[-1]['rollout']) + 1,
-        'kills': soak.kills,
-        'memory_growth_mb_per_1000': grown,
-        'problems': soak.problems,
-    }
-    (arguments.out / 'summary.json').write_text(json.dumps(summary, indent=1))
+    summary = soak.write()
     print(json.dumps(summary, indent=1))
+    grown = summary['memory_growth_mb_per_1000']
     return int(bool(soak.problems) or grown > MOST_GROWTH_MB)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import subprocess
 
 import pytest
+from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
+import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.files import share_path
@@ -55,6 +57,9 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
         'distill', 'bundled', str(EPISODE.parent), '--out', str(out / 'student'), '--dtype',
         'float32', '--threads', '1', '--set', 'optimizer.steps=2', '--set',
         'optimizer.batch_size=1'],
+    'demo': lambda out: ['demo', '--out', str(out / 'demo'), *ONE_STEP],
+    'imagine': lambda out: [
+        'imagine', '--episodes', str(EPISODE), '--out', str(out / 'imagined'), *ONE_STEP],
 }  # fmt: skip
 
 
@@ -75,16 +80,65 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(['umount', '-l', str(disk)], check=True)
 
 
+def _dataset(folder: Path) -> list[str]:
+    """Makes a LeRobot dataset; the command that imports it."""
+    assert main(['export-dataset', str(EPISODE), '--out', str(folder)]) == 0
+    return ['import-dataset', str(folder), '--mapping', str(folder / 'meta' / 'mapping.yaml')]
+
+
+def _weights(folder: Path) -> list[str]:
+    """Makes small weights in the public layout; the command that imports them."""
+    public = write_videox(folder / 'public')
+    preset, video = folder / 'tiny.yaml', {'num_frames': 4, 'width': 32, 'height': 32}
+    sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
+    preset.write_text(yaml.safe_dump({**sections, 'video': video}))
+    return ['import-weights', str(public), '--preset', str(preset)]
+
+
+def _evaluation(folder: Path) -> list[str]:
+    """Evaluates without a report; the command that writes it."""
+    words = ['--actions', 'true', '--no-ceiling', '--no-report', '--out', str(folder), *ONE_STEP]
+    assert main(['evaluate', 'bundled', str(EPISODE.parent), *words]) == 0
+    return ['report', str(folder)]
+
+
+#: what makes the input of a command on another disk and returns the command, and the output's name
+PREPARED = {
+    'import-dataset': (_dataset, 'episodes'),
+    'import-weights': (_weights, 'checkpoint'),
+    'report': (_evaluation, 'report.html'),
+}
+
+
 @pytest.mark.parametrize('name', WRITERS)
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     name: str, full_disk: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(full_disk.parent)
-    status = main(WRITERS[name](full_disk))
+    check_refused(WRITERS[name](full_disk), full_disk, capfd)
+
+
+@pytest.mark.parametrize('is_full', [True, False], ids=['full', 'fills_up'])
+@pytest.mark.parametrize('name', PREPARED)
+def test_a_disk_that_is_full_or_fills_up_keeps_no_part_of_an_import_or_a_report(
+    name: str, is_full: bool, full_disk: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    make, out = PREPARED[name]
+    (tmp_path / 'input').mkdir()
+    words = make(tmp_path / 'input')
+    capfd.readouterr()
+    if not is_full:
+        (full_disk / 'others').unlink()
+    check_refused([*words, '--out', str(full_disk / out)], full_disk, capfd)
+
+
+def check_refused(words: list[str], disk: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The command ends with status 1 and one line about the disk, and leaves no result on it."""
+    status = main(words)
     said = capfd.readouterr().err.splitlines()
     assert status == 1, said
     assert 'Traceback (most recent call last):' not in said
-    (line,) = [line for line in said if line.startswith('mtv-world: ')]
+    (line,) = [line for line in said if line.startswith(('mtv-world: ', 'episode 0: '))]
     assert any(word in line for word in ('No space left', 'os error 28', 'disk full')), said
-    left = [path for path in full_disk.rglob('*') if path.is_file() and path.name != 'others']
-    assert not [path for path in left if path.name.endswith(('.part', '.mcap', '.npz', '.rrd'))]
+    left = {path.name for path in disk.rglob('*') if path.is_file()}
+    assert left <= {'others', '.lock'}

@@ -267,6 +267,8 @@ class BagWriter:
         return channel, record
 
     def _finish(self) -> None:
+        if self._failure:
+            self.set_metadata('recording', {'cut_off': self._failure})
         custom = {key: text for part in self._metadata.values() for key, text in part.items()}
         records = [record for _, record in self._topics.values()]
         information = bag_information(

@@ -155,13 +155,9 @@ class EpisodeRunner(Node):
         end_s = time.monotonic() + options.max_seconds
         while self._ended is None:
             self._spin_once()
-            for name, how in (
-                (options.policy_node, 'policy_died'),
-                (options.world_model, 'world_model_died'),
-            ):
-                silence_s = self._peers.silence_s(name)
-                if silence_s > options.heartbeat_timeout:
-                    return {'how': how, 'text': f"'{name}' has been silent for {silence_s:.1f} s"}
+            self._recording.check()
+            if dead := self._dead():
+                return dead
             if time.monotonic() > end_s:
                 self._call_trigger(f'{options.policy_node}/stop')
                 self._wait_for(lambda: self._ended is not None, 'the end of the episode')

@@ -9,7 +9,7 @@ import subprocess
 from std_srvs.srv import Trigger
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.processes import module_command, start_process, stop_process
+from mtv_world_ros.processes import how_it_ended, module_command, start_process, stop_process
 from mtv_world_ros.ros.peers import Peers
 
 _VIEW_TOPICS = ('predicted/image_raw', 'predicted/camera_info')
@@ -60,11 +60,25 @@ class Recording:
         self._bag = Path(answer.message)
         return answer.message
 
+    def check(self) -> None:
+        """Refuses to go on without the recorder.
+
+        Raises:
+            EpisodeError: it ended, e.g. because the disk is full.
+        """
+        if self._process is not None and self._process.poll() is not None:
+            raise EpisodeError(how_it_ended('recorder', self._process, self._log.parent))
+
     def end(self) -> None:
-        """Lets the recorder take what is still on its way, and waits for the closed bag."""
+        """Lets the recorder take what is still on its way, and waits for the closed bag.
+
+        Raises:
+            EpisodeError: it ended; the bag holds what it had got.
+        """
         bag, self._bag = self._bag, None
         if bag is None:
             return
+        self.check()
         self._peers.call(Trigger, 'episode_recorder/end', Trigger.Request())
         self._peers.wait(lambda: self._is_on() and bag.is_dir(), f"'{bag}'", _TIMEOUT_S)
 
@@ -74,6 +88,5 @@ class Recording:
         self._process = None
 
     def _is_on(self) -> bool:
-        if self._process is not None and self._process.poll() is not None:
-            raise EpisodeError(f"the recorder ended early; see '{self._log}'")
+        self.check()
         return ': recording' in self._log.read_text(errors='replace')

@@ -67,6 +67,7 @@ def test_a_full_disk_loses_no_message_and_the_bag_is_whole(tmp_path) -> None:
     writer.close()
     with Reader(tmp_path / 'bag') as reader:  # an independent reader, by metadata and index
         found = [bytes(data) for _, _, data in reader.messages()]
+    assert 'No space left' in BagReader(tmp_path / 'bag').custom_data['cut_off']
     assert found == [payload(index) for index in range(count)]
     assert not list(tmp_path.glob('.*'))
     assert not list((tmp_path / 'bag').glob('.*'))

@@ -1,6 +1,8 @@
 """A policy lives in the node's imagination: no gap in the clock, and a record of every fault."""
 
 import json
+import os
+from pathlib import Path
 import signal
 import sys
 import time
@@ -19,6 +21,7 @@ FRAME_NS, NUM_FRAMES = 200_000_000, 4
 START_NS = 1_700_000_000 * NANO
 #: of the runner: episode k has seed 200 + 1000 k, and the fake model blocks at 1200 to 1299
 SEED = 200
+BLOCKED_SEED = 1200
 TASKS = ('good', 'blocked', 'nan', 'other_robot', 'late', 'crashes', 'slow', 'good', 'dies')
 ENDS = ('done', 'reset', 'policy_failed', 'rejected', 'late', 'policy_failed', 'another_policy',
         'done', 'policy_died')  # fmt: skip
@@ -55,15 +58,19 @@ class Stack:
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001',
             'diagnostics_period_s:=0.2', *ros.FROZEN, remaps=ros.JOINT_STATES,
         )  # fmt: skip
+        self.episodes = [write_episode(folder, task, ros) for task in TASKS]
+        self.start('out', ros, self.episodes, SEED)
+        self.diagnostics = []
+
+    def start(self, out, ros, episodes, seed):
         self.policy = ros.start_policy(
-            folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
+            self.folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
         )
-        episodes = [write_episode(folder, task, ros) for task in TASKS]
-        arguments = [folder / 'out', '--views', 'low', 'high', '--seed', SEED, '--episodes']
+        arguments = [self.folder / out, '--views', 'low', 'high', '--seed', seed, '--episodes']
         arguments += [*episodes, '--heartbeat-timeout', '3']
         command = [sys.executable, '-m', 'mtv_world_ros.ros.episodes.episode_runner']
-        self.runner = ros.NodeProcess([*command, *map(str, arguments)], folder / 'runner.log')
-        self.diagnostics = []
+        log = self.folder / f'{out}.log'
+        self.runner = ros.NodeProcess([*command, *map(str, arguments)], log)
 
     def state(self, name):
         found = [s for s in self.client.statuses('/diagnostics') if s.name == name]
@@ -232,3 +239,14 @@ def test_a_dead_policy_ends_the_run_with_its_record_closed(stack, results):
     values = diagnostics_in(results[-1]['bag'], 'world_model')[-1].values
     assert values['mode'] == 'imagine'
     assert results[-1]['how'] == 'policy_died'
+
+
+def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
+    stack.start('again', ros, stack.episodes[:1], BLOCKED_SEED)
+    stack.wait(lambda: stack.state('world_model').get('busy') == 'true', 'the blocked rollout')
+    runner = stack.runner.process
+    (recorder,) = Path(f'/proc/{runner.pid}/task/{runner.pid}/children').read_text().split()
+    os.kill(int(recorder), signal.SIGKILL)
+    assert runner.wait(5) == 1
+    last = stack.runner.output().splitlines()[-1]
+    assert last.startswith("EpisodeError: 'recorder' ended with status -9: ")
