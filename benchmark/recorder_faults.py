@@ -28,6 +28,8 @@ from mtv_world_ros.ros.bags.raw_headers import read_stamp
 DISK_BYTES = 8 * 2**20
 RECORDS_S = 3.0
 STOPS_S = 2.0
+#: a busy machine takes long to fill the disk
+FULL_S = 300.0
 TOPICS = ('/joints', '/camera')
 PUBLISHER = """
 import sys, time
@@ -93,7 +95,7 @@ class Lab:
             try:
                 _wait(lambda: ': recording' in log.read_text())
                 if end is None:
-                    process.wait(60)
+                    process.wait(FULL_S)
                 else:
                     time.sleep(RECORDS_S)
                     process.send_signal(end)

@@ -44,6 +44,16 @@ def line(kind: str, row: dict[str, Any]) -> list[str]:
     return [kind, *(str(row[key]) for key in HEAD[1:5]), *worst]
 
 
+def commits_text(files: list[Path]) -> str:
+    """At which commits the rows were made."""
+    kinds: dict[str, set[str]] = {}
+    for file in files:
+        for row in json.loads(file.read_text()):
+            kinds.setdefault(row['commit'], set()).add(row['kind'])
+    counted = (f'`{commit}` ({len(names)} kinds)' for commit, names in kinds.items())
+    return f'Rows are of the commits {", ".join(counted)}.'
+
+
 def soak_text(folder: Path) -> str:
     """What the soak found, in a sentence or two."""
     summary = json.loads((folder / 'summary.json').read_text())
@@ -52,8 +62,8 @@ def soak_text(folder: Path) -> str:
     grown = 'too few rollouts to say' if not np.isfinite(growth) else f'{growth:.2f} MB'
     return (
         f'Soak: {summary["rollouts"]} rollouts over the wire with faults injected, '
-        f'{summary["kills"]} kills, seed {summary["seed"]}. Growth of memory for 1,000 rollouts: '
-        f'{grown}. Problems: {problems}.'
+        f'{summary["kills"]} kills, seed {summary["seed"]}, commit `{summary["commit"]}`. '
+        f'Growth of memory for 1,000 rollouts: {grown}. Problems: {problems}.'
     )
 
 
@@ -62,7 +72,7 @@ def main() -> None:
 
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('rows', type=Path, nargs='+', help='what --json and kills wrote')
-        parser.add_argument('--soak', type=Path, help='folder of a soak')
+        parser.add_argument('--soak', type=Path, nargs='+', default=[], help='folders of soaks')
 
     options = parse_arguments(__doc__, 1, more)
     rows = add_up(options.rows)
@@ -76,11 +86,12 @@ def main() -> None:
         'plausible by numbers of the harness. Kills: time is that until a node that was started '
         'after the killed one had answered a plan, or a bag was recovered and read by rosbags.'
     )
-    if options.soak:
-        body.append(soak_text(options.soak))
+    body.append(commits_text(options.rows))
+    for index, folder in enumerate(options.soak):
+        body.append(soak_text(folder))
         if options.out:
-            name = f'robustness_soak_{options.machine}.png'
-            shutil.copy(options.soak / 'soak.png', options.out / name)
+            name = f'robustness_soak{index or ""}_{options.machine}.png'
+            shutil.copy(folder / 'soak.png', options.out / name)
             body.append(f'![Memory, threads, descriptors and latency over rollouts]({name})')
     publish(
         'robustness', 'Damaged input, kills and rollouts with faults',

@@ -82,7 +82,8 @@ def robot_path(name: str | Path) -> Path:
     """
     path = bundled('robots', name, 'robot_file')
     if not path.is_file():
-        raise ConfigError(f"robot file '{path}' does not exist; set 'robot_file' to one")
+        problem = 'is no regular file' if path.exists() else 'does not exist'
+        raise ConfigError(f"robot file '{path}' {problem}; set 'robot_file' to one")
     return path
 
 

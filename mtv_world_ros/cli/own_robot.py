@@ -282,7 +282,6 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
     if arguments.guess and guess.mount_link == camera.mount_link:
         mm, degrees = difference(guess.T_mount_camera, camera.T_mount_camera)
         print(f'the guess was {mm:.0f} mm and {degrees:.1f} degrees away')
-    save_calibration(out, {**known, arguments.view: camera})
     assert episode.joint_states is not None
     picture = overlay_picture(
         replace(episode, cameras={arguments.view: camera}),
@@ -292,6 +291,7 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
         JointTrack(episode.joint_states, robot),
     )
     write_png(out.with_suffix('.png'), picture)
+    save_calibration(out, {**known, arguments.view: camera})
     print(f'calibration: {out}\nlook at it: {out.with_suffix(".png")}')
     return 0
 

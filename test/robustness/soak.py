@@ -13,6 +13,7 @@ import argparse
 from contextlib import suppress
 import csv
 import importlib.util
+from itertools import pairwise
 import json
 import os
 from pathlib import Path
@@ -273,9 +274,12 @@ def plot(rows: list[dict[str, float]], path: Path) -> None:
     for axis, (key, label) in zip(axes, LABELS.items(), strict=True):
         axis.plot(x, [row[key] for row in rows], '.', markersize=2)
         axis.set_ylabel(label)
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-    axes[-1].set_xlabel('rollout (the node is killed and started again where memory drops)')
+        if key != 'memory_mb':
+            axis.set_ylim(0, 1.1 * max(row[key] for row in rows))
+        for before, row in pairwise(rows):
+            if row['kills'] > before['kills']:
+                axis.axvline(row['rollout'], color='tab:red', linewidth=0.5)
+    axes[-1].set_xlabel('rollout; red = the node is killed and started again')
     figure.savefig(path, bbox_inches='tight')
     pyplot.close(figure)
 

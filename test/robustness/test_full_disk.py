@@ -31,6 +31,8 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
     'doctor': lambda out: ['doctor', str(EPISODE), '--out', str(out / 'doctor')],
     'robot': lambda out: ['robot', str(URDF), '--out', str(out / 'a.yaml')],
     'robot picture': lambda out: ['robot', 'yam_bimanual', '--picture', str(out / 'a.png')],
+    'calibrate-camera': lambda out: [
+        'calibrate-camera', str(EPISODE), '--view', 'low', '--out', str(out / 'camera.yaml')],
     'replay': lambda out: ['replay', str(EPISODE), '--offline', '--out', str(out / 'replay')],
     'train': lambda out: [
         'train', str(EPISODE.parent), '--out', str(out / 'run'), '--dtype', 'float32',
