@@ -16,6 +16,8 @@ whether an episode begins there, and `scene` (N,), its number. The same command 
 was stopped.
 """
 
+# lerobot is in another environment
+# pyright: reportMissingImports=false
 from __future__ import annotations
 
 import argparse
@@ -176,8 +178,8 @@ def _data(options: argparse.Namespace, *, held: bool = False) -> dict[str, torch
     data |= {'all': every, 'starts': every[since == 0], 'answers': every[(since > 0) & after]}
     if options.late:
         grippers = data['actions'][..., GRIPPERS]
-        held = grippers[:, :1].expand(-1, options.late, -1)
-        data['actions'][..., GRIPPERS] = torch.cat([held, grippers[:, : -options.late]], dim=1)
+        still = grippers[:, :1].expand(-1, options.late, -1)
+        data['actions'][..., GRIPPERS] = torch.cat([still, grippers[:, : -options.late]], dim=1)
     return data
 
 

@@ -40,6 +40,7 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.ranking.run_jobs import read_results
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.sim.collect.record import expert_generator
 from mtv_world_ros.sim.expert.expert import Expert
@@ -185,12 +186,14 @@ def _pack(root: Path, task: str, _options: argparse.Namespace) -> None:
     num = len(more['state'])
     # scenes of their own, after those of the demonstrations
     more |= {'start': np.ones(num, bool), 'scene': parts['scene'].max() + 1 + np.arange(num)}
-    parts = {key: np.concatenate([values, more[key]]) for key, values in parts.items()}
     out.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(out, views=np.array(VIEWS), **parts)
+    whole: dict[str, Any] = {
+        key: np.concatenate([values, more[key]]) for key, values in parts.items()
+    }
+    np.savez(out, views=np.array(VIEWS), **whole)
 
 
-def _demonstrated(dataset: Path) -> dict[str, np.ndarray]:
+def _demonstrated(dataset: Path) -> dict[str, Any]:
     """Every row of a LeRobot dataset with the actions that follow; an episode ends at rest."""
     parts: dict[str, list[Any]] = {
         key: [] for key in ('images', 'state', 'actions', 'start', 'scene')
@@ -251,7 +254,9 @@ def _rank(root: Path, tasks: Sequence[str], options: argparse.Namespace) -> None
     options.repeats = options.scenes
     ranking = json.loads((root / 'ranking/ranking.json').read_text(encoding='utf-8'))
     body = '\n\n'.join(_body(ranking, root, options))
-    command = 'python benchmark/learned_policies.py --lerobot ENV/bin/python'
+    given = ('tasks', 'demos', 'starts', 'steps', 'scenes', 'max_chunks')
+    words = (f'--{name.replace("_", "-")} {getattr(options, name)}' for name in given)
+    command = f'python benchmark/learned_policies.py --lerobot ENV/bin/python {" ".join(words)}'
     publish('learned_policies', 'Learned policies', command, body, options, _versions(options))
 
 
@@ -300,6 +305,8 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
     )
     yield '## Agreement with the simulator, over the policies'
     yield from _agreement(ranking, rates)
+    yield '## Rollouts'
+    yield from _rollouts(ranking, root, options)
     yield '## Prediction-powered success rates'
     yield (
         f'{ranking["num_true_for_powered"]} true episodes of each policy, and all imagined ones. '
@@ -346,12 +353,60 @@ def _agreement(ranking: dict[str, Any], rates: dict[str, Any]) -> Iterator[str]:
     )  # fmt: skip
     confusion = ranking['confusion']['imagined']
     yield (
-        'Values with 95 % intervals as `mtv-world rank` gives them, of endless scenes. Rollouts: '
+        'As `mtv-world rank` gives them: value; without the noise of few scenes, with a 95 % '
+        'interval. Rollouts, imagined / true: '
         + ', '.join(f'{key.replace("_", " / ")} {count}' for key, count in confusion.items())
-        + f' (imagined / true); abstained {ranking["abstained"]["imagined"]["abstained"]}; '
-        f'without a result {len(ranking["failed"])}. The no-picture rule cannot answer: it judges '
-        'commands, and these policies choose theirs by what they see.'
+        + f'; abstained {ranking["abstained"]["imagined"]["abstained"]}; without a result '
+        f'{len(ranking["failed"])}.'
     )
+
+
+def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> Iterator[str]:
+    """What looking adds, when the two worlds part, and the rollouts that are judged worst."""
+    results = [
+        result
+        for result in read_results(root / 'ranking')
+        if result.policy in ranking['policies'] and result.index < options.scenes
+    ]
+
+    def right(judged: str) -> str:
+        said = [(getattr(result, judged).probability, result.final) for result in results]
+        return f'{np.mean([(probability >= 0.5) == final for probability, final in said]):.2f}'
+
+    yield (
+        f'Right in how many of the {len(results)} rollouts: imagination {right("imagined")}, the '
+        f"estimator on the simulator's frames {right('seen')}, the no-picture rule "
+        f'{right("no_picture")}. That rule is given the commands of the simulated rollout, which '
+        'these policies choose by what they see: before the robot moves nobody has more of them '
+        'than the first answer, so the rule cannot be asked in the place of imagination.'
+    )
+    parts = [
+        [course.commands_part_s, course.objects_part_s]
+        for course in (result.course for result in results)
+        if course is not None
+    ]
+    shares = [f'{np.isfinite(values).mean():.2f}' for values in np.transpose(parts)]
+    medians = [
+        f'{np.median(values[np.isfinite(values)]):.1f} s' if np.isfinite(values).any() else '-'
+        for values in np.transpose(parts)
+    ]
+    yield (
+        f'The commands of the two worlds part in {shares[0]} of the rollouts (median of those at '
+        f'{medians[0]}), the objects in {shares[1]} (at {medians[1]}).'
+    )
+    worst = sorted(results, key=lambda found: -abs(found.imagined.probability - found.final))
+    yield table(
+        ['worst cases', 'scene', 'simulator', 'imagined', "simulator's frames", 'objects part'],
+        [
+            [
+                found.policy, f'{found.task} {found.index}', str(int(found.final)),
+                f'{found.imagined.probability:.2f}', f'{found.seen.probability:.2f}',
+                '-' if found.course is None or not np.isfinite(found.course.objects_part_s)
+                else f'{found.course.objects_part_s:.1f} s',
+            ]
+            for found in worst[:6]
+        ],
+    )  # fmt: skip
 
 
 def _score(found: dict[str, Any]) -> str:
@@ -371,7 +426,8 @@ def _estimate(found: dict[str, Any]) -> str:
 def _rank_correlation(pairs: Sequence[tuple[float, float]]) -> str:
     if len(pairs) < 3 or any(len({pair[k] for pair in pairs}) < 2 for k in (0, 1)):
         return '-'
-    return f'{spearmanr(*zip(*pairs, strict=True)).statistic:.3f}'
+    found: Any = spearmanr([true for true, _ in pairs], [said for _, said in pairs])
+    return f'{found.statistic:.3f}'
 
 
 def _trained(root: Path, options: argparse.Namespace) -> Iterator[list[str]]:
