@@ -309,8 +309,8 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
     yield from _rollouts(ranking, root, options)
     yield '## Prediction-powered success rates'
     yield (
-        f'{ranking["num_true_for_powered"]} true episodes of each policy, and all imagined ones. '
-        'Saved: how many true trials more would give as narrow an interval alone.'
+        f'The first {ranking["num_true_for_powered"]} true episodes of each policy, at most, and '
+        'all imagined ones. An interval over so few true episodes is wide.'
     )
     yield table(
         ['policy', 'estimate', 'weight of imagination', 'all true ones'],
