@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 import time
@@ -101,8 +101,8 @@ class Take:
     ever: bool
     final: bool
     moved: dict[str, float]
-    missed: str | None
-    any_outcome: bool
+    missed: str | None = None
+    any_outcome: bool = False
     physics_s: float
     rendering_s: float
     object_poses: FloatArray
@@ -147,7 +147,7 @@ def simulate(
         PolicyError: the variant finds no plan.
     """
     started = time.process_time()
-    observations = [sim.reset(seed, task)]
+    first = sim.reset(seed, task)
     rendering = time.process_time() - started
     if variant is None:
         commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
@@ -155,7 +155,35 @@ def simulate(
         policy = ScriptedPolicy(variant, expert, task, sim.scene)
         policy.reset(seed=seed)
         commands = policy.plan
-    measured = [sim.positions()]
+    planning = time.process_time() - started - rendering
+    take = carry_out(sim, task, commands, first, config)
+    return replace(
+        take,
+        missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
+        any_outcome=variant is not None,
+        physics_s=take.physics_s + planning,
+        rendering_s=take.rendering_s + rendering,
+    )
+
+
+def carry_out(
+    sim: SimEpisode,
+    task: Task,
+    commands: JointTrajectory,
+    first: SimObservation,
+    config: RecordConfig,
+) -> Take:
+    """Runs commands open loop, one every control period.
+
+    Args:
+        sim: has just been reset, or given a scene.
+        task: what success is judged by.
+        commands: of every control period.
+        first: what the simulator returned.
+        config: how it is sampled.
+    """
+    started, rendering = time.process_time(), 0.0
+    observations, measured = [first], [sim.positions()]
     last = len(commands.times) - 1
     least = last + round(config.hold_s / CONTROL_PERIOD_S)
     num_frames = next(n for n in count(1) if config.frame_at(n) >= least)
@@ -178,8 +206,6 @@ def simulate(
             role: float(np.linalg.norm(centres[-1] - centres[0]))
             for role, centres in situation.positions.items()
         },
-        missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
-        any_outcome=variant is not None,
         physics_s=time.process_time() - started - rendering,
         rendering_s=rendering,
         object_poses=sim.seen_poses(),
