@@ -40,7 +40,7 @@ fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints
 kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour); prints a table
 	$(BIN)/python test/robustness/kills.py
 
-soak: $(STAMP)  ## many rollouts with faults (hours); memory, threads, latency under out/soak/
+soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python test/robustness/soak.py
 
 format: $(STAMP)  ## sort imports and format the code
