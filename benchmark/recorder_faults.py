@@ -217,12 +217,14 @@ def main() -> int:
     ]  # fmt: skip
     logs = [f'## {name}\n\n```\n{own[0].log}```' for name, own in runs.items()]
     body = (
-        f'{table(head, rows)}\n\nSums over n, and the longest of n. Published all the time: joint states at 100 Hz and images of '
-        f'30 kB at 50 Hz; {options.busy} processes that only compute beside it. Due = sent after '
+        f'{table(head, rows)}\n\nSums over n, and the longest of n. Published all the time: joint '
+        f'states at 100 Hz and images of 30 kB at 50 Hz; {options.busy} processes that only '
+        'compute beside it. Due = sent after '
         '`recording` was said, up to the last message in the bag, which is at most so old when '
         'the recorder is killed, told to stop, or finds the disk full. Missing = due and not in '
         'the bag; older = sent more than a second before. Closed, ended = after the signal. Every '
-        f'bag was read with rosbags.\n\nThe first log of each, folder left out.\n\n{chr(10).join(logs)}'
+        'bag was read with rosbags.\n\nThe first log of each, folder left out.\n\n'
+        f'{chr(10).join(logs)}'
     )
     body = body.replace(f'{folder}/', '')
     publish(

@@ -1,10 +1,10 @@
 """Soak of the node: rollouts with faults injected, while memory, threads and latency are watched.
 
-`make soak` runs 10,000 rollouts (an hour); `--rollouts N` fewer. Between plans, images are damaged,
-joints jump, names repeat, the model crashes, runs out of memory or is pre-empted, subscribers come
-and go, and every now and then the node is killed and started again. Every plan must get exactly
-one end. Writes `soak.csv`, `soak.png` and a summary; the exit status is 1 if an end is missing or
-doubled, the node died by itself, or memory grows.
+`make soak` runs 10,000 rollouts (an hour); `--rollouts N` fewer. Between plans, images are
+damaged, joints jump, names repeat, the model crashes, runs out of memory or is pre-empted,
+subscribers come and go, and every now and then the node is killed and started again. Every plan
+must get exactly one end. Writes `soak.csv`, `soak.png` and a summary; the exit status is 1 if an
+end is missing or doubled, the node died by itself, or memory grows.
 """
 
 from __future__ import annotations
