@@ -9,7 +9,7 @@ import subprocess
 from std_srvs.srv import Trigger
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.processes import how_it_ended, module_command, start_process, stop_process
+from mtv_world_ros.processes import last_line, module_command, start_process, stop_process
 from mtv_world_ros.ros.peers import Peers
 
 _VIEW_TOPICS = ('predicted/image_raw', 'predicted/camera_info')
@@ -67,7 +67,8 @@ class Recording:
             EpisodeError: it ended, e.g. because the disk is full.
         """
         if self._process is not None and self._process.poll() is not None:
-            raise EpisodeError(how_it_ended('recorder', self._process, self._log.parent))
+            status, text = self._process.returncode, last_line(self._log, 'its log is empty')
+            raise EpisodeError(f'the recorder ended with status {status}: {text}')
 
     def end(self) -> None:
         """Lets the recorder take what is still on its way, and waits for the closed bag.

@@ -249,4 +249,4 @@ def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
     os.kill(int(recorder), signal.SIGKILL)
     assert runner.wait(5) == 1
     last = stack.runner.output().splitlines()[-1]
-    assert last.startswith("EpisodeError: 'recorder' ended with status -9: ")
+    assert last.startswith('EpisodeError: the recorder ended with status -9: ')
