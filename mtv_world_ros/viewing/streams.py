@@ -24,6 +24,8 @@ from mtv_world_ros.errors import EpisodeError, MtvWorldError
 
 #: kinds of frames, in the order in which they are shown
 KINDS = ('real', 'trajectory', 'imagined')
+#: no recording is this long [s]
+_APART_S = 86_400.0
 #: camera images of a view, or what the node publishes of it; also what imagination starts from
 _IMAGES = re.compile(
     r'^/(?:.+/)?(?P<view>(?!(?:predicted|trajectory|mask)/)[^/]+)/'
@@ -71,7 +73,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     """Reads episodes and predictions; those of one time belong together.
 
     Raises:
-        EpisodeError: one cannot be read, or none holds an image.
+        EpisodeError: one cannot be read, none holds an image, or they are more than a day apart.
     """
     streams = Streams()
     for bag in bags:
@@ -83,6 +85,13 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     if not streams.images:
         raise EpisodeError(
             f"'{', '.join(map(str, bags))}' holds no images of cameras or of a node"
+        )
+    times = [item[0] for found in streams.images.values() for item in found]
+    apart_s = (max(times) - min(times)) / 1e9
+    if len(bags) > 1 and apart_s > _APART_S:
+        raise EpisodeError(
+            f"'{', '.join(map(str, bags))}' are of different times, {apart_s:.0f} s from the "
+            'first image to the last; give one of them, or predictions of the same recording'
         )
     for found in (*streams.images.values(), *streams.masks.values()):
         found.sort(key=lambda item: item[0])

@@ -21,14 +21,14 @@ EPISODE = share_path('resource', 'demo_episode')
 START_NS = 1_700_000_000_000_000_000
 
 
-def write_predictions(path: Path) -> Path:
+def write_predictions(path: Path, start_ns: int = START_NS) -> Path:
     """A bag under the node's topics, of the episode's time."""
     frame = np.full((72, 96, 3), 90, np.uint8)
     labels = np.zeros((72, 96), np.uint8)
     labels[10:20, 30:50] = 2
     with BagWriter(path) as writer:
         for k in range(3):
-            stamp = START_NS + k * 200_000_000
+            stamp = start_ns + k * 200_000_000
             header = messages.make_header(stamp, 'low')
             for stream in ('predicted', 'trajectory'):
                 image = messages.make(
@@ -71,6 +71,13 @@ def test_an_episode_and_its_predictions_are_of_one_time(tmp_path: Path) -> None:
     assert [value for _, value in streams.success] == [0.75]
     assert any(text.startswith('instruction: ') for _, text in streams.words)
     assert {kind for kind, *_ in streams.joints} == {'real'}
+
+
+def test_bags_of_different_times_are_refused(tmp_path: Path) -> None:
+    later = write_predictions(tmp_path / 'later', START_NS + 10**15)
+    with pytest.raises(EpisodeError, match='of different times, 1000000 s .*; give one of them'):
+        read_streams([EPISODE, later])
+    assert read_streams([later]).views == ('low',)
 
 
 def test_a_bag_without_images_is_refused(tmp_path: Path) -> None:
