@@ -90,12 +90,11 @@ def main() -> None:
         if step in save_at or step % 100 == 0:
             now = spent + time.process_time() - began
             _keep(state, policy, optimizer, schedule, step, now)
-        if step in save_at or step % 100 == 0:
             explained = _explained(policy, before, held, options)
             print(f'step {step} explained {explained}', flush=True)
-        if step in save_at:
-            card = {'step': step, 'cpu_s': now, 'loss': float(np.mean(losses[-25:]))}
-            _save(options.out / f'{step:06d}', policy, before, after, card | explained)
+            if step in save_at:
+                card = {'step': step, 'cpu_s': now, 'loss': float(np.mean(losses[-25:]))}
+                _save(options.out / f'{step:06d}', policy, before, after, card | explained)
 
 
 def thaw(policy: ACTPolicy) -> None:
