@@ -46,6 +46,9 @@ _LOOK_PERIOD_S = 0.05
 class Recorder(Node):
     """Subscribes to topics as their publishers offer them and writes what comes.
 
+    A topic of which nothing comes although it has a publisher is named in a warning: a publisher
+    may reach a new subscription late, e.g. while it still serves one that was killed.
+
     Args:
         options: of the command line, see `parse`.
         name: of the node.
@@ -53,6 +56,9 @@ class Recorder(Node):
     Raises:
         EpisodeError: the folder exists already or cannot be written.
     """
+
+    #: a topic that brings nothing for this long after 'recording' was said is named [s]
+    silent_after_s = 2.0
 
     def __init__(self, options: argparse.Namespace, name: str = 'recorder') -> None:
         super().__init__(name)
@@ -65,7 +71,8 @@ class Recorder(Node):
         self._next_flush_s = 0.0
         self._num_lost: Counter[str] = Counter()
         self._end_s = float('inf')
-        self._is_announced = False
+        self._announced_s = float('inf')
+        self._silent: set[str] = set()
         self._counts: Counter[str] = Counter()
         self._last_stamp_ns = 0
         self.last_message_s = 0.0
@@ -107,11 +114,12 @@ class Recorder(Node):
         writer, self._writer = self._writer, None
         if writer is None:
             return
-        if not (writer.num_messages or self._is_announced):
+        if not (writer.num_messages or self._is_announced()):
             writer.abort()
             return
         writer.close()
-        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(self._counts.items()))
+        counts = {topic: self._counts[topic] for topic, *_ in self._declared}
+        counted = ', '.join(f'{topic} {number}' for topic, number in sorted(counts.items()))
         self._counts.clear()
         self.get_logger().info(f"recorded '{writer.path}': {counted or 'nothing'}")
         if self._num_lost:
@@ -127,6 +135,8 @@ class Recorder(Node):
         if self._writer is not None and time.monotonic() > self._next_flush_s:
             self._next_flush_s = time.monotonic() + _FLUSH_PERIOD_S
             self._writer.flush()
+        if time.monotonic() > self._announced_s + self.silent_after_s:
+            self._name_silent()
 
     def _on_signal(self, *_: object) -> None:
         self._stopping = True
@@ -146,10 +156,24 @@ class Recorder(Node):
     def _announce(self) -> None:
         """Says so, once every subscription is connected."""
         connected = (s.get_publisher_count() for s in self._taken)
-        if not self._is_announced and all(connected):
-            self._is_announced = True
-            self._end_s = time.monotonic() + self._options.duration
+        if not self._is_announced() and all(connected):
+            self._announced_s = time.monotonic()
+            self._end_s = self._announced_s + self._options.duration
             self.get_logger().info('recording')
+
+    def _is_announced(self) -> bool:
+        return self._announced_s < float('inf')
+
+    def _name_silent(self) -> None:
+        """Names the topics that brought nothing so far, once; what they bring is said then."""
+        self.silent_after_s = float('inf')
+        self._silent = {s.topic_name for s in self._taken if not self._counts[s.topic_name]}
+        if self._silent:
+            self.get_logger().warning(
+                f'nothing came of {", ".join(sorted(self._silent))} in the '
+                f"{time.monotonic() - self._announced_s:.1f} s since 'recording'; if anything was "
+                'published there, it is not in the bag'
+            )
 
     def _check_patience(self, waited_s: float) -> None:
         if self._pending and waited_s > self._options.wait_timeout:
@@ -197,6 +221,10 @@ class Recorder(Node):
                     self._last_stamp_ns = stamp_ns if leads else self._last_stamp_ns
             self._writer.write_raw(topic, msgtype, stamp_ns, data, publish_ns=now_ns)
             self._counts[topic] += 1
+            if topic in self._silent:
+                self._silent.remove(topic)
+                waited_s = time.monotonic() - self._announced_s
+                self.get_logger().info(f"{topic} began {waited_s:.1f} s after 'recording'")
             if topic not in _ENDLESS:
                 self.last_message_s = time.monotonic()
 

@@ -22,6 +22,8 @@ _LONGEST_DRAIN_S = 10.0
 class EpisodeRecorder(Recorder):
     """Writes `<out>/episode_00000` and so on; a bag appears there when it is complete."""
 
+    silent_after_s = float('inf')  # nothing comes before an episode begins
+
     def _open(self) -> BagWriter | None:
         self._number = 0
         self._end_before_s = float('inf')

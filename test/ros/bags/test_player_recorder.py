@@ -2,6 +2,8 @@
 
 import os
 from pathlib import Path
+import re
+import select
 import signal
 import subprocess
 import sys
@@ -319,6 +321,27 @@ def test_a_killed_recorder_loses_no_more_than_a_second(recorded, tmp_path):
     assert age_s < 1.0
     with AnyReader([tmp_path / 'bag']) as read:
         assert read.message_count == len(stamps)
+
+
+def test_a_topic_that_brings_nothing_is_named_and_so_is_its_beginning(launch, tmp_path, client):
+    out = tmp_path / 'bag'
+    talks, mute, late = (
+        client.node.create_publisher(String, f'/{name}', 10) for name in ('talks', 'mute', 'late')
+    )
+    recorder = launch('recorder', out, '/talks', '/mute', '/late')
+    for publisher in (talks, mute, late):
+        client.wait(publisher.get_subscription_count, 'the recorder')
+    lines = []
+    while not (lines and 'nothing came of' in lines[-1]):
+        talks.publish(String(data='a'))
+        if select.select([recorder.stdout], [], [], 0.1)[0]:
+            lines.append(recorder.stdout.readline())
+    assert 'nothing came of /late, /mute in the 2.' in lines[-1]
+    late.publish(String(data='b'))
+    assert re.search(r"/late began \d+\.\d s after 'recording'", recorder.stdout.readline())
+    code, said = finish(recorder, signal.SIGINT)
+    assert code == 0
+    assert re.search(r'/late 1, /mute 0, /talks \d+$', said.strip()), said
 
 
 def is_alive(pid):
