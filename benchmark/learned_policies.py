@@ -2,14 +2,14 @@
 
     python benchmark/learned_policies.py --lerobot ENV/bin/python [--data out/learned]
         [--tasks shake_bottle,place_cup_plate,place_bread_plate] [--demos 150] [--starts 1000]
-        [--steps 2400] [--scenes 20] [--workers 1] [--until rank] [--checkpoint bundled]
+        [--steps 800] [--scenes 20] [--workers 1] [--until rank] [--checkpoint bundled]
         [--out benchmark/results]
 
 From an empty folder to a ranking: collects demonstrations of every task, exports them as LeRobot
 datasets, and renders the first frames of more scenes, whose commands are the expert's plan; trains
-LeRobot's ACT on all tasks at once (act_training.py, in LeRobot's environment, see
+LeRobot's ACT on each task (act_training.py, in LeRobot's environment, see
 requirements/lerobot.txt); and ranks the checkpoints, served by LeRobot's own policy server, with
-`mtv-world rank`, each in every task. Every command is printed before it runs. The same command
+`mtv-world rank`, each in its task. Every command is printed before it runs. The same command
 goes on where it was stopped; what exists is not made again, so checkpoints can be ranked while
 others are missing.
 """
@@ -46,7 +46,7 @@ from mtv_world_ros.sim.collect.record import expert_generator
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.world.simulator import SimEpisode
 
-#: one arm moves one object, which its shape tells: ACT reads no instruction
+#: one arm moves one object: ACT reads no instruction
 TASKS = 'shake_bottle,place_cup_plate,place_bread_plate'
 STAGES = ('collect', 'pack', 'train', 'rank')
 #: of the demonstrations, and of further first frames; the ranking has scenes of its own
@@ -61,7 +61,7 @@ TRAINER = Path(__file__).parent / 'act_training.py'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """One training run on all tasks.
+    """One training run, of which every task has its own.
 
     Attributes:
         name: of its folder.
@@ -113,7 +113,8 @@ def main() -> None:
     if 'train' in stages:
         for run in RUNS:
             if run.name in options.runs.split(','):
-                _train(root, tasks, run, options)
+                for task in tasks:
+                    _train(root, task, run, options)
     if 'rank' in stages:
         _rank(root, tasks, options)
 
@@ -125,7 +126,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--runs', default=','.join(run.name for run in RUNS))
     parser.add_argument('--demos', type=int, default=150, help='demonstrations of each task')
     parser.add_argument('--starts', type=int, default=1000, help='more first frames of each task')
-    parser.add_argument('--steps', type=int, default=2400, help='training steps of the full run')
+    parser.add_argument('--steps', type=int, default=800, help='training steps of the full run')
     parser.add_argument('--scenes', type=int, default=20, help='of each task, for the ranking')
     parser.add_argument('--max-chunks', type=int, default=2, help='answers of a policy at most')
     parser.add_argument('--workers', type=int, default=1, help='of the ranking; .6 GB a policy')
@@ -217,22 +218,22 @@ def _demonstrated(dataset: Path) -> dict[str, Any]:
 _STAGES = {'collect': _collect, 'pack': _pack}
 
 
-def _train(root: Path, tasks: Sequence[str], run: Run, options: argparse.Namespace) -> None:
+def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None:
     """Trains to the end; goes on where it was stopped."""
     steps = [_step(at, options) for _, at in run.ranked]
-    if _checkpoint(root, run.name, steps[-1]).exists():
+    if _checkpoint(root, task, run.name, steps[-1]).exists():
         return
-    words = [options.lerobot, str(TRAINER), '--out', str(root / 'runs' / run.name)]
-    words += ['--data', *(str(_samples(root, task)) for task in tasks)]
+    words = [options.lerobot, str(TRAINER), '--out', str(root / 'runs' / task / run.name)]
+    words += ['--data', str(_samples(root, task))]
     words += ['--views', ','.join(SEEN), '--size', SEEN_SIZE, '--rate', f'{run.rate:g}']
     words += ['--steps', str(_step(run.sixteenths, options))]
     words += ['--save-at', ','.join(map(str, steps)), '--asked', f'{run.asked:g}']
     words += ['--share', str(run.share), '--late', str(run.late), '--seed', str(options.seed)]
     if run.begin:
         name, at = run.begin
-        words += ['--begin', str(_checkpoint(root, name, _step(at, options)))]
-    (root / 'runs').mkdir(parents=True, exist_ok=True)
-    _call(words, log=root / f'runs/{run.name}.log')
+        words += ['--begin', str(_checkpoint(root, task, name, _step(at, options)))]
+    (root / 'runs' / task).mkdir(parents=True, exist_ok=True)
+    _call(words, log=root / f'runs/{task}/{run.name}.log')
 
 
 def _rank(root: Path, tasks: Sequence[str], options: argparse.Namespace) -> None:
@@ -249,6 +250,7 @@ def _rank(root: Path, tasks: Sequence[str], options: argparse.Namespace) -> None
             'rank', '--policies', str(root / name), '--episodes', str(options.scenes),
             '--max-chunks', str(options.max_chunks), '--seed', str(SCENE_SEED),
             '--workers', str(options.workers), '--checkpoint', options.checkpoint,
+            '--threads', '1',
             *([] if options.clips else ['--no-clips']), '--out', str(root / 'ranking'),
         )  # fmt: skip
     options.repeats = options.scenes
@@ -266,7 +268,7 @@ def _policies(root: Path, task: str, options: argparse.Namespace) -> Iterator[di
     size = {'width': WIDTH, 'height': HEIGHT}
     for run in RUNS:
         for name, sixteenth in run.ranked:
-            path = _checkpoint(root, run.name, _step(sixteenth, options))
+            path = _checkpoint(root, task, run.name, _step(sixteenth, options))
             if not path.exists():
                 continue
             yield {
@@ -290,10 +292,10 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
     rates = {name: found['rates']['all tasks'] for name, found in ranking['policies'].items()}
     yield (
         f"LeRobot's ACT (ResNet-18 from random weights, view {' and '.join(SEEN)} at {SEEN_SIZE} "
-        f'px, {FPS} Hz, answers of {CHUNK / FPS:g} s), one run on all tasks: {options.demos} '
-        f'demonstrations and the first frames of {options.starts} more scenes of each, '
-        f'{options.steps} steps of 64. Every checkpoint is asked in every task; '
-        f'{options.scenes} scenes of each task (seed {SCENE_SEED}; the demonstrations have '
+        f'px, {FPS} Hz, answers of {CHUNK / FPS:g} s), runs of its own for every task: '
+        f'{options.demos} demonstrations and the first frames of {options.starts} more scenes, '
+        f'schedule of {options.steps} steps of 64. {options.scenes} scenes of each task (seed '
+        f'{SCENE_SEED}; the demonstrations have '
         f'{SEED}), {options.max_chunks} answers an episode.'
     )
     yield table(
@@ -326,7 +328,8 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
         'the first frame (the grasp) and 1.6 s after later ones.'
     )
     header = ['checkpoint', 'steps of its run', 'CPU min', 'loss', 'explained, grasp']
-    yield table([*header, 'explained, later'], list(_trained(root, options)))
+    trained = [row for task in options.tasks.split(',') for row in _trained(root, task, options)]
+    yield table([*header, 'explained, later'], trained)
     speed = [[name, f'{value:.2f}'] for name, value in ranking['speed'].items()]
     yield table(['speed of one process, wall', ''], speed)
 
@@ -430,16 +433,17 @@ def _rank_correlation(pairs: Sequence[tuple[float, float]]) -> str:
     return f'{found.statistic:.3f}'
 
 
-def _trained(root: Path, options: argparse.Namespace) -> Iterator[list[str]]:
+def _trained(root: Path, task: str, options: argparse.Namespace) -> Iterator[list[str]]:
     """What the cards of the checkpoints say."""
     for run in RUNS:
         for name, sixteenth in run.ranked:
-            card = _checkpoint(root, run.name, _step(sixteenth, options)) / 'training.json'
+            card = _checkpoint(root, task, run.name, _step(sixteenth, options)) / 'training.json'
             if card.exists():
                 values: Mapping[str, float] = json.loads(card.read_text(encoding='utf-8'))
                 shares = (f'{values[key]:.3f}' for key in ('grasp', 'later'))
                 minutes = f'{values["cpu_s"] / 60:.1f}'
-                yield [name, f'{values["step"]}', minutes, f'{values["loss"]:.3f}', *shares]
+                steps, loss = f'{values["step"]}', f'{values["loss"]:.3f}'
+                yield [f'{task}_{name}', steps, minutes, loss, *shares]
 
 
 def _share(found: dict[str, Any]) -> str:
@@ -465,8 +469,8 @@ def _step(sixteenths: int, options: argparse.Namespace) -> int:
     return options.steps * sixteenths // 16
 
 
-def _checkpoint(root: Path, run: str, step: int) -> Path:
-    return root / 'runs' / run / f'{step:06d}'
+def _checkpoint(root: Path, task: str, run: str, step: int) -> Path:
+    return root / 'runs' / task / run / f'{step:06d}'
 
 
 def _versions(options: argparse.Namespace) -> str:

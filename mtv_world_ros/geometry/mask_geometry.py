@@ -10,10 +10,12 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
-from mtv_world_ros.geometry.camera import project, triangulate
+from mtv_world_ros.geometry.camera import project, triangulate, unproject
 
 #: error of the centroid of a small mask [px]
 CENTROID_NOISE_PX = 0.3
+#: holds back the lean that no view sees; squared shares of a view that sees it wholly
+_RIDGE = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +102,38 @@ def block_size(
     return float(np.median(sizes)) if sizes else float('nan')
 
 
+def lean(
+    cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], masks: Sequence[BoolArray]
+) -> FloatArray:
+    """Returns the horizontal part (2,) of the unit vector along an object's long axis, upwards.
+
+    A mask's long axis and the camera span a plane that the axis lies in. Its lean is the least one
+    that fits the planes of all views; a round mask tells none.
+
+    Args:
+        cameras: V of them.
+        T_base_camera: V of (4, 4).
+        masks: V of (H, W), not empty.
+    """
+    planes = np.array([_plane(*view) for view in zip(cameras, T_base_camera, masks, strict=True)])
+    level, up = planes[:, :2], planes[:, 2]
+    slope = np.linalg.solve(level.T @ level + _RIDGE * np.eye(2), -level.T @ up)
+    return np.asarray(slope / np.hypot(1.0, np.linalg.norm(slope)))
+
+
+def _plane(camera: CameraModel, T_base_camera: FloatArray, mask: BoolArray) -> FloatArray:
+    """Normal (3,) of the plane through the camera and the long axis; longer for long masks."""
+    moments = cv2.moments(mask.view(np.uint8), binaryImage=True)
+    centre = np.array([moments['m10'], moments['m01']]) / moments['m00']
+    wide, slanted = moments['mu20'] - moments['mu02'], 2 * moments['mu11']
+    angle = 0.5 * np.arctan2(slanted, wide)
+    # two pixels of the axis as rays, which lenses do not bend
+    ends = centre + np.outer([-2.0, 2.0], [np.cos(angle), np.sin(angle)])
+    normal = np.cross(*(unproject(camera, ends) @ T_base_camera[:3, :3].T))
+    length = np.hypot(wide, slanted) / max(moments['mu20'] + moments['mu02'], 1e-9)
+    return np.asarray(normal / np.linalg.norm(normal) * length)
+
+
 def moved_mask(
     mask: BoolArray,
     camera: CameraModel,
@@ -126,6 +160,11 @@ def moved_mask(
 def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
     """Distance along the optical axis [m]."""
     return float(T_base_camera[:3, 2] @ (point - T_base_camera[:3, 3]))
+
+
+def widest_swing(leans: FloatArray) -> FloatArray:
+    """Returns (T,) the leans (T, 2) along the direction in which they differ most."""
+    return np.asarray(leans @ np.linalg.svd(leans - leans.mean(0))[2][0])
 
 
 def count_reversals(angles: FloatArray, swing: float) -> FloatArray:

@@ -8,7 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.geometry.mask_geometry import block_size, count_reversals, Location
+from mtv_world_ros.geometry.mask_geometry import (
+    block_size,
+    count_reversals,
+    Location,
+    widest_swing,
+)
 from mtv_world_ros.success.goal_pictures import Picture, PictureMasks
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.success.views import Views
@@ -88,16 +93,14 @@ class ImaginedScene:
         return np.interp(frames, frames[known], heights[known])
 
     def reversals(self, role: str, swing: float) -> FloatArray:
-        """See `Situation`; what the view tells that shows most of them."""
-        found = np.zeros(self.views.memory.leans.shape[2])
-        for leans in self.views.memory.leans[:, self.item(role)]:
-            known = np.isfinite(leans)
-            if known.any():
-                counts = count_reversals(np.unwrap(leans[known], period=np.pi), swing)
-                last_known = np.cumsum(known)
-                counts = np.concatenate([[0.0], counts])[last_known]
-                found = max(found, counts, key=lambda values: values[-1])
-        return found
+        """See `Situation`; by the long axis of the object's masks."""
+        leans = self.views.memory.leans[self.item(role)]
+        known = np.isfinite(leans[:, 0])
+        if not known.any():
+            return np.zeros(len(leans))
+        along = widest_swing(leans[known])
+        counts = count_reversals(np.unwrap(np.arcsin(along), period=np.pi), swing)
+        return np.concatenate([[0.0], counts])[np.cumsum(known)]
 
     def pictured(self, role: str, pictures: Mapping[str, Picture]) -> BoolArray:
         """Returns (V, H, W) masks of an object in pictures; empty where a view has none."""

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
 
 from mtv_world_ros.config import expected, Schema, wrong
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.situation import Situation
 
@@ -24,6 +24,9 @@ FLOOR_M = 0.005
 OVER_WALL_M = 0.03
 #: a J, or a share of an area, that counts as one in the margins
 _SOFT_SHARE = 0.1
+#: swings that are told apart, and what counts as one in their margin, in swings that are wanted
+_SWINGS = (0.25, 0.5, 0.625, 0.75, 0.875, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
+_SOFT_SWING = 0.25
 
 #: a placeholder, and where the centre (3,) of its object should be at the end [m]
 Goal = tuple[str, FloatArray]
@@ -395,14 +398,27 @@ class Shaken(Relation):
     min_swing_rad: _Angle = 0.15
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds; a reversal more or less counts as two."""
+        """Returns by how much each condition holds; how wide the swings were, to `_SWINGS`."""
         room = at.clearances(self.subject) - self.min_lift_m
-        turns = np.diff(at.reversals(self.subject, self.min_swing_rad), prepend=0.0)
-        counted = np.cumsum(turns * (room > 0)) - self.num_reversals + 0.5
+        swings = self.min_swing_rad * np.array(_SWINGS)
+        enough = np.array([self._reversed(at, swing, room > 0) for swing in swings])
+        wide = _SWINGS.index(1.0)
+        # those that are narrower, or wider, than wanted; a swing lies halfway to the next
+        below, above = enough[:wide].sum(0), wide + enough[wide:].sum(0)
+        reached = np.where(enough[wide], above, below)
+        halfway = (np.append(0.0, swings) + np.append(swings, 2 * swings[-1])) / 2
         return [
             Margin('lifted', np.maximum.accumulate(room)),
-            Margin('swung to and fro', counted, 'reversals', 0.5),
-        ]
+            Margin(
+                'swung to and fro', halfway[reached] - self.min_swing_rad, 'rad',
+                _SOFT_SWING * self.min_swing_rad,
+            ),
+        ]  # fmt: skip
+
+    def _reversed(self, at: Situation, swing: float, is_lifted: BoolArray) -> BoolArray:
+        """(T,) whether there were enough reversals, each by more than a swing."""
+        turns = np.diff(at.reversals(self.subject, swing), prepend=0.0)
+        return np.asarray(np.cumsum(turns * is_lifted) >= self.num_reversals)
 
 
 class AsPictured(Relation):

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
+from mtv_world_ros.geometry.mask_geometry import centroids, lean, locate_all
 from mtv_world_ros.geometry.robot import RobotModel
 
 #: frames whose places are kept; the start is kept whatever follows
@@ -108,7 +107,8 @@ class RolloutMemory:
         start_masks: of the rollout's first frame (T = 1).
         start_poses: (V, 4, 4) T_base_camera then.
         points: (O, N, 3) centres, NaN where fewer than two views know one [m].
-        leans: (V, O, N) angles of the masks' long axes in the image [rad].
+        leans: (O, N, 2) x and y of unit vectors along the objects' long axes, NaN where no view
+            knows one.
         seen_masks: (V, O, H, W) last masks in which an object was not hidden.
         seen_points: (O, 3) where it was then [m].
         largest: (V, O) largest area of each mask so far [px].
@@ -159,12 +159,12 @@ def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
 
 def _begin(footage: Footage) -> RolloutMemory:
     masks = footage.frame_masks(0)
-    points, leans = _points(footage, 0), _leans(masks, footage.known(0))
+    points, leans = _points(footage, 0), _leans(footage, 0)
     memory = RolloutMemory(
         start_masks=footage.start_masks,
         start_poses=footage.poses[:, 0],
         points=points[:, None],
-        leans=leans[:, :, None],
+        leans=leans[:, None],
         seen_masks=masks,
         seen_points=points,
         largest=masks.sum((-2, -1)).astype(np.float64),
@@ -190,9 +190,9 @@ def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMem
     unhidden = known.all(0) & (area >= UNHIDDEN_SHARE * largest).all(0)
     unhidden &= np.isfinite(points[:, 0])
     trail = np.concatenate([memory.points, points[:, None]], axis=1)
-    leans = np.concatenate([memory.leans, _leans(masks, known)[:, :, None]], axis=2)
+    leans = np.concatenate([memory.leans, _leans(footage, frame)[:, None]], axis=1)
     if trail.shape[1] > MAX_FRAMES:  # drops the oldest but the start
-        trail, leans = np.delete(trail, 1, axis=1), np.delete(leans, 1, axis=2)
+        trail, leans = np.delete(trail, 1, axis=1), np.delete(leans, 1, axis=1)
     return replace(
         memory,
         points=trail,
@@ -277,12 +277,12 @@ def _points(footage: Footage, frame: int) -> FloatArray:
     return locate_all(footage.cameras, tuple(footage.poses[:, frame]), pixels)
 
 
-def _leans(masks: BoolArray, known: BoolArray) -> FloatArray:
-    """(V, O) angles of the long axes from the image's vertical, in (-pi/2, pi/2] [rad]."""
-    leans = np.full(masks.shape[:2], np.nan)
-    for view, item in zip(*np.nonzero(known), strict=True):
-        moments = cv2.moments(masks[view, item].view(np.uint8), binaryImage=True)
-        leans[view, item] = 0.5 * np.arctan2(
-            -2 * moments['mu11'], moments['mu02'] - moments['mu20']
-        )
+def _leans(footage: Footage, frame: int) -> FloatArray:
+    """(O, 2) leans of the long axes, NaN where no view knows one."""
+    masks, known = footage.frame_masks(frame), footage.known(frame)
+    leans = np.full((known.shape[1], 2), np.nan)
+    for item in np.flatnonzero(known.any(0)):
+        views = np.flatnonzero(known[:, item])
+        cameras = [footage.cameras[view] for view in views]
+        leans[item] = lean(cameras, footage.poses[views, frame], masks[views, item])
     return leans

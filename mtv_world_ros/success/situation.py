@@ -9,7 +9,7 @@ from typing import Protocol, TYPE_CHECKING
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.geometry.mask_geometry import count_reversals
+from mtv_world_ros.geometry.mask_geometry import count_reversals, widest_swing
 
 if TYPE_CHECKING:
     from mtv_world_ros.success.goal_pictures import Picture
@@ -119,9 +119,7 @@ class TruePoses:
     def reversals(self, role: str, swing: float) -> FloatArray:
         """See `Situation`; the lean is that of the object's z axis, where it swings most."""
         axis = self.rotations[role][:, :, 2]
-        lean = axis[:, :2]
-        direction = np.linalg.svd(lean - lean.mean(0))[2][0]
-        return count_reversals(np.arctan2(lean @ direction, axis[:, 2]), swing)
+        return count_reversals(np.arctan2(widest_swing(axis[:, :2]), axis[:, 2]), swing)
 
     def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
         """See `Situation`; there are no masks."""

@@ -124,10 +124,10 @@ def test_memory_is_bounded_and_keeps_the_start():
     memory = remember(None, shown)
     first = memory.points[:, 0]
     trail = np.concatenate([memory.points, np.zeros((2, MAX_FRAMES, 3))], axis=1)
-    leans = np.concatenate([memory.leans, np.zeros((2, 2, MAX_FRAMES))], axis=2)
-    memory = replace(memory, points=trail[:, :MAX_FRAMES], leans=leans[:, :, :MAX_FRAMES])
+    leans = np.concatenate([memory.leans, np.zeros((2, MAX_FRAMES, 2))], axis=1)
+    memory = replace(memory, points=trail[:, :MAX_FRAMES], leans=leans[:, :MAX_FRAMES])
     memory = remember(memory, shown)
-    assert memory.points.shape[1] == memory.leans.shape[2] == MAX_FRAMES
+    assert memory.points.shape[1] == memory.leans.shape[1] == MAX_FRAMES
     assert (memory.points[:, 0] == first).all()
 
 
