@@ -281,8 +281,8 @@ def _leans(footage: Footage, frame: int) -> FloatArray:
     """(O, 2) leans of the long axes, NaN where no view knows one."""
     masks, known = footage.frame_masks(frame), footage.known(frame)
     leans = np.full((known.shape[1], 2), np.nan)
-    for item in np.flatnonzero(known.any(0)):
+    for item in map(int, np.flatnonzero(known.any(0))):
         views = np.flatnonzero(known[:, item])
-        cameras = [footage.cameras[view] for view in views]
+        cameras = [footage.cameras[int(view)] for view in views]
         leans[item] = lean(cameras, footage.poses[views, frame], masks[views, item])
     return leans
