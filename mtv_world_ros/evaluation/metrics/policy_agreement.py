@@ -20,9 +20,11 @@ from mtv_world_ros.evaluation.metrics.statistics import (
 
 #: fewer policies than this have no interval of r or MMRV
 MIN_POLICIES = 3
-#: of the posterior beyond either end of an interval; with .025 an interval held the truth too
-#: rarely at 4 to 8 scenes (`benchmark/interval_coverage.py`)
-_TAIL = 0.0125
+#: of the posterior below and above an interval; with .025 an interval held the truth too rarely
+#: (`benchmark/interval_coverage.py`)
+_TAILS = (0.0125, 0.0125)
+#: the same of r where policies have few episodes, up to so many; from many on, it is as above
+_TAILS_OF_FEW, _FEW, _MANY = (0.0075, 0.0025), 20, 60
 
 
 def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray) -> float:
@@ -109,12 +111,20 @@ def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRat
         middle, interval = np.nan, UNKNOWN
         if draws is not None and np.isfinite(observed[name]):
             values = score_of_draws(*draws)
-            low, high = (float(end) for end in np.quantile(values, (_TAIL, 1 - _TAIL)))
+            below, above = _TAILS if name == 'mmrv' else _tails_of_pearson(true)
+            low, high = (float(end) for end in np.quantile(values, (below, 1 - above)))
             low, high = min(low, observed[name]), max(high, observed[name])
             if low < high:
                 middle, interval = float(np.median(values)), (low, high)
         found[name] = ScoreOfRates(observed=observed[name], noise_free=middle, interval=interval)
     return found
+
+
+def _tails_of_pearson(true: FloatArray) -> FloatArray:
+    episodes = float(np.median(np.isfinite(true).sum(axis=(1, 2))))
+    return _TAILS_OF_FEW + np.interp(episodes, (_FEW, _MANY), (0, 1)) * np.subtract(
+        _TAILS, _TAILS_OF_FEW
+    )
 
 
 def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:

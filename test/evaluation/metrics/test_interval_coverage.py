@@ -52,9 +52,9 @@ def test_differences_and_areas_hold_the_truth_in_both_populations(benchmark, nam
 
 @pytest.mark.parametrize('differs', [False, True])
 def test_r_and_mmrv_hold_the_truth_in_both_populations(benchmark, differs):
-    """93 to 97 % is the aim; the page says what is reached (r: 90 % at 4 scenes, 99 % if mild)."""
+    """93 to 97 % is the aim; the page says what is reached (r: 93 % at 4 scenes, 99 % if mild)."""
     found = [benchmark.ranking_scores(num, 40, 7, differs) for num in benchmark.SIZES]
     for name, least in (('pearson', -1.0), ('mmrv', 0.0)):
         scores = [one for by_size in found for one in by_size[name]]
         assert all(least <= s.interval[0] < s.interval[1] <= 1.0 for s, _ in scores)
-        assert (0.88 if differs else 0.93) <= benchmark.held(scores) < 1.0
+        assert (0.9 if differs else 0.93) <= benchmark.held(scores) < 1.0
