@@ -435,7 +435,7 @@ class _EpisodeReader:
             )
         row = self.mapping.views.get(view)
         frame = (row.frame if row else '') or of_info or of_images
-        links = () if self.robot is None else self.robot.link_names
+        links = () if self.robot is None else self.robot.posed_links
         if unknown_mount and tree.name(frame) not in tree.frames:
             mount = Mount(unknown_mount, np.eye(4), None)
         elif tree.is_moving(frame, links):

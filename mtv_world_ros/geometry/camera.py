@@ -31,9 +31,21 @@ _PARALLEL = 1e9
 
 
 def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) -> FloatArray:
-    """Returns T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera."""
+    """Returns T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera.
+
+    Raises:
+        CalibrationError: a joint carries it that is not among the robot's joints.
+    """
     if camera.mount_link == robot.base_link:
         return np.repeat(camera.T_mount_camera[None], len(positions), axis=0)
+    unknown = robot.unknown_joints(camera.mount_link)
+    if unknown:
+        raise CalibrationError(
+            f"the camera of view '{camera.view}' is on link '{camera.mount_link}', which joint "
+            f"'{unknown[0]}' moves, and that is not among the joints of robot '{robot.name}': add "
+            "it to 'joints' of the robot's YAML, take the pose from /tf, or give it in a link "
+            'that the joint does not move'
+        )
     return robot.link_poses(camera.mount_link, positions) @ camera.T_mount_camera
 
 

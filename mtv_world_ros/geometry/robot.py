@@ -126,6 +126,19 @@ class RobotModel:
         """Names of all links."""
         return tuple(self._frames)
 
+    @property
+    def posed_links(self) -> tuple[str, ...]:
+        """Names of the links whose pose in the base link the commanded joints determine."""
+        return tuple(link for link in self._frames if not self.unknown_joints(link))
+
+    def unknown_joints(self, link: str) -> tuple[str, ...]:
+        """Returns the joints between a link and the base link that no commanded joint moves."""
+        model = self.pinocchio_model
+        ends = [model.frames[self._frame(name)].parentJoint for name in (link, self.base_link)]
+        between = set(model.supports[ends[0]]) ^ set(model.supports[ends[1]])
+        known = {joint.id for joint, *_ in self._setters}
+        return tuple(model.names[joint] for joint in sorted(between - known))
+
     def forward_kinematics(self, positions: FloatArray) -> dict[str, FloatArray]:
         """Returns base_T_link (T, 4, 4) of every link for positions (T, J)."""
         return dict(zip(self._frames, self._poses(positions, self.link_names), strict=True))

@@ -1,7 +1,9 @@
 """A camera that no joint of the robot moves: its poses come from /tf or a data set, row by row."""
 
+from dataclasses import replace
+
 from bags import record
-from crane import FPS, load, make_cameras, make_positions
+from crane import FPS, load, make_cameras, make_positions, URDF, write_episode, write_robot
 import numpy as np
 import pytest
 import yaml
@@ -11,6 +13,7 @@ from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import cached_recording, cut_clip, load_recording
 from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.robot_shape import load_shape
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.inspection.inspect import Inspector
@@ -66,10 +69,10 @@ def truth():
     return cart_poses() @ inverse(CEILING) @ make_cameras()['door'].T_mount_camera
 
 
-def imported(bag):
+def imported(bag, *more):
     out = bag.parent / 'out'
     assert main(['import-bag', str(bag), '--topics', str(bag.parent / 'bag.yaml'), '--out',
-                 str(out)]) == 0  # fmt: skip
+                 str(out), *more]) == 0  # fmt: skip
     return out / 'wave'
 
 
@@ -157,3 +160,43 @@ def test_what_takes_one_pose_of_a_camera_refuses_it(bag, robot, capsys, tmp_path
     command = ['export-dataset', str(path), '--robot', str(robot.file), '--fps', str(FPS)]
     assert main([*command, '--out', str(tmp_path / 'set')]) == 1
     assert "the camera of view 'door' moves by itself" in capsys.readouterr().err
+
+
+@pytest.fixture
+def panning(tmp_path):
+    """The crane with a link `ceiling` on a joint `pan` that is not among its joints."""
+    file = write_robot(tmp_path / 'panning')
+    pan = (
+        '<link name="ceiling"/><joint name="pan" type="revolute"><parent link="plinth"/>'
+        '<child link="ceiling"/><origin xyz="0.4 0.1 2"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    file.with_suffix('.urdf').write_text(URDF.replace('</robot>', pan))
+    file.write_text(f'{file.read_text()}joints: [{", ".join(JOINTS)}]\n')
+    return load_robot(file)
+
+
+def test_a_joint_that_the_robot_does_not_list_is_followed_by_tf(panning, bag):
+    assert 'ceiling' in panning.link_names and 'ceiling' not in panning.posed_links
+    assert {'plinth', 'hand', 'right', 'world'} <= set(panning.posed_links)
+    episode = read_episode(imported(bag, '--robot', str(panning.file)))
+    assert episode.cameras['door'].mount_link == 'plinth'
+    np.testing.assert_allclose(episode.camera_tracks['door'], truth(), atol=1e-6)
+
+
+def test_without_tf_the_joint_is_named(panning, tmp_path, capsys):
+    """Taken as at rest, a view would be drawn at a pose that it does not have."""
+    door = make_cameras()['door']
+    on_ceiling = replace(door, mount_link='ceiling')
+    path = write_episode(
+        tmp_path / 'episode',
+        panning,
+        {'door': door},
+        make_positions(1.0),
+        recorded_as={'door': on_ceiling},
+    )
+    command = ['doctor', str(path), '--robot', str(panning.file), '--out', str(tmp_path / 'out')]
+    assert main(command) == 1
+    printed = capsys.readouterr().err
+    assert "the camera of view 'door' is on link 'ceiling', which joint 'pan' moves" in printed
+    assert "add it to 'joints' of the robot's YAML" in printed

@@ -42,7 +42,7 @@ class Extrinsics:
 
     Args:
         node: owner of the subscriptions and the publisher.
-        links: of the robot.
+        links: of the robot, those whose pose its joint states determine.
         settings: the present parameters.
         guarded: wraps a handler so that it never raises.
 

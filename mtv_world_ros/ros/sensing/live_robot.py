@@ -37,7 +37,7 @@ class LiveRobot:
         on_robot: Callable[[RobotModel], None],
         guarded: Callable[[Handler], Handler],
     ) -> None:
-        self._extrinsics = Extrinsics(node, expected.link_names, settings, guarded)
+        self._extrinsics = Extrinsics(node, expected.posed_links, settings, guarded)
         self._description: RobotDescription | None = None
         if settings().use_robot_description:
             self._description = RobotDescription(node, expected, on_robot, guarded)
