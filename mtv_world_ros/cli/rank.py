@@ -6,11 +6,13 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
+    add_describer,
     add_dtype,
     add_model_options,
     add_overwrite,
@@ -105,6 +107,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_checkpoint(parser)
     add_dtype(parser)
     add_model_options(parser)
+    add_describer(parser)
     add_segmenter(parser)
     add_serving(parser)
     parser.set_defaults(handler=_rank, steps=1)
@@ -189,6 +192,7 @@ def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoi
         load_pipeline,
         name,
         num_threads=threads_of_workers(arguments),
+        describer=arguments.describer,
         **pipeline_choices(arguments),
     )
     settings = _settings(arguments, name)
@@ -248,10 +252,14 @@ def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
     """Settings that rollouts depend on: with other settings they are run again."""
     from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.files import share_path
+    from mtv_world_ros.importing.stored_objects import stage_key
 
-    return {
+    settings = {
         'checkpoint': fingerprint(name),
         'task files': fingerprint(share_path('config', 'tasks')).split()[-1],
         'robot': arguments.robot or '',
         'segmenter': arguments.segmenter,
     }
+    if arguments.describer:
+        settings['describer'] = sha256(stage_key(arguments.describer, '')).hexdigest()[:8]
+    return settings

@@ -109,7 +109,7 @@ class RolloutRunner:
         found = [observed.observe(chunk.frames, chunk.positions) for chunk in world.chunks]
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
-        episode = self._begin(real, job)
+        episode = self._begin(real, job, observed.names)  # a describer is asked once
         imagined = ImaginedWorld(episode, world.start)
         run = self._run(real.policy, imagined, real.instruction, job)
         imagining_s = time.perf_counter() - begun
@@ -129,7 +129,7 @@ class RolloutRunner:
             final=real.final,
             imagined=Judged.of(imagined.success),
             seen=Judged.of(found[-1].success if found else None),
-            no_picture=_judge_without_pictures(self._begin(real, job), world),
+            no_picture=_judge_without_pictures(self._begin(real, job, observed.names), world),
             num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
             is_over=real.run.is_over and run.is_over,
@@ -149,11 +149,14 @@ class RolloutRunner:
             },
         )
 
-    def _begin(self, real: SimulatedRollout, job: Job) -> ImaginedEpisode:
+    def _begin(
+        self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()
+    ) -> ImaginedEpisode:
         """An episode that begins with the simulator's first observation."""
         return self.pipeline.begin(
             real.world.start,
             instruction=real.instruction,
+            objects=objects,
             seed=job.seed,
             num_inference_steps=self.config.num_inference_steps,
         )

@@ -13,6 +13,7 @@ from mtv_world_ros.cli import main
         (['--true-episodes', '-1'], '--true-episodes is -1; it must be 0 or more'),
         (['--max-chunks', '0'], '--max-chunks'),
         (['--hold', '-1'], '--hold is -1; it must be 0 or more'),
+        (['--describer', 'nowhere.yaml'], "describer file 'nowhere.yaml'"),
     ],
 )
 def test_a_wrong_option_is_refused_before_anything_runs(options, says, tmp_path, capsys):

@@ -14,8 +14,10 @@ from mtv_world_ros.ranking.rollout_runner import (
     WantedJob,
 )
 from mtv_world_ros.ranking.run_jobs import Checkpoint, run_jobs
+from mtv_world_ros.vision.describers.scene_objects import SceneObject
 
 TASK = 'place_block_a2b_left'
+COLOURS = ('red', 'blue', 'green', 'purple')
 
 
 @pytest.fixture(scope='module')
@@ -90,6 +92,24 @@ def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
     beyond = replace(runner.config, make_policy=lambda *place: Beyond(made[0].policy))
     with pytest.raises(TrajectoryError, match='limit'):
         RolloutRunner(runner.pipeline, beyond).simulate(job)
+
+
+def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, expert):
+    """What it names is followed and judged in both worlds."""
+    shown = []
+
+    class Describer:
+        def describe(self, first_frame, instruction):
+            shown.append(first_frame)
+            return tuple(SceneObject(id=colour, name=f'{colour} block') for colour in COLOURS)
+
+    (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
+    asking = RolloutRunner(replace(runner.pipeline, describer=Describer()), runner.config)
+    real = asking.simulate(job)
+    result = asking.imagine(job, real)
+    np.testing.assert_array_equal(shown, real.world.start.frames[:1])
+    assert [len(row) for row in result.seen.jaccard] == [len(COLOURS)] * 2
+    assert [len(row) for row in result.imagined.jaccard] == [len(COLOURS)] * 2
 
 
 def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, monkeypatch):

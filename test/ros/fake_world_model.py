@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.assembly import asked_describer, robot_path
 from mtv_world_ros.errors import ModelMemoryError, RolloutPreempted
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
@@ -82,6 +82,7 @@ def load(settings):
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
         rendering=TrajectoryVideoConfig(),
         objects=settings.objects,
+        describer=asked_describer(settings.describer),
     )
 
 

@@ -59,9 +59,9 @@ def name_objects(
 ) -> tuple[str, ...]:
     """Returns the names of a scene's objects; empty if there are none.
 
-    Import, training, node, replay and evaluation all name objects by this rule: the names that
-    are `given`, else the describer's, else those `stored` with the episode, else those that the
-    instruction names by colour.
+    Import, training, node, replay, evaluation and ranking name objects by this rule: the names
+    that are `given`, else the describer's, else those `stored` with the episode, else those that
+    the instruction names by colour.
 
     Args:
         instruction: what the robot was told.
