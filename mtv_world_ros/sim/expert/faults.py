@@ -179,6 +179,15 @@ FAULTS: Mapping[str, FaultKind] = {
         'number of visits to any object of the scene, through it or past it, drawn at random: '
         'when, from where, how low, open or shut, turned and leaning',
     ),
+    'meet': _kind(
+        'collision',
+        'train',
+        1,
+        4,
+        '',
+        'number of times that what is held is carried low through the place of another object, or '
+        'past it, drawn at random: when, which, from where, how low',
+    ),
     'knock': _kind(
         'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push what is at the goal before it'
     ),

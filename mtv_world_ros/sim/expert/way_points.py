@@ -29,6 +29,9 @@ _ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
 _VISIT_FROM_M, _VISIT_TO_M = (0.0, 0.08), (-0.02, 0.06)
 _VISIT_HEIGHT_M, _VISIT_RISE_M = (-0.03, 0.05), (0.03, 0.1)
 _VISIT_BESIDE_M, _VISIT_YAW_RAD, _VISIT_LEAN_RAD = 0.012, 0.6, 0.35
+#: what is carried meets an object: how high the tool is over where it grasped, how far the centres
+#: pass each other [m]
+_MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,6 +368,35 @@ def _visit(stops: Stops, size: float, side: _Side) -> Stops:
     return stops
 
 
+def _meet(stops: Stops, size: float, side: _Side) -> Stops:
+    """What the gripper holds is carried low through another object's place, or past it."""
+    rng = side.play
+    grasp = stops[_first(stops, 'close')].position
+    others = [
+        place for place in side.objects if np.linalg.norm((place - grasp)[:2]) > _VISIT_TO_M[1]
+    ]
+    held = range(_first(stops, 'lift') + 1, _first(stops, 'open') + 1)
+    for _ in range(round(size) if others else 0):
+        at = int(rng.integers(held[0], held[-1] + 1))
+        place = others[int(rng.integers(len(others)))][:2] + rng.normal(0.0, _MEET_BESIDE_M, 2)
+        angle, height = rng.uniform(0.0, 2 * np.pi), grasp[2] + rng.uniform(*_MEET_HEIGHT_M)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        begin, end = (
+            np.array([*(place + far * way), height])
+            for far in (-rng.uniform(0.06, 0.14), rng.uniform(*_VISIT_TO_M))
+        )
+        before = stops[at - 1]
+        arrives = replace(before, phase='carry', position=begin, seconds=None)
+        if rng.random() < 0.5:
+            arrives = replace(arrives, yaw=before.yaw + float(rng.normal(0.0, _VISIT_YAW_RAD)))
+        leaves = replace(arrives, position=end)
+        over, after = (_up(rng.uniform(*_VISIT_RISE_M)) for _ in range(2))
+        meeting = [arrives.moved(over), arrives, leaves, leaves.moved(after)]
+        stops = [*stops[:at], *meeting, *stops[at:]]
+        held = range(held[0], held[-1] + 1 + len(meeting))
+    return stops
+
+
 def _elsewhere(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _PLACE, lambda stop: stop.moved(size * side.anywhere))
 
@@ -439,6 +471,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'play': _play,
     'odd': _odd,
     'visit': _visit,
+    'meet': _meet,
     'knock': _knock,
     'brush': _brush,
     'low_carry': _low_carry,

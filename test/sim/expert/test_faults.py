@@ -17,6 +17,7 @@ from mtv_world_ros.sim.expert.faults import (
     SPLITS,
 )
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
 
 SEED, TASK = 4, 'place_block_a2b_left'
 
@@ -116,6 +117,28 @@ def test_what_is_undone_is_let_go_twice(expert):
     (height,) = heights_where_it_lets_go(expert, 'expert')
     undone = heights_where_it_lets_go(expert, 'expert-undo-0.05')
     assert undone == pytest.approx([height, height], abs=2e-3)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_what_is_held_is_carried_low_to_another_object(seed):
+    own, other = np.array([0.0, 0.3, 0.03]), np.array([0.2, 0.35, 0.03])
+    up, goal = np.array([0, 0, 0.15]), np.array([-0.2, 0.3, 0.03])
+    places = [
+        ('above', own + up, 1.0), ('grasp', own, 1.0), ('close', own, 0.2),
+        ('lift', own + up, 0.2), ('carry', goal + up, 0.2), ('lower', goal, 0.2), ('open', goal, 1.0),
+        ('retreat', goal + up, 1.0),
+    ]  # fmt: skip
+    stops = [WayPoint(phase, place, 0.0, opening) for phase, place, opening in places]
+    faults = WayPointFaults(parse_variant('expert-meet-1'), np.random.default_rng(seed))
+    changed = faults.applied(stops, 0.0, [own, other])
+    (first,) = [k for k, stop in enumerate(changed) if stop.phase == 'open']
+    number = {id(stop): k for k, stop in enumerate(stops)}
+    assert [number[id(stop)] for stop in changed if id(stop) in number] == list(range(8))
+    new = [stop for stop in changed[4:first] if id(stop) not in number]
+    assert len(new) == len(changed) - 8 == 4 and all(stop.opening == 0.2 for stop in new)
+    low = [stop.position for stop in new[1:3]]
+    assert all(own[2] <= place[2] <= own[2] + 0.09 for place in low)
+    assert np.linalg.norm((low[1] - other)[:2]) < 0.15
 
 
 def test_random_policies_are_of_the_kinds_asked_for():
