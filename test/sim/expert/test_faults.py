@@ -125,8 +125,8 @@ def test_what_is_held_is_carried_low_to_another_object(seed):
     up, goal = np.array([0, 0, 0.15]), np.array([-0.2, 0.3, 0.03])
     places = [
         ('above', own + up, 1.0), ('grasp', own, 1.0), ('close', own, 0.2),
-        ('lift', own + up, 0.2), ('carry', goal + up, 0.2), ('lower', goal, 0.2), ('open', goal, 1.0),
-        ('retreat', goal + up, 1.0),
+        ('lift', own + up, 0.2), ('carry', goal + up, 0.2), ('lower', goal, 0.2),
+        ('open', goal, 1.0), ('retreat', goal + up, 1.0),
     ]  # fmt: skip
     stops = [WayPoint(phase, place, 0.0, opening) for phase, place, opening in places]
     faults = WayPointFaults(parse_variant('expert-meet-1'), np.random.default_rng(seed))
