@@ -17,6 +17,7 @@ from mtv_world_ros.cli.shared_options import (
     add_segmenter,
     add_serving,
     add_task,
+    check_model,
     pipeline_choices,
     provenance,
     threads_of_workers,
@@ -76,14 +77,16 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.evaluation.calibration.calibration_report import write_calibration_report
-    from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
-    from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
     from mtv_world_ros.success.calibration import save_calibration, save_horizon
 
+    check_model(arguments.device, arguments.checkpoint)
     folder = checkpoint_path(arguments.checkpoint)
     _check_places(arguments, folder)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    from mtv_world_ros.evaluation.calibration.calibration_report import write_calibration_report
+    from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
+    from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
+
     print(f'{arguments.dataset}: {selection}')
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
@@ -104,10 +107,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
     """Refuses to write into the installed package, and to replace an earlier calibration."""
     from mtv_world_ros.assembly import BUNDLED
-    from mtv_world_ros.model.card import read_card
     from mtv_world_ros.success.calibration import CALIBRATION
 
-    read_card(folder)
     check_free(arguments.out / 'calibration.json', arguments.overwrite)
     if not arguments.store:
         return

@@ -18,6 +18,7 @@ from mtv_world_ros.cli.shared_options import (
     add_serving,
     add_source,
     add_task,
+    check_model,
     names,
     pipeline_choices,
     provenance,
@@ -154,15 +155,13 @@ def _row(entry: Entry, pipeline: Pipeline) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.evaluation.report.comparison import write_comparison
-    from mtv_world_ros.model.card import read_card
 
     entries = parse_entries(arguments.checkpoints)
-    for entry in entries:
-        read_card(checkpoint_path(entry.path))  # before hours go into the first one
+    check_model(arguments.device, *(entry.path for entry in entries))
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    from mtv_world_ros.evaluation.report.comparison import write_comparison
+
     print(f'{arguments.dataset}: {selection}')
     alone = len(entries) == 1
     folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]

@@ -17,6 +17,7 @@ from mtv_world_ros.cli.shared_options import (
     add_serving,
     add_source,
     add_task,
+    check_model,
     pipeline_of,
 )
 from mtv_world_ros.errors import EpisodeError
@@ -61,6 +62,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.replay.offline import replay_offline
 
+    check_model(arguments.device, arguments.checkpoint)
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
     check_free(out, arguments.overwrite)
     summary = replay_offline(
@@ -125,6 +127,10 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
     from mtv_world_ros.errors import ConfigError
 
+    check_model(arguments.device, arguments.checkpoint)
+    for folder in arguments.episodes:
+        if not folder.exists():
+            raise EpisodeError(f"there is no episode '{folder}'")
     episodes = [path for folder in arguments.episodes for path in list_episodes(folder)]
     if bool(episodes) == arguments.live:
         raise ConfigError(

@@ -18,10 +18,12 @@ from mtv_world_ros.cli.shared_options import (
     add_overwrite,
     add_segmenter,
     add_serving,
+    check_model,
     pipeline_choices,
     provenance,
     threads_of_workers,
 )
+from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.ranking.policy_list import ListedPolicy
@@ -114,7 +116,10 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.errors import ConfigError
+    names = _names(arguments)
+    check_model(arguments.device, *names)
+    listed = _listed(arguments)
+    jobs = _jobs(arguments, listed)
     from mtv_world_ros.ranking.flip_sheet import flip_sheet
     from mtv_world_ros.ranking.optimism import Optimism
     from mtv_world_ros.ranking.policy_list import ListedPolicies
@@ -124,16 +129,10 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.ranking.run_jobs import FOLDER, run_jobs
     from mtv_world_ros.rendering.images import write_png
 
-    if arguments.true_episodes < 0:
-        raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
-    names = [arguments.checkpoint, *([arguments.compare] if arguments.compare else [])]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"--compare is '{arguments.compare}', as --checkpoint; give another one")
     folders = [arguments.out, arguments.out / 'compared'][: len(names)]
     checkpoints = [
         _checkpoint(arguments, name, out) for name, out in zip(names, folders, strict=True)
     ]
-    listed = _listed(arguments)
     config = RolloutConfig(
         num_inference_steps=arguments.steps,
         max_chunks=arguments.max_chunks,
@@ -144,7 +143,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())
         config = replace(config, make_policy=policies)
     found, failed = run_jobs(
-        _jobs(arguments, listed),
+        jobs,
         checkpoints,
         config=config,
         workers=arguments.workers,
@@ -182,6 +181,16 @@ def _rank(arguments: argparse.Namespace) -> int:
             write_png(out / 'flips.png', sheet)
     print(f'{console(summaries[0])}\n\nreport: {path}')
     return 0
+
+
+def _names(arguments: argparse.Namespace) -> list[str]:
+    """The checkpoints to rank with: one, or two with `--compare`."""
+    if arguments.true_episodes < 0:
+        raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
+    names = [arguments.checkpoint, *([arguments.compare] if arguments.compare else [])]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--compare is '{arguments.compare}', as --checkpoint; give another one")
+    return names
 
 
 def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoint:

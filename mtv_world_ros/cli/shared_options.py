@@ -151,6 +151,24 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     )
 
 
+def check_model(device: str, *checkpoints: str) -> None:
+    """Checks what is often mistyped, before seconds go into imports and hours into the run.
+
+    Raises:
+        CheckpointError: a folder is no checkpoint.
+        ConfigError: this machine has no such device.
+    """
+    from mtv_world_ros.assembly import checkpoint_path
+    from mtv_world_ros.model.card import read_card
+
+    for name in checkpoints:
+        read_card(checkpoint_path(name))
+    if device != 'cpu':
+        from mtv_world_ros.model.runtime import check_device
+
+        check_device(device)
+
+
 def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:
     """Returns the options of a pipeline except checkpoint and threads."""
     given = vars(arguments)

@@ -83,6 +83,12 @@ def imagine_episodes(
         EpisodeError: a process failed; the message says what it said last and names its log.
         OSError: the disk is full.
     """
+    views = read_card(checkpoint_path(options.checkpoint)).spec.views
+    commands = {
+        'world_model': _world_model_command(options, views),
+        'policy': _policy_command(options, views),
+        'runner': _runner_command(options, views, out),
+    }
     check_room(out, ROOM_BYTES)
     for bag in sorted(out.glob('episode_*')):
         check_free(bag, overwrite)
@@ -91,12 +97,6 @@ def imagine_episodes(
     logs.mkdir(parents=True, exist_ok=True)
     (out / 'episodes.json').unlink(missing_ok=True)
     environment = private_domain() if options.episodes else dict(os.environ)
-    views = read_card(checkpoint_path(options.checkpoint)).spec.views
-    commands = {
-        'world_model': _world_model_command(options, views),
-        'policy': _policy_command(options, views),
-        'runner': _runner_command(options, views, out),
-    }
     started: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for name, command in commands.items():
