@@ -36,7 +36,7 @@ from mtv_world_ros.inspection.camera_pose import (
 from mtv_world_ros.inspection.clocks import JointTrack
 
 #: widths of the images and blurs [px] of the steps of the search, from coarse to fine
-_COARSE, _WIDE, _MIDDLE, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (240, 1.5)
+_COARSE, _WIDE, _MIDDLE, _NEAR, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (160, 1.0), (240, 1.5)
 #: difference of drawn and seen change from which on a pixel counts less
 _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
@@ -49,6 +49,8 @@ _CHANGED = (4.0, 16.0)
 _NUM_TRIED, _NUM_KEPT = 1500, 6
 #: measurements that the pixels of all frames are worth
 _NUM_INDEPENDENT = 12
+#: first step of the search along poses that look alike, in `UNITS`
+_STEP = 5.0
 #: correlation below which a found pose explains the pictures no better than chance
 _LEAST_FIT = 0.45
 
@@ -124,7 +126,9 @@ class FixedCamera:
         wide, middle = self._changes(*_WIDE), self._changes(*_MIDDLE)
         found = [self._aligned(self._aligned(start, wide), middle) for start in starts]
         T = max(found, key=lambda pose: self._fit(pose, middle))
-        fine = self._changes(*_FINE)
+        near, fine = self._changes(*_NEAR), self._changes(*_FINE)
+        for sign in (1.0, -1.0):
+            T = self._refined(T, near, sign * self._alike_steps(T, near))
         T = self._aligned(T, fine)
         fit = self._fit(T, fine)
         if fit < _LEAST_FIT:
@@ -221,13 +225,7 @@ class FixedCamera:
         in all frames, so that pixels say much less than their number: they are counted as few
         independent measurements, and the pose's changes without one link at a time are added.
         """
-        errors = self._errors(T, changes).ravel()
-        slopes = np.stack(
-            [(self._errors(moved(T, row, self.centre), changes)
-              - self._errors(moved(T, -row, self.centre), changes)).ravel() / 2
-             for row in np.diag(UNITS)]
-        )  # fmt: skip
-        weights = 1 / (1 + (errors / _OUTLIER) ** 2)
+        errors, weights, slopes = self._linearized(T, changes)
         normal = np.asarray((weights * slopes) @ slopes.T, np.float64)
         variance = float((weights * errors**2).sum()) / _NUM_INDEPENDENT
         at_centre = np.diag(UNITS) @ np.linalg.pinv(normal) @ np.diag(UNITS) * variance
@@ -249,6 +247,29 @@ class FixedCamera:
             float(np.hypot(np.degrees(np.sqrt(turn)), degrees)),
         )
 
+    def _linearized(
+        self, T: FloatArray, changes: _Changes
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+        """Errors (N,), their weights (N,), and their change by each of `UNITS` (6, N)."""
+        errors = self._errors(T, changes).ravel()
+        slopes = np.stack(
+            [(self._errors(moved(T, row, self.centre), changes)
+              - self._errors(moved(T, -row, self.centre), changes)).ravel() / 2
+             for row in np.diag(UNITS)]
+        )  # fmt: skip
+        return errors, 1 / (1 + (errors / _OUTLIER) ** 2), slopes
+
+    def _alike_steps(self, T: FloatArray, changes: _Changes) -> FloatArray:
+        """(6, 6) steps, in rows, that change the drawn pixels alike; the largest is of `_STEP`.
+
+        A camera that circles the robot while it looks at it hardly changes them: there, least
+        squares stop far from the best pose, and a simplex of these steps goes on.
+        """
+        _, weights, slopes = self._linearized(T, changes)
+        values, vectors = np.linalg.eigh(np.asarray((weights * slopes) @ slopes.T, np.float64))
+        steps = _STEP * vectors * np.sqrt(values[0] / values)
+        return np.asarray(steps.T * UNITS, np.float64)
+
     def _pixels_of_links(self, T: FloatArray, changes: _Changes) -> list[np.ndarray]:
         """Indices of the pixels at which each link is drawn, each pixel at one link."""
         owner = np.full(changes.seen.size, -1)
@@ -263,30 +284,22 @@ class FixedCamera:
         return [pixels for pixels in found if len(pixels)]
 
     def _refined(
-        self,
-        T: FloatArray,
-        changes: _Changes,
-        *,
-        turn: float,
-        shift: float,
-        evaluations: int = 220,
+        self, T: FloatArray, changes: _Changes, steps: FloatArray, evaluations: int = 220
     ) -> FloatArray:
-        """The pose nearby that fits best; `turn` [rad] and `shift` [m] are first steps."""
-        steps = np.array([turn] * 3 + [shift] * 3)
-        simplex = np.vstack([np.zeros(6), np.diag(steps)])
+        """The pose nearby that fits best; `steps` (6, 6) are the first ones, in rows [rad, m]."""
         result = minimize(
-            lambda p: -self._fit(moved(T, p, self.centre), changes),
+            lambda p: -self._fit(moved(T, p @ steps, self.centre), changes),
             np.zeros(6),
             method='Nelder-Mead',
             options={
-                'initial_simplex': simplex,
+                'initial_simplex': np.vstack([np.zeros(6), np.eye(6)]),
                 'maxfev': evaluations,
-                'xatol': 1e-4,
+                'xatol': 1e-3,
                 'fatol': 1e-5,
                 'adaptive': True,
             },
         )
-        return moved(T, np.asarray(result.x), self.centre)
+        return moved(T, np.asarray(result.x) @ steps, self.centre)
 
     def _search(self, seed: int) -> list[FloatArray]:
         """The best of many upright cameras around the robot."""
@@ -307,7 +320,8 @@ class FixedCamera:
                 best.append(T)
             if len(best) == _NUM_KEPT:
                 break
-        improved = [self._refined(T, changes, turn=0.25, shift=0.1, evaluations=70) for T in best]
+        steps = np.diag([0.25] * 3 + [0.1] * 3)
+        improved = [self._refined(T, changes, steps, evaluations=70) for T in best]
         improved.sort(key=lambda T: -self._fit(T, changes))
         return improved[:3]
 
