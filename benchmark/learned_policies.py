@@ -40,6 +40,7 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.ranking.run_jobs import read_results
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.sim.collect.record import expert_generator
@@ -322,6 +323,7 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
             for name, found in ranking['policies'].items()
         ],
     )  # fmt: skip
+    yield _saved(list(_results(ranking, root, options)))
     yield '## Training'
     yield (
         'Explained: share of the variance of commands, in scenes kept from training, 1.2 s after '
@@ -359,29 +361,26 @@ def _agreement(ranking: dict[str, Any], rates: dict[str, Any]) -> Iterator[str]:
         'As `mtv-world rank` gives them: value; without the noise of few scenes, with a 95 % '
         'interval. Rollouts, imagined / true: '
         + ', '.join(f'{key.replace("_", " / ")} {count}' for key, count in confusion.items())
-        + f'; abstained {ranking["abstained"]["imagined"]["abstained"]}; without a result '
+        + f'; abstained {ranking["abstained"]["imagined"]["hits"]}; without a result '
         f'{len(ranking["failed"])}.'
     )
 
 
 def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> Iterator[str]:
     """What looking adds, when the two worlds part, and the rollouts that are judged worst."""
-    results = [
-        result
-        for result in read_results(root / 'ranking')
-        if result.policy in ranking['policies'] and result.index < options.scenes
-    ]
+    results = list(_results(ranking, root, options))
 
     def right(judged: str) -> str:
         said = [(getattr(result, judged).probability, result.final) for result in results]
-        return f'{np.mean([(probability >= 0.5) == final for probability, final in said]):.2f}'
+        known = [(probability >= 0.5) == final for probability, final in said if probability >= 0]
+        return f'{np.mean(known):.2f} of {len(known)}'
 
     yield (
-        f'Right in how many of the {len(results)} rollouts: imagination {right("imagined")}, the '
-        f"estimator on the simulator's frames {right('seen')}, the no-picture rule "
-        f'{right("no_picture")}. That rule is given the commands of the simulated rollout, which '
-        'these policies choose by what they see: before the robot moves nobody has more of them '
-        'than the first answer, so the rule cannot be asked in the place of imagination.'
+        f'Right in how many of the {len(results)} rollouts that it judges: imagination '
+        f"{right('imagined')}, the estimator on the simulator's frames {right('seen')}, the "
+        f'no-picture rule {right("no_picture")}. That rule is given the commands of the simulated '
+        'rollout, which these policies choose by what they see: before the robot moves nobody '
+        'has more of them than the first answer, so the rule cannot be asked in the place of imagination.'
     )
     parts = [
         [course.commands_part_s, course.objects_part_s]
@@ -397,7 +396,8 @@ def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) 
         f'The commands of the two worlds part in {shares[0]} of the rollouts (median of those at '
         f'{medians[0]}), the objects in {shares[1]} (at {medians[1]}).'
     )
-    worst = sorted(results, key=lambda found: -abs(found.imagined.probability - found.final))
+    judged = [found for found in results if np.isfinite(found.imagined.probability)]
+    worst = sorted(judged, key=lambda found: -abs(found.imagined.probability - found.final))
     yield table(
         ['worst cases', 'scene', 'simulator', 'imagined', "simulator's frames", 'objects part'],
         [
@@ -410,6 +410,28 @@ def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) 
             for found in worst[:6]
         ],
     )  # fmt: skip
+
+
+def _results(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> Iterator[Result]:
+    for result in read_results(root / 'ranking'):
+        if result.policy in ranking['policies'] and result.index < options.scenes:
+            yield result
+
+
+def _saved(results: Sequence[Result]) -> str:
+    """How many real trials imagined ones stand for."""
+    pairs: dict[str, list[tuple[float, float]]] = {}
+    for result in results:
+        if np.isfinite(result.imagined.probability):
+            pair = (result.imagined.probability, float(result.final))
+            pairs.setdefault(result.policy, []).append(pair)
+    within = np.concatenate([np.array(found) - np.mean(found, 0) for found in pairs.values()])
+    share = float(np.corrcoef(within.T)[0, 1] ** 2)
+    return (
+        f'Within a policy, the imagined probability explains {share:.2f} of the variance of the '
+        f'true outcome (squared correlation, {len(within)} rollouts). With many imagined episodes '
+        f'for each true one an interval as narrow therefore takes {share:.0%} fewer true trials.'
+    )
 
 
 def _score(found: dict[str, Any]) -> str:
