@@ -380,7 +380,8 @@ def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) 
         f"{right('imagined')}, the estimator on the simulator's frames {right('seen')}, the "
         f'no-picture rule {right("no_picture")}. That rule is given the commands of the simulated '
         'rollout, which these policies choose by what they see: before the robot moves nobody '
-        'has more of them than the first answer, so the rule cannot be asked in the place of imagination.'
+        'has more of them than the first answer, so the rule cannot be asked in the place of '
+        'imagination.'
     )
     parts = [
         [course.commands_part_s, course.objects_part_s]
