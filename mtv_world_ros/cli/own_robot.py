@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 import sys
 import tempfile
@@ -380,11 +381,11 @@ def _estimate_fixed(
 def _estimate_text(estimate: CameraEstimate) -> str:
     camera = estimate.camera
     x, y, z = (float(v) for v in camera.T_mount_camera[:3, 3])
-    meant = (
-        'of the right pose, if this is one'
-        if is_doubtful(estimate)
-        else ('95 % of errors are within twice that')
-    )
+    meant = '95 % of errors are within twice that'
+    if isfinite(estimate.match):  # of a fixed camera: not measured often enough
+        meant = 'most errors are within twice that'
+    if is_doubtful(estimate):
+        meant = 'of the right pose, if this is one'
     return (
         f"view '{camera.view}' on link '{camera.mount_link}': at ({x:.3f}, {y:.3f}, {z:.3f}) m, "
         f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees ({meant})\n'
