@@ -105,12 +105,27 @@ def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
         if is_scored(path):
             found |= {f'/{one.name}': one for one in scored_rollouts(path, arguments.episodes)}
         else:
-            bags.append(path / 'predictions' if (path / 'predictions').is_dir() else path)
+            bags.append(_bag(path))
     if bags:
         found = {'/bag': read_streams(bags), **found}
     if not found:
-        raise EpisodeError(f'no frames were kept in {", ".join(map(str, arguments.paths))}')
+        raise EpisodeError(
+            f'{", ".join(map(str, arguments.paths))}: no frames were kept; run it into another '
+            "--out: 'mtv-world rank' without --no-clips"
+        )
     return found
+
+
+def _bag(path: Path) -> Path:
+    """The bag of a path: itself, or the predictions in the folder of `mtv-world demo`."""
+    from mtv_world_ros.data.episode_reader import list_episodes
+
+    if (path / 'predictions').is_dir():
+        return path / 'predictions'
+    inside = list_episodes(path)
+    if inside and path not in inside:
+        raise EpisodeError(f"'{path}' is a folder of episodes; name one, e.g. '{inside[0]}'")
+    return path
 
 
 def _wait() -> None:

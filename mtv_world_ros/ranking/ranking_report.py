@@ -26,8 +26,9 @@ _NUM_HUES = 6
 _MEANING = (
     "Success in the simulator: the task's relations hold on true object poses at the end. Success "
     'in imagination is an estimate of at least {threshold} at the end of the imagined episode, '
-    'which starts from the same first pictures. The scripted policies go by time and do not look, '
-    'so what differs is the world that their commands meet.'
+    'which starts from the same first pictures. Scripted policies go by time and do not look: '
+    'only the world that their commands meet differs. Policies that look may also send other '
+    'commands in each world.'
 )
 _CEILING = (
     "'{seen}' is what imagination could reach at best: its errors are the estimator's, the rest "

@@ -39,6 +39,7 @@ def recording(name: str) -> Any:
 
 def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
     """Logs a bag or a scored rollout."""
+    root = _escaped(root)
     if isinstance(shown, Streams):
         log_streams(stream, shown, root)
     else:
@@ -72,6 +73,7 @@ def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = No
     joints = ((*row[:2], pair) for row in streams.joints for pair in zip(*row[2:], strict=True))
     for kind, stamp, (name, value) in joints:
         log(stamp, f'joints/{kind}/{name}', rerun.Scalars(float(value)))
+    _mark_points(stream, f'{root}/success')
     for stamp, value in streams.success:
         log(stamp, 'success', rerun.Scalars(value))
     for stamp, text in streams.words:
@@ -84,19 +86,48 @@ def log_rollout(stream: Any, scored: ScoredRollout, root: str) -> None:
 
     rollout = scored.rollout
     for who, estimates in scored.estimates.items():
+        _mark_points(stream, f'{root}/success/{who}')
         for time, value in estimates:
             stream.set_time(_TIMELINE, duration=time)
             stream.log(f'{root}/success/{who}', rerun.Scalars(value))
     for time, text in scored.words:
         stream.set_time(_TIMELINE, duration=time)
         stream.log(f'{root}/words', rerun.TextLog(text))
+    _style_curves(stream, rollout, root)
     for index, time in enumerate(rollout.times):
         stream.set_time(_TIMELINE, duration=float(time))
         for v, view in enumerate(rollout.views):
             _log_view(stream, rollout, v, index, f'{root}/{view}')
             for o, name in enumerate(rollout.objects):
                 value = float(rollout.j[v, o, index])
-                stream.log(f'{root}/J/{view}/{name}', rerun.Scalars(value))
+                stream.log(f'{root}/J/{view}/{_escaped(name)}', rerun.Scalars(value))
+
+
+def _escaped(path: str) -> str:
+    """The path of entities in Rerun's notation, where spaces and signs need a backslash."""
+    import rerun
+
+    parts = (rerun.escape_entity_path_part(part) if part else '' for part in path.split('/'))
+    return '/'.join(parts)
+
+
+def _style_curves(stream: Any, rollout: StoredRollout, root: str) -> None:
+    """Draws J in the colour of the object's outline, darker in each further view."""
+    import rerun
+
+    for o, name in enumerate(rollout.objects):
+        for v, view in enumerate(rollout.views):
+            colour = [round(part * 0.6**v) for part in _COLOURS[o % len(_COLOURS)]]
+            lines = rerun.SeriesLines(colors=[colour], names=f'{name}, {view}')
+            stream.log(f'{root}/J/{view}/{_escaped(name)}', lines, static=True)
+
+
+def _mark_points(stream: Any, path: str) -> None:
+    """Marks the values of a curve: a single one draws no line."""
+    import rerun
+
+    lines, points = rerun.SeriesLines(widths=[1.5]), rerun.SeriesPoints(marker_sizes=[4.0])
+    stream.log(path, lines, points, static=True)
 
 
 def _log_view(stream: Any, rollout: StoredRollout, v: int, index: int, root: str) -> None:
@@ -143,7 +174,7 @@ def layout(roots: dict[str, Streams | ScoredRollout]) -> Any:
 
 
 def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
-    kinds = KINDS
+    kinds, name, root = KINDS, root.strip('/') or 'recording', _escaped(root)
     if isinstance(shown, Streams):
         kinds, views = shown.kinds, shown.views
         below = [rrb.TimeSeriesView(origin=f'{root}/joints', name='joints')]
@@ -163,7 +194,6 @@ def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
     if has_estimates:
         below.append(rrb.TimeSeriesView(origin=f'{root}/success', name='success'))
     below.append(rrb.TextLogView(origin=f'{root}/words', name='reports'))
-    name = root.strip('/') or 'recording'
     return rrb.Vertical(*rows, rrb.Horizontal(*below), row_shares=[3] * len(rows) + [2], name=name)
 
 
