@@ -19,7 +19,7 @@ import statistics
 import tempfile
 import time
 
-from page import in_turns, machine_line, table
+from page import in_turns, machine_line, made_line, table
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -100,6 +100,8 @@ With one process an episode takes {alone / count:.2f} s of wall time and
 {_workers(options.workers, count, alone, shared)}
 
 Scores with {options.workers} workers {'are the same in every row' if same else 'DIFFER'}.
+
+{made_line('evaluation', options.checkpoint)}
 """
 
 

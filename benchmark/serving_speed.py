@@ -10,12 +10,10 @@ stages.
 from __future__ import annotations
 
 import argparse
-from datetime import date
-from pathlib import Path
-import platform
 import statistics
 
 import numpy as np
+from page import parse_arguments, publish
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -27,29 +25,27 @@ from mtv_world_ros.prediction import Prediction
 
 def main() -> None:
     """Measures and prints a Markdown table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    options = parse_arguments(__doc__, repeats=7, more=_add)
+    publish(
+        'serving',
+        'Serving speed',
+        f'python benchmark/serving_speed.py --threads {options.threads} --device {options.device}',
+        '\n'.join(lines(options)),
+        options,
+        f'torch {torch.__version__}',
+    )
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--checkpoint', default='bundled')
     parser.add_argument('--threads', type=int, default=2)
-    parser.add_argument('--repeats', type=int, default=7)
     parser.add_argument('--device', default='cpu')
-    parser.add_argument('--out', type=Path, help='folder for a results page')
-    options = parser.parse_args()
-    page = '\n'.join(lines(options))
-    print(page)
-    if options.out is not None:
-        name = f'serving_{options.device}{options.threads}_{date.today()}.md'
-        (options.out / name).write_text(page + '\n')
 
 
 def lines(options: argparse.Namespace) -> list[str]:
-    """The page: heading, table, what was measured."""
-    where = f'{options.device} ({options.threads} threads, {platform.machine()})'
-    command = f'`python benchmark/serving_speed.py --threads {options.threads}`'
-    setting = f'checkpoint `{options.checkpoint}`, torch {torch.__version__}, seed 0'
+    """The table, and what was measured."""
     rows = [
-        f'# Serving speed, {where}, {date.today()}',
-        '',
-        f'{command}: {setting}, median of n = {options.repeats} chunks, one to warm up, in turns.',
+        'Medians of wall time of n chunks that take turns, one to warm up.',
         '',
         '| format | steps | chunk [s] | real-time factor | model [s] | all else [s] |',
         '|---|---|---|---|---|---|',
@@ -67,7 +63,7 @@ def lines(options: argparse.Namespace) -> list[str]:
     chunks: dict[tuple[str, int], list[Prediction]] = {
         (dtype, steps): [] for dtype in pipelines for steps in (1, 2, 4, 8)
     }
-    for seed in range(options.repeats + 1):
+    for seed in range(options.seed, options.seed + options.repeats + 1):
         for (dtype, steps), found in chunks.items():  # in turns
             found += imagine_stretch(
                 pipelines[dtype], recording, stretch, actions=recording, seed=seed,
