@@ -14,7 +14,11 @@ from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.policy import Policy
-from mtv_world_ros.policies.policy_config import load_policy_config, ScriptedPolicySettings
+from mtv_world_ros.policies.policy_config import (
+    load_policy_config,
+    PolicyConfig,
+    ScriptedPolicySettings,
+)
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     CALIBRATION,
@@ -285,22 +289,35 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     Raises:
         ConfigError, PolicyError: no such policy, or its file is wrong.
     """
-    if str(name).startswith('expert'):
-        return _scripted(ScriptedPolicySettings(variant=str(name)), robot)
-    config = load_policy_config(bundled('policies', name, 'policy'), robot)
+    config = policy_settings(name, robot)
     if isinstance(config, ScriptedPolicySettings):
         return _scripted(config, robot)
     made = config.make()
     return lambda task, scene_seed: made
 
 
+def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
+    """Returns the settings of the policy of a name, checked; no server is asked.
+
+    Raises:
+        ConfigError, PolicyError: as in `assemble_policy`.
+    """
+    from mtv_world_ros.sim.expert.faults import parse_variant
+
+    if str(name).startswith('expert'):
+        config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
+    else:
+        config = load_policy_config(bundled('policies', name, 'policy'), robot)
+    if isinstance(config, ScriptedPolicySettings):
+        parse_variant(config.variant)
+    return config
+
+
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
     from mtv_world_ros.sim.expert.expert import Expert
-    from mtv_world_ros.sim.expert.faults import parse_variant
     from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 
     variant = settings.variant
-    parse_variant(variant)
     expert = Expert(robot)
 
     def make(task: str, scene_seed: int) -> Policy:

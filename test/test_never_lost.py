@@ -95,6 +95,8 @@ def test_imagined_episodes_and_predictions_stay(
     kept.write_text('')
     start = ['--episodes', str(EPISODE), '--out', str(tmp_path)]
     assert "episode_00000' exists" in refused(['imagine', *start], capsys)
+    for policy, why in (('expert-mis-0.5', "did you mean 'miss'"), ('exprt', 'is not in config')):
+        assert why in refused(['imagine', *start, '--policy', policy, '--overwrite'], capsys)
     offline = ['replay', str(EPISODE), '--offline', '--out', str(kept.parent)]
     assert "episode_00000' exists" in refused(offline, capsys)
     assert "episode_00000' exists" in refused(['demo', '--out', str(kept.parent)], capsys)

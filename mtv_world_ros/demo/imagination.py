@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import time
 
-from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, policy_settings
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.demo.node_processes import ROOM_BYTES
@@ -79,11 +79,13 @@ def imagine_episodes(
         What `episodes.json` says, one entry for each episode that was begun.
 
     Raises:
-        ConfigError: `out` holds episodes, and `overwrite` is not set.
+        ConfigError: `out` holds episodes, and `overwrite` is not set; no such policy.
         EpisodeError: a process failed; the message says what it said last and names its log.
         OSError: the disk is full.
     """
     views = read_card(checkpoint_path(options.checkpoint)).spec.views
+    # a wrong name is an error here, before anything is removed
+    policy_settings(options.policy, checkpoint_robot(options.checkpoint, options.robot or None))
     commands = {
         'world_model': _world_model_command(options, views),
         'policy': _policy_command(options, views),
