@@ -28,6 +28,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-play-2',
         'expert-odd-3',
         'expert-visit-1',
+        'expert-meet-1',
     ),
     'calibrate': (
         'expert',
