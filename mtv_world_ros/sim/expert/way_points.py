@@ -375,9 +375,8 @@ def _meet(stops: Stops, size: float, side: _Side) -> Stops:
     others = [
         place for place in side.objects if np.linalg.norm((place - grasp)[:2]) > _VISIT_TO_M[1]
     ]
-    held = range(_first(stops, 'lift') + 1, _first(stops, 'open') + 1)
     for _ in range(round(size) if others else 0):
-        at = int(rng.integers(held[0], held[-1] + 1))
+        at = int(rng.integers(_first(stops, 'lift') + 1, _first(stops, 'open') + 1))
         place = others[int(rng.integers(len(others)))][:2] + rng.normal(0.0, _MEET_BESIDE_M, 2)
         angle, height = rng.uniform(0.0, 2 * np.pi), grasp[2] + rng.uniform(*_MEET_HEIGHT_M)
         way = np.array([np.cos(angle), np.sin(angle)])
@@ -393,7 +392,6 @@ def _meet(stops: Stops, size: float, side: _Side) -> Stops:
         over, after = (_up(rng.uniform(*_VISIT_RISE_M)) for _ in range(2))
         meeting = [arrives.moved(over), arrives, leaves, leaves.moved(after)]
         stops = [*stops[:at], *meeting, *stops[at:]]
-        held = range(held[0], held[-1] + 1 + len(meeting))
     return stops
 
 
