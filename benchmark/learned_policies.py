@@ -309,7 +309,12 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
     yield '## Agreement with the simulator, over the policies'
     yield from _agreement(ranking, rates)
     yield '## Rollouts'
-    yield from _rollouts(ranking, root, options)
+    results = [
+        result
+        for result in read_results(root / 'ranking')
+        if result.policy in ranking['policies'] and result.index < options.scenes
+    ]
+    yield from _rollouts(results)
     yield '## Prediction-powered success rates'
     yield (
         f'The first {ranking["num_true_for_powered"]} true episodes of each policy, at most, and '
@@ -323,7 +328,7 @@ def _body(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> I
             for name, found in ranking['policies'].items()
         ],
     )  # fmt: skip
-    yield _saved(list(_results(ranking, root, options)))
+    yield _saved(results)
     yield '## Training'
     yield (
         'Explained: share of the variance of commands, in scenes kept from training, 1.2 s after '
@@ -366,9 +371,8 @@ def _agreement(ranking: dict[str, Any], rates: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> Iterator[str]:
+def _rollouts(results: Sequence[Result]) -> Iterator[str]:
     """What looking adds, when the two worlds part, and the rollouts that are judged worst."""
-    results = list(_results(ranking, root, options))
 
     def right(judged: str) -> str:
         said = [(getattr(result, judged).probability, result.final) for result in results]
@@ -411,12 +415,6 @@ def _rollouts(ranking: dict[str, Any], root: Path, options: argparse.Namespace) 
             for found in worst[:6]
         ],
     )  # fmt: skip
-
-
-def _results(ranking: dict[str, Any], root: Path, options: argparse.Namespace) -> Iterator[Result]:
-    for result in read_results(root / 'ranking'):
-        if result.policy in ranking['policies'] and result.index < options.scenes:
-            yield result
 
 
 def _saved(results: Sequence[Result]) -> str:
