@@ -21,7 +21,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
-    parser.add_argument('--init', type=Path, metavar='DIR', help='start from DIR/object_motion')
+    parser.add_argument(
+        '--init', type=Path, metavar='DIR', help='start from (the first of) DIR/object_motion'
+    )
+    parser.add_argument(
+        '--beside',
+        type=Path,
+        metavar='DIR',
+        help='keep the networks of DIR/object_motion and add this one: where several networks '
+        'disagree about the outcome, the estimate abstains',
+    )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument(
@@ -66,7 +75,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.predictor import load_network
+    from mtv_world_ros.model.object_motion.predictor import load_networks
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
@@ -78,6 +87,10 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
+    init, beside = (
+        () if folder is None else load_networks(folder / OBJECT_MOTION_FOLDER)
+        for folder in (arguments.init, arguments.beside)
+    )
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
@@ -86,7 +99,6 @@ def _train(arguments: argparse.Namespace) -> int:
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     held_out = [starts[0] for starts in tracks[::20]]
-    init = None if arguments.init is None else load_network(arguments.init / OBJECT_MOTION_FOLDER)
     network = train_motion(
         [track for number, starts in enumerate(tracks) if number % 20 for track in starts],
         arguments.out,
@@ -100,7 +112,9 @@ def _train(arguments: argparse.Namespace) -> int:
             width=arguments.width,
             hidden=arguments.hidden,
         ),
-        init=init,
+        init=init[0] if init else None,
+        beside=beside,
+        overwrite=arguments.overwrite,
     )
     errors, ways = end_errors(network, held_out)
     moved = ways > 0.015

@@ -17,11 +17,11 @@ import torch.nn.functional as F
 from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError, TrainingError
-from mtv_world_ros.files import write_whole
+from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
-from mtv_world_ros.model.object_motion.predictor import num_features, save_network
+from mtv_world_ros.model.object_motion.predictor import num_features, save_networks
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 
 #: steps of a training window
@@ -34,6 +34,8 @@ _PLACE_NOISE_M = 0.001
 #: relative one of their features
 _SHAPE_NOISE = 0.02
 _EMA_DECAY = 0.999
+#: outputs of a layer that Muon trains
+_LEAST_ROWS = 8
 #: of a network that begins anew
 _WIDTH, _HIDDEN = 128, 48
 #: steps between two savings, and of a row of the curve
@@ -108,6 +110,8 @@ def train_motion(
     config: MotionTraining,
     *,
     init: ObjectMotionNetwork | None = None,
+    beside: Sequence[ObjectMotionNetwork] = (),
+    overwrite: bool = False,
 ) -> ObjectMotionNetwork:
     """Trains, writes the averaged weights into `out/object_motion`, and returns the network.
 
@@ -119,14 +123,15 @@ def train_motion(
         out: folder.
         config: how.
         init: network to go on from.
+        beside: networks that are kept as they are, and written before the new one.
+        overwrite: `out/object_motion` may be there already, and is replaced.
 
     Raises:
-        TrainingError: no tracks, the folder is there already, `init` is wider than wanted, or the
-            loss is not finite.
+        ConfigError: the folder is there already.
+        TrainingError: no tracks, `init` is wider than wanted, or the loss is not finite.
     """
     folder = Path(out) / OBJECT_MOTION_FOLDER
-    if folder.exists():
-        raise TrainingError(f"'{folder}' exists; choose another --out, or remove it")
+    check_free(folder, overwrite)
     if not tracks:
         raise TrainingError('no episode is left to train on beside those held out; give more')
     torch.manual_seed(config.seed)
@@ -141,10 +146,10 @@ def train_motion(
             losses.append(loss)
             bar.set_postfix(loss=f'{np.mean(losses[-50:]):.3f}')
             if len(losses) % _SAVE_EVERY == 0 or len(losses) == config.steps:
-                _save(_network_of(averaged), folder, losses)
+                _save([*beside, _network_of(averaged)], folder, losses)
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
-        _save(_network_of(averaged), folder, losses)
+        _save([*beside, _network_of(averaged)], folder, losses)
     return _network_of(averaged).eval()
 
 
@@ -173,9 +178,7 @@ def _losses(
 ) -> Iterator[float]:
     """Trains, and yields the loss of each step."""
     rng = np.random.default_rng(config.seed)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4
-    )
+    optimizers = _optimizers(network, config.learning_rate)
     most = max(len(track.features) for track in tracks)
     scenes: dict[str, list[ObjectTracks]] = {}
     for track in tracks:
@@ -185,25 +188,40 @@ def _losses(
     if config.compile:
         network.step = torch.compile(network.step)
     for step in range(config.steps):
-        for group in optimizer.param_groups:
-            group['lr'] = _rate(step, config)
+        for optimizer in optimizers:
+            for group in optimizer.param_groups:
+                group['lr'] = _rate(step, config)
+            optimizer.zero_grad()
         groups = _drawn(tracks, siblings, config.batch_size, rng)
         batch = _turned(_stacked([p for group in groups for p in _windows(group, most, rng)]), rng)
         forced = _forced(step / config.steps, config, batch, rng)
         loss = _loss(network(batch.scene, (batch.points, batch.rotations), forced), batch)
         if not math.isfinite(loss.item()):
             raise TrainingError(f'the loss is {loss.item()} at step {step}; lower --learning-rate')
-        optimizer.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         if torch.isfinite(norm):
-            optimizer.step()
+            for optimizer in optimizers:
+                optimizer.step()
         averaged.update_parameters(network)
         yield loss.item()
 
 
-def _save(network: ObjectMotionNetwork, folder: Path, losses: Sequence[float]) -> None:
-    save_network(network, folder)
+def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.Optimizer]:
+    """Muon (Jordan et al. 2024) for matrices; AdamW for biases and what has few outputs."""
+    weights: list[Tensor] = []
+    others: list[Tensor] = []
+    for parameter in network.parameters():
+        is_matrix = parameter.ndim == 2 and len(parameter) >= _LEAST_ROWS
+        (weights if is_matrix else others).append(parameter)
+    return [
+        torch.optim.Muon(weights, lr=rate, weight_decay=1e-4, adjust_lr_fn='match_rms_adamw'),
+        torch.optim.AdamW(others, lr=rate, betas=(0.9, 0.99), weight_decay=1e-4),
+    ]
+
+
+def _save(networks: Sequence[ObjectMotionNetwork], folder: Path, losses: Sequence[float]) -> None:
+    save_networks(networks, folder)
     rows = [
         f'{first + _CURVE_EVERY},{np.mean(losses[first : first + _CURVE_EVERY]):.4f}'
         for first in range(0, len(losses), _CURVE_EVERY)
