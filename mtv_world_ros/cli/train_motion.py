@@ -22,7 +22,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
     parser.add_argument(
-        '--init', type=Path, metavar='DIR', help='start from (the first of) DIR/object_motion'
+        '--init',
+        type=names,
+        default=(),
+        metavar='DIR[,DIR]',
+        help='start from (the first of) DIR/object_motion; of several, from the mean of their '
+        'weights, which says something only of networks that went on from the same one',
     )
     parser.add_argument(
         '--beside',
@@ -80,6 +85,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
         end_errors,
+        mean_network,
         MotionTraining,
         read_tracks,
         train_motion,
@@ -87,10 +93,8 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
-    init, beside = (
-        () if folder is None else load_networks(folder / OBJECT_MOTION_FOLDER)
-        for folder in (arguments.init, arguments.beside)
-    )
+    init = [load_networks(Path(folder) / OBJECT_MOTION_FOLDER)[0] for folder in arguments.init]
+    beside = arguments.beside and load_networks(arguments.beside / OBJECT_MOTION_FOLDER)
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
@@ -112,8 +116,8 @@ def _train(arguments: argparse.Namespace) -> int:
             width=arguments.width,
             hidden=arguments.hidden,
         ),
-        init=init[0] if init else None,
-        beside=beside,
+        init=mean_network(init) if init else None,
+        beside=beside or (),
         overwrite=arguments.overwrite,
     )
     errors, ways = end_errors(network, held_out)

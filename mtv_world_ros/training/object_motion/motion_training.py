@@ -6,6 +6,7 @@ Shape letters: B batch, T steps, O objects.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+import copy
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -43,7 +44,7 @@ _SAVE_EVERY, _CURVE_EVERY = 500, 100
 #: an object has moved if it went further than this, and siblings have parted [m]
 _MOVED_M = 0.01
 #: of batches, the share drawn as groups of siblings, and the most siblings of a group
-_SIBLINGS_SHARE, _GROUP = 0.5, 4
+_SIBLINGS_SHARE, _GROUP = 0.15, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +72,14 @@ class MotionTraining:
     compile: bool = False
     width: int | None = None
     hidden: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Pool:
+    """Tracks of one number of objects, and those of them that share a scene, by scene."""
+
+    tracks: list[ObjectTracks]
+    siblings: list[list[ObjectTracks]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,6 +162,21 @@ def train_motion(
     return _network_of(averaged).eval()
 
 
+def mean_network(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
+    """Returns the network of mean weights (of one origin, else useless: Wortsman et al. 2022).
+
+    Raises:
+        TrainingError: they differ in size.
+    """
+    mean = copy.deepcopy(networks[0])
+    sizes = [network.config for network in networks]
+    if any(size != sizes[0] for size in sizes):
+        raise TrainingError(f'networks of several sizes have no mean: {sizes}; give those of one')
+    states = [network.state_dict() for network in networks]
+    mean.load_state_dict({k: torch.stack([s[k] for s in states]).mean(0) for k in states[0]})
+    return mean
+
+
 def _network(
     init: ObjectMotionNetwork | None, count: int, config: MotionTraining
 ) -> ObjectMotionNetwork:
@@ -179,12 +203,8 @@ def _losses(
     """Trains, and yields the loss of each step."""
     rng = np.random.default_rng(config.seed)
     optimizers = _optimizers(network, config.learning_rate)
-    most = max(len(track.features) for track in tracks)
-    scenes: dict[str, list[ObjectTracks]] = {}
-    for track in tracks:
-        if track.scene:
-            scenes.setdefault(track.scene, []).append(track)
-    siblings = [group for group in scenes.values() if len(group) > 1]
+    pools = _pools(tracks)
+    shares = np.array([len(pool.tracks) for pool in pools]) / len(tracks)
     if config.compile:
         network.step = torch.compile(network.step)
     for step in range(config.steps):
@@ -192,8 +212,9 @@ def _losses(
             for group in optimizer.param_groups:
                 group['lr'] = _rate(step, config)
             optimizer.zero_grad()
-        groups = _drawn(tracks, siblings, config.batch_size, rng)
-        batch = _turned(_stacked([p for group in groups for p in _windows(group, most, rng)]), rng)
+        pool = pools[int(rng.choice(len(pools), p=shares))]
+        groups = _drawn(pool, config.batch_size, rng)
+        batch = _turned(_stacked([part for group in groups for part in _windows(group, rng)]), rng)
         forced = _forced(step / config.steps, config, batch, rng)
         loss = _loss(network(batch.scene, (batch.points, batch.rotations), forced), batch)
         if not math.isfinite(loss.item()):
@@ -270,25 +291,34 @@ def _forced(
     return torch.from_numpy(forced)
 
 
-def _drawn(
-    tracks: Sequence[ObjectTracks],
-    siblings: Sequence[Sequence[ObjectTracks]],
-    size: int,
-    rng: np.random.Generator,
-) -> list[list[ObjectTracks]]:
+def _pools(tracks: Sequence[ObjectTracks]) -> list[_Pool]:
+    pools: dict[int, list[ObjectTracks]] = {}
+    scenes: dict[str, list[ObjectTracks]] = {}
+    for track in tracks:
+        pools.setdefault(len(track.features), []).append(track)
+        if track.scene:
+            scenes.setdefault(track.scene, []).append(track)
+    families = [family for family in scenes.values() if len(family) > 1]
+    return [
+        _Pool(tracks=own, siblings=[one for one in families if len(one[0].features) == count])
+        for count, own in pools.items()
+    ]
+
+
+def _drawn(pool: _Pool, size: int, rng: np.random.Generator) -> list[list[ObjectTracks]]:
     """A batch of `size` tracks: some in groups of siblings if there are any, others alone."""
     groups: list[list[ObjectTracks]] = []
     left = size
-    while siblings and left > size * (1 - _SIBLINGS_SHARE):
-        family = siblings[int(rng.integers(len(siblings)))]
+    while pool.siblings and left > size * (1 - _SIBLINGS_SHARE):
+        family = pool.siblings[int(rng.integers(len(pool.siblings)))]
         picked = rng.permutation(len(family))[: min(_GROUP, left)]
         groups.append([family[k] for k in picked])
         left -= len(picked)
-    return groups + [[tracks[k]] for k in rng.integers(len(tracks), size=left)]
+    return groups + [[pool.tracks[k]] for k in rng.integers(len(pool.tracks), size=left)]
 
 
 def _windows(
-    group: Sequence[ObjectTracks], most: int, rng: np.random.Generator
+    group: Sequence[ObjectTracks], rng: np.random.Generator
 ) -> list[dict[str, np.ndarray]]:
     """Rows of a batch: windows of tracks of one scene that begin at the same time."""
     parts, last = [], min(len(track.points) for track in group) - 1
@@ -303,7 +333,7 @@ def _windows(
         noise = rng.normal(0.0, _PLACE_NOISE_M, (len(order), 3))
         scale = rng.normal(1.0, _SHAPE_NOISE, (len(order), 1, track.features.shape[2]))
         parted = (np.linalg.norm(points - own, axis=-1) > _MOVED_M).any(0)
-        parts.append(_part(track, rows, order, noise, scale, most, parted))
+        parts.append(_part(track, rows, order, noise, scale, parted))
     return parts
 
 
@@ -311,9 +341,7 @@ def _whole(track: ObjectTracks) -> _Batch:
     order = np.arange(len(track.features))
     rows = np.arange(len(track.points))
     parted = np.zeros((len(rows), len(order)), bool)
-    return _stacked(
-        [_part(track, rows, order, np.zeros((len(order), 3)), 1.0, len(order), parted)]
-    )
+    return _stacked([_part(track, rows, order, np.zeros((len(order), 3)), 1.0, parted)])
 
 
 def _part(
@@ -322,25 +350,21 @@ def _part(
     order: np.ndarray,
     noise: np.ndarray,
     scale: np.ndarray | float,
-    most: int,
     parted: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """One row of a batch, padded to `most` objects."""
-    extra = most - len(order)
+    """One row of a batch, its objects in an order."""
     points = (track.points + noise[np.argsort(order)])[:, order]
-    features = track.features[order] * scale
-    eye = np.broadcast_to(np.eye(3), (len(rows), extra, 3, 3))
     return {
-        'start': np.pad(points[0], ((0, extra), (0, 0))),
-        'features': np.pad(features, ((0, extra), (0, 0), (0, 0))),
-        'present': np.pad(track.known[0][order], (0, extra)),
+        'start': points[0],
+        'features': track.features[order] * scale,
+        'present': track.known[0][order],
         'tools': track.tools[rows],
         'gaps': track.gaps[rows],
-        'points': np.pad(points[rows], ((0, 0), (0, extra), (0, 0))),
-        'rotations': np.concatenate([track.rotations[rows][:, order], eye], axis=1),
-        'known': np.pad(track.known[rows][:, order], ((0, 0), (0, extra))),
+        'points': points[rows],
+        'rotations': track.rotations[rows][:, order],
+        'known': track.known[rows][:, order],
         'turns_known': np.array(track.turns_known),
-        'parted': np.pad(parted[:, order], ((0, 0), (0, extra))),
+        'parted': parted[:, order],
     }
 
 

@@ -25,6 +25,7 @@ from mtv_world_ros.sim.world.opengl import missing_opengl
 from mtv_world_ros.training.object_motion import motion_training
 from mtv_world_ros.training.object_motion.motion_training import (
     end_errors,
+    mean_network,
     MotionTraining,
     read_tracks,
     train_motion,
@@ -93,7 +94,7 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
     torch.manual_seed(0)
     untrained = ObjectMotionNetwork(width=24, hidden=8)
     before = error_of_one_step(untrained, tracks)
-    config = MotionTraining(steps=150, batch_size=4, learning_rate=0.005, forced_share=1.0)
+    config = MotionTraining(steps=200, batch_size=4, learning_rate=0.005, forced_share=1.0)
     network = train_motion(tracks, tmp_path / 'b', config, init=untrained)
     assert error_of_one_step(network, tracks) < 0.9 * before
     after, _ = end_errors(network, tracks)
@@ -111,7 +112,8 @@ def test_a_network_is_added_beside_others_and_replaces_none_unasked(episodes, tm
     small = ['--steps', '1', '--batch-size', '2', '--threads', '1']
     train = ['train-motion', str(episodes[0].parent), *small]
     assert main([*train, '--out', str(one), '--width', '16', '--hidden', '8']) == 0
-    beside = [*train, '--out', str(two), '--init', str(one), '--beside', str(one), '--seed', '1']
+    inits = f'{one},{one}'
+    beside = [*train, '--out', str(two), '--init', inits, '--beside', str(one), '--seed', '1']
     assert main(beside) == 0
     (first,) = load_networks(one / 'object_motion')
     same, other = load_networks(two / 'object_motion')
@@ -124,6 +126,15 @@ def test_a_network_is_added_beside_others_and_replaces_none_unasked(episodes, tm
     assert 'cannot be used' in capsys.readouterr().err and not (tmp_path / 'new').exists()
 
 
+def test_the_mean_of_networks_has_the_mean_of_their_weights():
+    first, second = (ObjectMotionNetwork(width=24, hidden=8) for _ in range(2))
+    mean = mean_network([first, second]).state_dict()
+    for name, value in second.state_dict().items():
+        torch.testing.assert_close(mean[name], (value + first.state_dict()[name]) / 2)
+    with pytest.raises(TrainingError, match='networks of several sizes have no mean'):
+        mean_network([first, ObjectMotionNetwork(width=16, hidden=8)])
+
+
 def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, robot, monkeypatch):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
     assert track.scene == ''
@@ -131,15 +142,19 @@ def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, rob
     first, second = replace(track, scene='a'), replace(track, scene='a', points=away)
     rng = np.random.default_rng(0)
     monkeypatch.setattr(motion_training, '_FROM_START', 1.0)
-    groups = motion_training._drawn([track, first, second], [[first, second]], 8, rng)
+    more = replace(track, features=np.concatenate([track.features, track.features[:1]]))
+    pool, other = motion_training._pools([track, first, second, more])
+    assert (pool.siblings, other.siblings) == ([[first, second]], [])
+    monkeypatch.setattr(motion_training, '_SIBLINGS_SHARE', 0.5)
+    groups = motion_training._drawn(pool, 8, rng)
     assert [len(group) for group in groups] == [2, 2, 1, 1, 1, 1]
-    parts = motion_training._windows([first, second], len(track.features), rng)
+    parts = motion_training._windows([first, second], rng)
     shift = 0.05 * np.arange(len(track.points)) / (len(track.points) - 1)
     for part in parts:
         rows = np.arange(motion_training._WINDOW + 1)
         np.testing.assert_array_equal(part['parted'].all(1), shift[rows] > 0.01)
         np.testing.assert_array_equal(part['parted'].any(1), shift[rows] > 0.01)
-    (alone,) = motion_training._windows([first], len(track.features), rng)
+    (alone,) = motion_training._windows([first], rng)
     assert not alone['parted'].any()
 
 
