@@ -41,6 +41,9 @@ _LEAST_ROWS = 8
 _WIDTH, _HIDDEN = 128, 48
 #: steps between two savings, and of a row of the curve
 _SAVE_EVERY, _CURVE_EVERY = 500, 100
+#: weight of a wrong turn [1 / rad^2], as of 5 mm for .15 rad; how far something tumbles nobody can
+#: know, so that squares of angles above this count little more [rad^2]
+_TURN, _TUMBLE = 10.0, 0.1
 #: an object has moved if it went further than this, and siblings have parted [m]
 _MOVED_M = 0.01
 #: of batches, the share drawn as groups of siblings, and the most siblings of a group
@@ -421,7 +424,8 @@ def _loss(motion: Motion, batch: _Batch) -> Tensor:
     error = (motion.points - batch.points).norm(dim=-1)
     place = F.huber_loss(motion.points, batch.points, reduction='none', delta=0.01).sum(-1) * 1e4
     cosine = (motion.rotations.mT @ batch.rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
-    turn = (3 - cosine) * batch.turns_known[:, None, None]
+    square = (3 - cosine) * batch.turns_known[:, None, None]  # of the angle, while it is small
+    turn = _TURN * square / (1 + square / _TUMBLE)
     spread = motion.spread + 2e-3
     doubt = torch.log(spread) + error.detach() / spread
     # what moves in truth or in imagination: else grasps that hold would count for more than those
@@ -433,4 +437,4 @@ def _loss(motion: Motion, batch: _Batch) -> Tensor:
     weights = (batch.known & batch.scene.present[:, None]) * (
         1.0 + 3.0 * moved + 4.0 * batch.parted
     )
-    return ((place + 0.3 * turn + 0.02 * doubt) * weights).sum() / weights.sum()
+    return ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()

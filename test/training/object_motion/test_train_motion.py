@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 from pathlib import Path
 import resource
 
@@ -196,3 +197,23 @@ def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, ro
 
     assert cost(carried, still) == pytest.approx(cost(still, carried), rel=1e-5)
     assert cost(carried, carried) < cost(still, carried)
+
+
+def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    real = motion_training._whole(track)
+    held = torch.zeros(*real.points.shape[:3], 2)
+
+    def cost(angle=0.0, aside=0.0):
+        cos, sin = math.cos(angle), math.sin(angle)
+        turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        motion = Motion(
+            points=real.points + torch.tensor([aside, 0.0, 0.0]),
+            rotations=real.rotations @ turn,
+            held=held,
+            spread=torch.full(real.points.shape[:3], 0.01),
+        )
+        return motion_training._loss(motion, real).item()
+
+    assert cost(angle=0.15) - cost() > 0.5 * (cost(aside=0.005) - cost())
+    assert cost(angle=3.1) - cost() < cost(aside=0.05) - cost()  # how far it tumbles
