@@ -43,7 +43,15 @@ _WIDTH, _HIDDEN = 128, 48
 _SAVE_EVERY, _CURVE_EVERY = 500, 100
 #: weight of a wrong turn [1 / rad^2], as of 5 mm for .15 rad; how far something tumbles nobody can
 #: know, so that squares of angles above this count little more [rad^2]
-_TURN, _TUMBLE = 10.0, 0.1
+_TURN, _TUMBLE = 20.0, 0.1
+#: where a tool that goes further than this in a step [m] is near an object [m], and that stays
+#: where it is in its frame, but for a share of its way, it carries the object
+_WAY_M, _NEAR_M, _SLIP = 0.005, 0.15, 0.35
+#: an object that goes less stands still, and goes along if it goes further [m]; the network is
+#: told while it has the object nearly where it is [m]
+_STANDS_M, _GOES_M, _RIGHT_M = 0.001, 0.004, 0.015
+#: what a turn of a tool counts as a way [m / rad]
+_LEVER_M = 0.05
 #: an object has moved if it went further than this, and siblings have parted [m]
 _MOVED_M = 0.01
 #: of batches, the share drawn as groups of siblings, and the most siblings of a group
@@ -420,6 +428,20 @@ def _turned(batch: _Batch, rng: np.random.Generator) -> _Batch:
     )
 
 
+def _carried(batch: _Batch) -> tuple[Tensor, Tensor]:
+    """(B, T, O, A) whether a tool carries an object in a step, and whether that is known."""
+    rotations, places = batch.scene.tools[..., :3, :3], batch.scene.tools[..., :3, 3]
+    offset = batch.points[:, :, :, None] - places[:, :, None]
+    local = torch.einsum('btaji,btoaj->btoai', rotations, offset)
+    cosine = (rotations[:, 1:].mT @ rotations[:, :-1]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    way = places.diff(dim=1).norm(dim=-1) + _LEVER_M * (3 - cosine).clamp(min=0).sqrt()
+    way = way[:, :, None]
+    gone = batch.points.diff(dim=1).norm(dim=-1)[..., None]
+    asked = (way > _WAY_M) & (local[:, 1:].norm(dim=-1) < _NEAR_M)
+    carried = (local.diff(dim=1).norm(dim=-1) < _SLIP * way) & (gone > _GOES_M)
+    return carried, asked & (carried | (gone < _STANDS_M))
+
+
 def _loss(motion: Motion, batch: _Batch) -> Tensor:
     error = (motion.points - batch.points).norm(dim=-1)
     place = F.huber_loss(motion.points, batch.points, reduction='none', delta=0.01).sum(-1) * 1e4
@@ -437,4 +459,10 @@ def _loss(motion: Motion, batch: _Batch) -> Tensor:
     weights = (batch.known & batch.scene.present[:, None]) * (
         1.0 + 3.0 * moved + 4.0 * batch.parted
     )
-    return ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()
+    loss = ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()
+    # else it would move what is held by pushing it, which does not turn it
+    carried, asked = _carried(batch)
+    asked &= ((error < _RIGHT_M) & batch.known & batch.scene.present[:, None])[:, 1:, :, None]
+    held = motion.held[:, 1:].clamp(1e-4, 1 - 1e-4)
+    wrong = F.binary_cross_entropy(held, carried.float(), reduction='none')
+    return loss + (wrong * asked).sum() / asked.sum().clamp(min=1)

@@ -217,3 +217,18 @@ def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
 
     assert cost(angle=0.15) - cost() > 0.5 * (cost(aside=0.005) - cost())
     assert cost(angle=3.1) - cost() < cost(aside=0.05) - cost()  # how far it tumbles
+
+
+def test_what_follows_a_tool_is_carried_and_what_stays_is_not(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    real = motion_training._whole(track)
+    tools = torch.eye(4).repeat(1, 9, 2, 1, 1)
+    tools[0, :, 0, 2, 3] = 0.01 * torch.arange(9)  # the first tool rises, the second stands still
+    points = torch.zeros(1, 9, 3, 3)
+    points[0, :, 0, 2] = 0.01 * torch.arange(9)
+    points[0, :, 2, 0] = 0.5
+    scene = replace(real.scene, tools=tools)
+    carried, asked = motion_training._carried(replace(real, scene=scene, points=points))
+    assert carried[0, :, 0, 0].all() and not carried[0, :, 1:].any()
+    assert asked[0, :, :2, 0].all()  # the third object is far away
+    assert not asked[0, :, 2].any() and not asked[..., 1].any()
