@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -128,7 +128,7 @@ def load_pipeline(
         CheckpointError, ConfigError, RobotError: see their messages.
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import load_networks
+    from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -158,7 +158,7 @@ def load_pipeline(
         describer=asked_describer(describer),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
-        object_motion=() if loaded.object_motion is None else load_networks(loaded.object_motion),
+        object_motion=None if loaded.object_motion is None else load_network(loaded.object_motion),
     )
 
 
@@ -173,7 +173,7 @@ def assemble(
     describer: Describer | None = None,
     calibration: Calibration | None = None,
     horizon: HorizonCurve | None = None,
-    object_motion: Sequence[ObjectMotionNetwork] = (),
+    object_motion: ObjectMotionNetwork | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
     segmenter = segmenter or assemble_segmenter()
@@ -196,13 +196,13 @@ def assemble(
 
 
 def _predictor(
-    networks: Sequence[ObjectMotionNetwork], robot: RobotModel
+    network: ObjectMotionNetwork | None, robot: RobotModel
 ) -> ObjectMotionPredictor | None:
-    if not networks:
+    if network is None:
         return None
     from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
 
-    return ObjectMotionPredictor(networks, robot)
+    return ObjectMotionPredictor(network, robot)
 
 
 def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:

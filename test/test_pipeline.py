@@ -332,7 +332,7 @@ def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
     pipeline = assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM)
-    predictor = ObjectMotionPredictor([ObjectMotionNetwork()], pipeline.robot)
+    predictor = ObjectMotionPredictor(ObjectMotionNetwork(), pipeline.robot)
     episode = replace(pipeline, object_motion=predictor).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
     assert len(chunks) == 2 and chunks[-1].masks.names == ()

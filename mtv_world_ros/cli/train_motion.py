@@ -26,15 +26,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=names,
         default=(),
         metavar='DIR[,DIR]',
-        help='start from (the first of) DIR/object_motion; of several, from the mean of their '
+        help='start from DIR/object_motion; of several, from the mean of their '
         'weights, which says something only of networks that went on from the same one',
-    )
-    parser.add_argument(
-        '--beside',
-        type=Path,
-        metavar='DIR',
-        help='keep the networks of DIR/object_motion and add this one: where several networks '
-        'disagree about the outcome, the estimate abstains',
     )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
@@ -80,7 +73,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.predictor import load_networks
+    from mtv_world_ros.model.object_motion.predictor import load_network
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
@@ -93,8 +86,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
-    init = [load_networks(Path(folder) / OBJECT_MOTION_FOLDER)[0] for folder in arguments.init]
-    beside = arguments.beside and load_networks(arguments.beside / OBJECT_MOTION_FOLDER)
+    init = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
@@ -117,7 +109,6 @@ def _train(arguments: argparse.Namespace) -> int:
             hidden=arguments.hidden,
         ),
         init=mean_network(init) if init else None,
-        beside=beside or (),
         overwrite=arguments.overwrite,
     )
     errors, ways = end_errors(network, held_out)

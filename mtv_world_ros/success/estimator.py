@@ -12,7 +12,7 @@ from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
-from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenMotions, is_undecided
+from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenMotions
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
@@ -123,8 +123,6 @@ class SuccessEstimator:
             return Judged(_abstains(reason, views, subjects), memory)
         starts = memory.points[:, 0]
         succeeded = None if foreseen is None else foreseen.succeeds(task, bound, starts)
-        if succeeded is not None and is_undecided(succeeded):
-            return Judged(_abstains(CannotTell(_count(succeeded)), views, subjects), memory)
         return Judged(self._judge(task, evidence, views, succeeded), memory)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
@@ -163,7 +161,7 @@ class SuccessEstimator:
             ]
         reasons += evidence.notes
         if succeeded is not None:
-            reasons.append(_count(succeeded))
+            reasons.append(f'{sum(succeeded)} of {len(succeeded)} foreseen motions succeed')
         if task.gripper == 'open' and views.footage.openings is None:
             reasons.append('gripper not checked')
         elif features['released'] == 0.0:
@@ -186,10 +184,6 @@ class SuccessEstimator:
             return f'uncalibrated: {stated}'
         objection = self.calibration.objection(task.name, self.segmenter)
         return objection and f'{objection}: {stated}'
-
-
-def _count(succeeded: FloatArray) -> str:
-    return f'{sum(succeeded)} of {len(succeeded)} foreseen motions succeed'
 
 
 def _origin(calibration: Calibration | None) -> str:

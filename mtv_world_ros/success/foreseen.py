@@ -1,8 +1,7 @@
 """How often a task succeeds among the motions that are foreseen: evidence before any picture.
 
-An object motion model foresees several motions of the same plan: from places and sizes within the
-error of the masks, and by several networks. Where some of them fail, a grasp is near its limits;
-where about half of them do, the outcome is not known.
+An object motion model foresees several motions of the same plan, from places and sizes within the
+error of the masks. Where some of them fail, a grasp is near its limits.
 
 K motions, N steps, O objects, A arms.
 """
@@ -20,9 +19,6 @@ from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.success.situation import CannotTell, TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
-
-#: least share of motions that contradict the others for the outcome to be unknown
-_UNDECIDED = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,11 +91,6 @@ def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> For
         sizes=objects.tracked.sizes,
         openings=robot.gripper_openings(objects.positions[kept]),
     )
-
-
-def is_undecided(succeeded: FloatArray) -> bool:
-    """Returns whether the motions disagree about the outcome."""
-    return bool(_UNDECIDED < np.mean(succeeded) < 1 - _UNDECIDED)
 
 
 def foreseen_feature(succeeded: FloatArray | None) -> float:

@@ -412,14 +412,14 @@ def _networks() -> list[bytes]:
 
 
 def _read_network(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.object_motion.predictor import load_networks
+    from mtv_world_ros.model.object_motion.predictor import load_network
 
     source = share_path('resource', 'checkpoint', 'object_motion')
     (folder / 'motion').mkdir(exist_ok=True)
     if not (folder / 'motion' / 'model.safetensors').exists():
         (folder / 'motion' / 'model.safetensors').symlink_to(source / 'model.safetensors')
     _file(folder / 'motion' / 'config.json', data)
-    return load_networks(folder / 'motion')
+    return load_network(folder / 'motion')
 
 
 KINDS = {

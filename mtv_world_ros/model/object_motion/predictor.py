@@ -1,7 +1,4 @@
-"""Object motion networks in use: objects found in a frame, and where a plan takes them.
-
-Several networks, trained apart, foresee together: where contact is hard to tell, they disagree.
-"""
+"""The object motion network in use: objects found in a frame, and where a plan takes them."""
 
 from __future__ import annotations
 
@@ -47,19 +44,16 @@ class ObjectMotionPredictor:
     """Finds objects in a frame; `TrackedObjects` says where they go.
 
     Args:
-        networks: M trained ones; what the first expects is shown.
+        network: trained.
         robot: gives tools and grippers.
-        num_disturbed: motions from places and sizes within the error of what masks tell, shared
-            among the networks; each of these gives the expected one beside.
+        num_disturbed: motions beside the expected one, from places and sizes within the error of
+            what masks tell.
     """
 
     def __init__(
-        self,
-        networks: Sequence[ObjectMotionNetwork],
-        robot: RobotModel,
-        num_disturbed: int = 12,
+        self, network: ObjectMotionNetwork, robot: RobotModel, num_disturbed: int = 12
     ) -> None:
-        self.networks, self.robot = tuple(network.eval() for network in networks), robot
+        self.network, self.robot = network.eval(), robot
         rng = np.random.default_rng(0)
         self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
         self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
@@ -99,7 +93,7 @@ class TrackedObjects:
         model: says where they go.
         reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
         features: (O, V, F) of `object_shapes`.
-        memories: M of the networks; None = nothing has moved yet.
+        memory: of the network; None = nothing has moved yet.
         tools: (A, 4, 4) T_base_tool one step before.
         gaps: (A,) one step before [m].
     """
@@ -107,7 +101,7 @@ class TrackedObjects:
     model: ObjectMotionPredictor
     reference: FloatArray
     features: FloatArray
-    memories: tuple[Memory, ...] | None = None
+    memory: Memory | None = None
     tools: FloatArray | None = None
     gaps: FloatArray | None = None
 
@@ -133,39 +127,32 @@ class TrackedObjects:
         robot = self.model.robot
         tools = robot.tool_poses(positions).transpose(1, 0, 2, 3)
         gaps = finger_gaps(robot, positions)
-        last = tools[0] if self.tools is None else self.tools
+        before = tools[0] if self.tools is None else self.tools
         apart = gaps[0] if self.gaps is None else self.gaps
-        tools = np.concatenate([last[None], tools])
+        tools = np.concatenate([before[None], tools])
         gaps = np.concatenate([apart[None], gaps])
         known = np.asarray(np.isfinite(self.reference).all(-1))
         places, features = self.model.disturbed(
             np.where(known[:, None], self.reference, 0.0), self.features
         )
-        networks = self.model.networks
-        moved, memories = [], []
-        for number, network in enumerate(networks):
-            shared = np.r_[0, 1 + number : len(places) : len(networks)]
-            count = len(shared)
-            scene = Scene(
-                points=_tensor(places[shared]),
-                features=_tensor(features[shared]),
-                present=torch.from_numpy(known).expand(count, -1),
-                tools=_tensor(tools).expand(count, -1, -1, -1, -1),
-                gaps=_tensor(gaps).expand(count, -1, -1),
-            )
-            before = None if self.memories is None else self.memories[number]
-            with torch.inference_mode():
-                motion, memory = network.roll(scene, before, skip=1)
-            memories.append(memory)
-            ways = motion.points.double().numpy() - places[shared][:, None]
-            points = np.where(known[:, None], self.reference + ways, np.nan)
-            rotations = motion.rotations.double().numpy()
-            moved += [
-                ObjectMotion(reference=self.reference, points=points[k], rotations=rotations[k])
-                for k in range(count)
-            ]
-        after = replace(self, memories=tuple(memories), tools=tools[-2], gaps=gaps[-2])
-        return tuple(moved), after
+        count = len(places)
+        scene = Scene(
+            points=_tensor(places),
+            features=_tensor(features),
+            present=torch.from_numpy(known).expand(count, -1),
+            tools=_tensor(tools).expand(count, -1, -1, -1, -1),
+            gaps=_tensor(gaps).expand(count, -1, -1),
+        )
+        with torch.inference_mode():
+            motion, memory = self.model.network.roll(scene, self.memory, skip=1)
+        ways = motion.points.double().numpy() - places[:, None]
+        points = np.where(known[:, None], self.reference + ways, np.nan)
+        rotations = motion.rotations.double().numpy()
+        moved = tuple(
+            ObjectMotion(reference=self.reference, points=points[k], rotations=rotations[k])
+            for k in range(count)
+        )
+        return moved, replace(self, memory=memory, tools=tools[-2], gaps=gaps[-2])
 
 
 def finger_gaps(robot: RobotModel, positions: FloatArray) -> FloatArray:
@@ -180,37 +167,20 @@ def _tensor(values: FloatArray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
-def save_networks(networks: Sequence[ObjectMotionNetwork], folder: Path) -> None:
-    """Writes networks into a folder; those that were there stay until the new ones are complete.
-
-    The first lies in the folder itself, the others in its subfolders 2, 3, ...
-    """
+def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
+    """Writes a network into a folder; one that was there stays until the new one is complete."""
+    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
     with disk_errors(), whole_folder(folder) as partial:
-        for number, network in enumerate(networks, start=1):
-            own = _folder_of(partial, number)
-            own.mkdir(exist_ok=True)
-            tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-            save_file(tensors, own / _WEIGHTS)
-            write_json(own / _CONFIG, network.config)
+        save_file(tensors, partial / _WEIGHTS)
+        write_json(partial / _CONFIG, network.config)
 
 
-def load_networks(folder: Path) -> tuple[ObjectMotionNetwork, ...]:
-    """Reads the networks of a folder, see `save_networks`.
+def load_network(folder: Path) -> ObjectMotionNetwork:
+    """Reads a network.
 
     Raises:
         CheckpointError: the folder is not there, or what it holds is not whole.
     """
-    networks = [_load(folder)]
-    while (own := _folder_of(folder, len(networks) + 1)).is_dir():
-        networks.append(_load(own))
-    return tuple(networks)
-
-
-def _folder_of(folder: Path, number: int) -> Path:
-    return folder if number == 1 else folder / str(number)
-
-
-def _load(folder: Path) -> ObjectMotionNetwork:
     try:
         network = ObjectMotionNetwork(**read_json(folder / _CONFIG))
         network.load_state_dict(load_file(folder / _WEIGHTS))

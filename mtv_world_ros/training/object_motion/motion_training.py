@@ -22,7 +22,7 @@ from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
-from mtv_world_ros.model.object_motion.predictor import num_features, save_networks
+from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 
 #: steps of a training window
@@ -130,7 +130,6 @@ def train_motion(
     config: MotionTraining,
     *,
     init: ObjectMotionNetwork | None = None,
-    beside: Sequence[ObjectMotionNetwork] = (),
     overwrite: bool = False,
 ) -> ObjectMotionNetwork:
     """Trains, writes the averaged weights into `out/object_motion`, and returns the network.
@@ -143,7 +142,6 @@ def train_motion(
         out: folder.
         config: how.
         init: network to go on from.
-        beside: networks that are kept as they are, and written before the new one.
         overwrite: `out/object_motion` may be there already, and is replaced.
 
     Raises:
@@ -166,10 +164,10 @@ def train_motion(
             losses.append(loss)
             bar.set_postfix(loss=f'{np.mean(losses[-50:]):.3f}')
             if len(losses) % _SAVE_EVERY == 0 or len(losses) == config.steps:
-                _save([*beside, _network_of(averaged)], folder, losses)
+                _save(_network_of(averaged), folder, losses)
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
-        _save([*beside, _network_of(averaged)], folder, losses)
+        _save(_network_of(averaged), folder, losses)
     return _network_of(averaged).eval()
 
 
@@ -252,8 +250,8 @@ def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.O
     ]
 
 
-def _save(networks: Sequence[ObjectMotionNetwork], folder: Path, losses: Sequence[float]) -> None:
-    save_networks(networks, folder)
+def _save(network: ObjectMotionNetwork, folder: Path, losses: Sequence[float]) -> None:
+    save_network(network, folder)
     rows = [
         f'{first + _CURVE_EVERY},{np.mean(losses[first : first + _CURVE_EVERY]):.4f}'
         for first in range(0, len(losses), _CURVE_EVERY)

@@ -13,27 +13,23 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork, Scene
 from mtv_world_ros.model.object_motion.predictor import (
-    load_networks,
+    load_network,
     ObjectMotionPredictor,
-    save_networks,
+    save_network,
     TrackedObjects,
 )
 
 STEPS = 12
 
 
-def network_of(seed: int) -> ObjectMotionNetwork:
-    torch.manual_seed(seed)
+@pytest.fixture
+def network() -> ObjectMotionNetwork:
+    torch.manual_seed(0)
     network = ObjectMotionNetwork(width=32, hidden=16)
     with torch.no_grad():  # an untrained one would hold everything still
         for parameter in network.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     return network.eval()
-
-
-@pytest.fixture
-def network() -> ObjectMotionNetwork:
-    return network_of(0)
 
 
 def scene(num_objects: int, present: int) -> Scene:
@@ -132,7 +128,7 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network)
     rng = np.random.default_rng(0)
     positions = np.cumsum(rng.normal(0, 0.02, (9, len(robot.joint_names))), axis=0)
     tracked = TrackedObjects(
-        model=ObjectMotionPredictor([network], robot),
+        model=ObjectMotionPredictor(network, robot),
         reference=np.array([[0.1, 0.2, 0.02], [np.nan] * 3]),
         features=np.full((2, 2, 9), 0.04),
     )
@@ -149,38 +145,11 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()
 
 
-def test_several_networks_foresee_what_each_foresees_alone(network):
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-    rng = np.random.default_rng(0)
-    positions = np.cumsum(rng.normal(0, 0.02, (9, len(robot.joint_names))), axis=0)
-    networks = [network, network_of(1), network_of(2)]
-
-    def foreseen(predictor):
-        tracked = TrackedObjects(
-            model=predictor,
-            reference=np.array([[0.1, 0.2, 0.02]]),
-            features=np.full((1, 2, 9), 0.04),
-        )
-        first, later = tracked.advance(positions[:5])
-        second, _ = later.advance(positions[4:])
-        return [before.then(after) for before, after in zip(first, second, strict=True)]
-
-    together = foreseen(ObjectMotionPredictor(networks, robot))
-    assert len(together) == 3 + 12
-    for number, own in enumerate(networks):
-        alone = foreseen(ObjectMotionPredictor([own], robot))
-        mine = together[5 * number : 5 * number + 5]
-        for motion, wanted in zip(mine, [alone[0], *alone[1 + number :: 3]], strict=True):
-            np.testing.assert_allclose(motion.points, wanted.points, atol=1e-6)
-
-
 def test_what_is_saved_is_read_again_and_damage_is_named(network, tmp_path):
-    networks = [network, network_of(1), network_of(2)]
-    save_networks(networks, tmp_path / 'object_motion')
-    read = load_networks(tmp_path / 'object_motion')
-    for had, wanted in zip(read, networks, strict=True):
-        for name, value in wanted.state_dict().items():
-            torch.testing.assert_close(had.state_dict()[name], value)
+    save_network(network, tmp_path / 'object_motion')
+    read = load_network(tmp_path / 'object_motion')
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(read.state_dict()[name], value)
     (tmp_path / 'object_motion' / 'model.safetensors').write_bytes(b'no')
     with pytest.raises(CheckpointError, match=r'object_motion.*cannot be used'):
-        load_networks(tmp_path / 'object_motion')
+        load_network(tmp_path / 'object_motion')

@@ -17,7 +17,7 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
-from mtv_world_ros.model.object_motion.predictor import load_networks, save_networks
+from mtv_world_ros.model.object_motion.predictor import load_network, save_network
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
@@ -99,7 +99,7 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
     network = train_motion(tracks, tmp_path / 'b', config, init=untrained)
     assert error_of_one_step(network, tracks) < 0.9 * before
     after, _ = end_errors(network, tracks)
-    (loaded,) = load_networks(tmp_path / 'b' / 'object_motion')
+    loaded = load_network(tmp_path / 'b' / 'object_motion')
     np.testing.assert_allclose(end_errors(loaded, tracks)[0], after, atol=1e-6)
     assert (loaded.width, loaded.hidden) == (24, 8)
     with pytest.raises(ConfigError, match='exists; give another --out'):
@@ -108,22 +108,19 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
         train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
-def test_a_network_is_added_beside_others_and_replaces_none_unasked(episodes, tmp_path, capsys):
+def test_training_goes_on_from_networks_and_replaces_none_unasked(episodes, tmp_path, capsys):
     one, two = tmp_path / 'one', tmp_path / 'two'
     small = ['--steps', '1', '--batch-size', '2', '--threads', '1']
     train = ['train-motion', str(episodes[0].parent), *small]
     assert main([*train, '--out', str(one), '--width', '16', '--hidden', '8']) == 0
-    inits = f'{one},{one}'
-    beside = [*train, '--out', str(two), '--init', inits, '--beside', str(one), '--seed', '1']
-    assert main(beside) == 0
-    (first,) = load_networks(one / 'object_motion')
-    same, other = load_networks(two / 'object_motion')
-    assert torch.equal(same.free.bias, first.free.bias)
-    assert not torch.equal(other.shape[0].weight, first.shape[0].weight)
-    assert main(beside) == 1
+    again = [*train, '--out', str(two), '--init', f'{one},{one}', '--seed', '1']
+    assert main(again) == 0
+    loaded = load_network(two / 'object_motion')
+    assert (loaded.width, loaded.hidden) == (16, 8)
+    assert main(again) == 1
     assert "two/object_motion' exists; give another --out" in capsys.readouterr().err
-    assert main([*beside, '--overwrite']) == 0
-    assert main([*train, '--out', str(tmp_path / 'new'), '--beside', str(tmp_path)]) == 1
+    assert main([*again, '--overwrite']) == 0
+    assert main([*train, '--out', str(tmp_path / 'new'), '--init', str(tmp_path)]) == 1
     assert 'cannot be used' in capsys.readouterr().err and not (tmp_path / 'new').exists()
 
 
@@ -169,16 +166,16 @@ def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
 def test_a_full_disk_leaves_the_last_network_whole(tmp_path):
     """Files may not grow beyond a limit here, which fails at the same calls as a full disk."""
     first, second = (ObjectMotionNetwork(width=24, hidden=8) for _ in range(2))
-    save_networks([first], tmp_path / 'object_motion')
+    save_network(first, tmp_path / 'object_motion')
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
     try:
         with pytest.raises(OSError, match='too large|No space'):
-            save_networks([second], tmp_path / 'object_motion')
+            save_network(second, tmp_path / 'object_motion')
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [path.name for path in tmp_path.iterdir()] == ['object_motion']
-    kept, wanted = load_networks(tmp_path / 'object_motion')[0].state_dict(), first.state_dict()
+    kept, wanted = load_network(tmp_path / 'object_motion').state_dict(), first.state_dict()
     assert all(torch.equal(kept[name], value) for name, value in wanted.items())
 
 
