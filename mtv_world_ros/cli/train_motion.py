@@ -86,7 +86,8 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
-    init = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
+    given = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
+    init = mean_network(given) if given else None
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
@@ -108,7 +109,7 @@ def _train(arguments: argparse.Namespace) -> int:
             width=arguments.width,
             hidden=arguments.hidden,
         ),
-        init=mean_network(init) if init else None,
+        init=init,
         overwrite=arguments.overwrite,
     )
     errors, ways = end_errors(network, held_out)

@@ -426,14 +426,18 @@ def _turned(batch: _Batch, rng: np.random.Generator) -> _Batch:
     )
 
 
+def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
+    """(...) of rotations (..., 3, 3), while it is small [rad^2]."""
+    return 3 - (first.mT @ second).diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
 def _carried(batch: _Batch) -> tuple[Tensor, Tensor]:
     """(B, T, O, A) whether a tool carries an object in a step, and whether that is known."""
     rotations, places = batch.scene.tools[..., :3, :3], batch.scene.tools[..., :3, 3]
     offset = batch.points[:, :, :, None] - places[:, :, None]
     local = torch.einsum('btaji,btoaj->btoai', rotations, offset)
-    cosine = (rotations[:, 1:].mT @ rotations[:, :-1]).diagonal(dim1=-2, dim2=-1).sum(-1)
-    way = places.diff(dim=1).norm(dim=-1) + _LEVER_M * (3 - cosine).clamp(min=0).sqrt()
-    way = way[:, :, None]
+    turn = _squared_angle(rotations[:, 1:], rotations[:, :-1]).clamp(min=0).sqrt()
+    way = (places.diff(dim=1).norm(dim=-1) + _LEVER_M * turn)[:, :, None]
     gone = batch.points.diff(dim=1).norm(dim=-1)[..., None]
     asked = (way > _WAY_M) & (local[:, 1:].norm(dim=-1) < _NEAR_M)
     carried = (local.diff(dim=1).norm(dim=-1) < _SLIP * way) & (gone > _GOES_M)
@@ -443,8 +447,7 @@ def _carried(batch: _Batch) -> tuple[Tensor, Tensor]:
 def _loss(motion: Motion, batch: _Batch) -> Tensor:
     error = (motion.points - batch.points).norm(dim=-1)
     place = F.huber_loss(motion.points, batch.points, reduction='none', delta=0.01).sum(-1) * 1e4
-    cosine = (motion.rotations.mT @ batch.rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
-    square = (3 - cosine) * batch.turns_known[:, None, None]  # of the angle, while it is small
+    square = _squared_angle(motion.rotations, batch.rotations) * batch.turns_known[:, None, None]
     turn = _TURN * square / (1 + square / _TUMBLE)
     spread = motion.spread + 2e-3
     doubt = torch.log(spread) + error.detach() / spread
