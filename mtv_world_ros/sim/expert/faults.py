@@ -229,6 +229,9 @@ FAULTS: Mapping[str, FaultKind] = {
         contact=False,
     ),
     'fast': _kind('speed', 'calibrate', 1, 3.0, '', 'it is this share faster'),
+    'freeze': _kind(
+        'speed', 'calibrate', 0.9, 3.0, 's', 'commands of this length are lost, three times'
+    ),
     'stall': _kind(
         'speed', 'test', 0.8, 3.0, 's', 'the arms stand still for a while, the grippers do not'
     ),
@@ -425,6 +428,8 @@ _NOISE_KNOT_S = 0.5
 _BACK_S = 0.4
 #: time in which a constant error sets in [s]
 _SET_IN_S = 1.0
+#: how often commands are lost
+_NUM_LOST = 3
 #: outliers of a plan, and how long each lasts [s]
 _NUM_SPIKES, _SPIKE_S = 3, 0.4
 #: travel from which on an arm joint takes part in a plan [rad]
@@ -501,6 +506,9 @@ def _controller_faults(
         own = np.random.default_rng(rng.integers(2**32))
         positions = _weak(positions, grippers, variant.size('weak'), own)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
+    if variant.size('freeze'):
+        own = np.random.default_rng(rng.integers(2**32))
+        positions = _freeze(positions, round(variant.size('freeze') / period), own)
     error = np.zeros_like(positions)
     rows, joints = error.shape
     if variant.size('zero'):
@@ -616,6 +624,14 @@ def _spikes(
     middles = rng.uniform(0.1, 0.9, _NUM_SPIKES) * num
     away = np.abs(np.arange(num)[:, None] - middles) * period / (_SPIKE_S / 2)
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (_NUM_SPIKES, num_joints))
+
+
+def _freeze(positions: FloatArray, num: int, rng: np.random.Generator) -> FloatArray:
+    """(T, J): `num` commands in a row are lost at a few places, where the last one holds."""
+    held = np.arange(len(positions))
+    for first in (rng.uniform(0.1, 0.9, _NUM_LOST) * len(positions)).astype(int):
+        held[first : first + num] = held[first]
+    return positions[held]
 
 
 def _smooth(positions: FloatArray, grippers: list[int], num: int) -> FloatArray:
