@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
+from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
@@ -35,8 +36,6 @@ from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 if TYPE_CHECKING:
-    from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
-    from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
     from mtv_world_ros.vision.describers.describer_config import DescriberConfig
     from mtv_world_ros.vision.describers.vlm import Chat
 
@@ -128,7 +127,7 @@ def load_pipeline(
         CheckpointError, ConfigError, RobotError: see their messages.
     """
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import load_network
+    from mtv_world_ros.model.object_motion.predictor import load_predictor
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -158,7 +157,9 @@ def load_pipeline(
         describer=asked_describer(describer),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
-        object_motion=None if loaded.object_motion is None else load_network(loaded.object_motion),
+        object_motion=None
+        if loaded.object_motion is None
+        else load_predictor(loaded.object_motion, model),
     )
 
 
@@ -173,7 +174,7 @@ def assemble(
     describer: Describer | None = None,
     calibration: Calibration | None = None,
     horizon: HorizonCurve | None = None,
-    object_motion: ObjectMotionNetwork | None = None,
+    object_motion: ObjectMotionModel | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
     segmenter = segmenter or assemble_segmenter()
@@ -191,18 +192,8 @@ def assemble(
         objects=objects,
         describer=describer,
         horizon=horizon,
-        object_motion=_predictor(object_motion, robot),
+        object_motion=object_motion,
     )
-
-
-def _predictor(
-    network: ObjectMotionNetwork | None, robot: RobotModel
-) -> ObjectMotionPredictor | None:
-    if network is None:
-        return None
-    from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
-
-    return ObjectMotionPredictor(network, robot)
 
 
 def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:

@@ -15,8 +15,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         'train-motion',
         help='train the object motion network: how objects move under commanded tools',
         description='Trains the object motion network of a checkpoint: where objects go when '
-        'grippers grasp, carry, push and drop them. It learns from recorded episodes: masks of '
-        'the first frame, commands, and where the objects went (/object_poses, else the masks). '
+        'grippers grasp, carry, push and drop them; and how arms follow their commands. It learns '
+        'from recorded episodes: masks of the first frame, commands, joint states, and where the '
+        'objects went (/object_poses, else the masks). '
         "Writes OUT/object_motion; OUT may be the checkpoint's folder.",
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
@@ -73,7 +74,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.predictor import load_network
+    from mtv_world_ros.model.object_motion.predictor import load_network, save_response
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
@@ -83,6 +84,7 @@ def _train(arguments: argparse.Namespace) -> int:
         read_tracks,
         train_motion,
     )
+    from mtv_world_ros.training.object_motion.response_fit import found_response
     from mtv_world_ros.training.training_run import find_episodes
 
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
@@ -92,7 +94,9 @@ def _train(arguments: argparse.Namespace) -> int:
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
     refuse_test_kinds(paths, 'training')
-    tracks, skipped = read_tracks(paths, robot, arguments.views, arguments.starts)
+    response, told = found_response(paths, robot)
+    print(told)
+    tracks, skipped = read_tracks(paths, robot, arguments.views, arguments.starts, response)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     held_out = [starts[0] for starts in tracks[::20]]
@@ -112,6 +116,8 @@ def _train(arguments: argparse.Namespace) -> int:
         init=init,
         overwrite=arguments.overwrite,
     )
+    if response is not None:
+        save_response(response, robot, arguments.out / OBJECT_MOTION_FOLDER)
     errors, ways = end_errors(network, held_out)
     moved = ways > 0.015
     print(f'{len(tracks)} episodes, {len(skipped)} left out; {len(held_out)} held out:')

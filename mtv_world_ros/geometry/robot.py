@@ -184,6 +184,23 @@ class RobotModel:
                 openings[arm] = (values - tool.gripper_closed) / travel
         return openings.clip(0.0, 1.0)
 
+    def dynamics(
+        self, positions: FloatArray, velocities: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns the mass matrix (J, J), and the forces (J,) of joints (J,) without gravity.
+
+        Both are zero where the description has no inertias.
+        """
+        model, data = self.pinocchio_model, self.pinocchio_model.createData()
+        q = self._configurations(positions[None])[0]
+        follows = np.zeros((model.nv, len(self.joint_names)))
+        for joint, column, multiplier, _ in self._setters:
+            follows[joint.idx_v, column] = multiplier
+        v = follows @ velocities
+        mass = follows.T @ pin.crba(model, data, q) @ follows
+        still = pin.computeGeneralizedGravity(model, data, q)
+        return mass, follows.T @ (pin.nonLinearEffects(model, data, q, v) - still)
+
     def _poses(self, positions: FloatArray, links: Sequence[str]) -> FloatArray:
         """(len(links), T, 4, 4)."""
         model, data = self.pinocchio_model, self.pinocchio_model.createData()

@@ -21,6 +21,12 @@ from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.object_motion.arm_response import (
+    ArmResponse,
+    ArmState,
+    as_json,
+    from_json,
+)
 from mtv_world_ros.model.object_motion.network import (
     Memory,
     ObjectMotionNetwork,
@@ -37,7 +43,7 @@ _MAX_OBJECTS = 16
 _LEAST_HEIGHT_M = 0.004
 #: travel of a finger where the robot's file does not say it [m]
 _TRAVEL_M = 0.04
-_CONFIG, _WEIGHTS = 'config.json', 'model.safetensors'
+_CONFIG, _WEIGHTS, _RESPONSE = 'config.json', 'model.safetensors', 'arm_response.json'
 
 
 class ObjectMotionPredictor:
@@ -48,12 +54,18 @@ class ObjectMotionPredictor:
         robot: gives tools and grippers.
         num_disturbed: motions beside the expected one, from places and sizes within the error of
             what masks tell.
+        response: how the arms follow their commands, as the network was trained with; None = at
+            once.
     """
 
     def __init__(
-        self, network: ObjectMotionNetwork, robot: RobotModel, num_disturbed: int = 12
+        self,
+        network: ObjectMotionNetwork,
+        robot: RobotModel,
+        num_disturbed: int = 12,
+        response: ArmResponse | None = None,
     ) -> None:
-        self.network, self.robot = network.eval(), robot
+        self.network, self.robot, self.response = network.eval(), robot, response
         rng = np.random.default_rng(0)
         self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
         self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
@@ -96,6 +108,7 @@ class TrackedObjects:
         memory: of the network; None = nothing has moved yet.
         tools: (A, 4, 4) T_base_tool one step before.
         gaps: (A,) one step before [m].
+        arms: where the arms really are by now, with a response.
     """
 
     model: ObjectMotionPredictor
@@ -104,6 +117,7 @@ class TrackedObjects:
     memory: Memory | None = None
     tools: FloatArray | None = None
     gaps: FloatArray | None = None
+    arms: ArmState | None = None
 
     @property
     def step_s(self) -> float:
@@ -124,8 +138,11 @@ class TrackedObjects:
         The first motion is the expected one, the others are of disturbed places and sizes. Row 0
         is where they are now.
         """
-        robot = self.model.robot
-        tools = robot.tool_poses(positions).transpose(1, 0, 2, 3)
+        robot, response = self.model.robot, self.model.response
+        followed, arms = positions, None
+        if response is not None:
+            followed, arms = response.follow(robot, positions, STEP_S, self.arms)
+        tools = robot.tool_poses(followed).transpose(1, 0, 2, 3)
         gaps = finger_gaps(robot, positions)
         before = tools[0] if self.tools is None else self.tools
         apart = gaps[0] if self.gaps is None else self.gaps
@@ -152,7 +169,8 @@ class TrackedObjects:
             ObjectMotion(reference=self.reference, points=points[k], rotations=rotations[k])
             for k in range(count)
         )
-        return moved, replace(self, memory=memory, tools=tools[-2], gaps=gaps[-2])
+        then = replace(self, memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms)
+        return moved, then
 
 
 def finger_gaps(robot: RobotModel, positions: FloatArray) -> FloatArray:
@@ -175,6 +193,12 @@ def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
         write_json(partial / _CONFIG, network.config)
 
 
+def save_response(response: ArmResponse, robot: RobotModel, folder: Path) -> None:
+    """Writes the response of a robot's arms beside the network that was trained with it."""
+    with disk_errors():
+        write_json(folder / _RESPONSE, as_json(response, robot.joint_names))
+
+
 def load_network(folder: Path) -> ObjectMotionNetwork:
     """Reads a network.
 
@@ -187,6 +211,37 @@ def load_network(folder: Path) -> ObjectMotionNetwork:
     except (OSError, ValueError, TypeError, RuntimeError, SafetensorError) as error:
         raise CheckpointError(f"'{folder}' cannot be used: {error}; train it anew") from error
     return network
+
+
+def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
+    """Reads the response that a network was trained with; None = with the commands themselves.
+
+    Raises:
+        CheckpointError: the file is not whole, or of another robot.
+    """
+    file = folder / _RESPONSE
+    if not file.exists():
+        return None
+    try:
+        return from_json(read_json(file), robot.joint_names)
+    except KeyError as error:
+        raise CheckpointError(
+            f"'{file}' has no {error}, which robot '{robot.name}' has; run 'mtv-world "
+            "train-motion' with episodes of this robot"
+        ) from error
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(f"'{file}' cannot be used: {error}; train it anew") from error
+
+
+def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
+    """Reads what `train-motion` wrote.
+
+    Raises:
+        CheckpointError: see `load_network`, `load_response`.
+    """
+    return ObjectMotionPredictor(
+        load_network(folder), robot, response=load_response(folder, robot)
+    )
 
 
 def num_features(num_views: int) -> int:

@@ -21,6 +21,7 @@ from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
@@ -104,7 +105,11 @@ class _Batch:
 
 
 def read_tracks(
-    paths: Sequence[Path], robot: RobotModel, views: Sequence[str], num_starts: int = 1
+    paths: Sequence[Path],
+    robot: RobotModel,
+    views: Sequence[str],
+    num_starts: int = 1,
+    response: ArmResponse | None = None,
 ) -> tuple[list[list[ObjectTracks]], dict[str, str]]:
     """Returns the tracks of each episode that can be trained on, and why others cannot, by path.
 
@@ -114,7 +119,7 @@ def read_tracks(
     tracks, skipped = [], {}
     for path in tqdm(paths, desc='reading episodes', unit='ep'):
         try:
-            tracks.append(object_tracks(path, robot, views, num_starts))
+            tracks.append(object_tracks(path, robot, views, num_starts, response))
         except MtvWorldError as error:
             skipped[str(path)] = str(error)
     if not tracks:

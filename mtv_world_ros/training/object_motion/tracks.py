@@ -21,6 +21,7 @@ from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_shape import object_shapes
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import STEP_S
 from mtv_world_ros.model.object_motion.predictor import finger_gaps
 
@@ -31,7 +32,7 @@ class ObjectTracks:
 
     Attributes:
         features: (O, V, F) of `object_shapes`.
-        tools: (T + 1, A, 4, 4) T_base_tool as commanded.
+        tools: (T + 1, A, 4, 4) T_base_tool as expected of the commands.
         gaps: (T + 1, A) from a tool to its fingers, as commanded [m].
         points: (T + 1, O, 3) [m], from where the first frame's masks have the objects.
         rotations: (T + 1, O, 3, 3) from the start.
@@ -51,7 +52,11 @@ class ObjectTracks:
 
 
 def object_tracks(
-    path: Path, robot: RobotModel, views: Sequence[str], num_starts: int = 1
+    path: Path,
+    robot: RobotModel,
+    views: Sequence[str],
+    num_starts: int = 1,
+    response: ArmResponse | None = None,
 ) -> list[ObjectTracks]:
     """Reads an episode: from its first frame on, and from later ones that have masks.
 
@@ -62,6 +67,7 @@ def object_tracks(
         robot: whose commands it has.
         views: whose masks are used.
         num_starts: frames to begin with at most, spread evenly over those that have masks.
+        response: how the arms follow their commands; None = at once.
 
     Raises:
         EpisodeError: it lacks masks in the first frame, joint states or commands, or no object is
@@ -79,13 +85,14 @@ def object_tracks(
     count = int(_last_ns(episode, masks) / 1e9 / STEP_S + 1e-6)
     times = np.arange(count + 1, dtype=np.float64) * STEP_S
     positions = resample(commands, states.positions[0][columns], times)
+    expected = positions if response is None else response.follow(robot, positions, STEP_S)[0]
     cameras = [episode.cameras[view] for view in views]
     recording = _Recording(
         episode=episode,
         masks=masks,
         cameras=cameras,
         poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
-        tools=robot.tool_poses(positions).transpose(1, 0, 2, 3),
+        tools=robot.tool_poses(expected).transpose(1, 0, 2, 3),
         gaps=finger_gaps(robot, positions),
         stamps_ns=stamps[0] + times * 1e9,
     )

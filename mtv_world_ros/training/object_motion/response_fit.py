@@ -1,0 +1,169 @@
+"""How a robot's arms follow their commands, from recordings of both.
+
+An equation-error fit (Gautier and Khalil 1992): accelerations are taken from the joint states, so
+that the numbers of each joint are a linear least-squares problem. What touches something does not
+fit and is left out.
+
+Shape letters: N rows, T steps, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import nnls
+
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import stitch
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+
+#: commands and measured positions of an episode, both (T, J), `PERIOD_S` apart
+Recording = tuple[FloatArray, FloatArray]
+
+#: rounds of the fit that leave out what touches something
+_ROUNDS = 5
+#: a row is left out where it is further from the fit than this many median errors
+_FAR = 4.0
+#: joints that are quicker cannot be integrated; damping that is added is led as much [s^2, s]
+_LEAST_ARMATURE, _LEAST_DAMPING = 1e-4, 0.02
+#: slower joints tell nothing [rad/s or m/s]
+_MOVES = 0.02
+#: joint states further apart do not show how joints accelerate [s]
+_LONGEST_PERIOD_S = 0.035
+#: episodes that are read
+_MOST = 100
+#: slower tools do not count in the error [m/s]
+_TOOL_MOVES = 0.02
+
+
+def joint_recording(path: Path, robot: RobotModel) -> Recording:
+    """Reads an episode's commands, and its joint states at the same times.
+
+    Raises:
+        EpisodeError: it lacks either, or its joint states are too far apart.
+    """
+    episode = read_episode(path, with_cameras=False, with_masks=False)
+    states = episode.joint_states
+    if states is None or not episode.trajectories:
+        raise EpisodeError(f"'{path}' has no joint states or commands")
+    times = (states.stamps_ns - states.stamps_ns[0]) / 1e9
+    period = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    if period > _LONGEST_PERIOD_S:
+        raise EpisodeError(
+            f"joint states of '{path}' are {period:.3f} s apart; how arms follow shows at "
+            f'{_LONGEST_PERIOD_S} s or less'
+        )
+    columns = [states.joint_names.index(name) for name in robot.joint_names]
+    wanted = np.arange(0.0, times[-1] + PERIOD_S / 2, PERIOD_S)
+    measured = [np.interp(wanted, times, states.positions[:, column]) for column in columns]
+    start = int(states.stamps_ns[0])
+    plans = [(stamp, match_joints(plan, robot, None)) for stamp, plan in episode.trajectories]
+    positions = np.stack(measured, axis=1)
+    return resample(stitch(plans, start), positions[0], wanted), positions
+
+
+def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmResponse | None, str]:
+    """Returns how arms follow in recorded episodes, and in words how well.
+
+    None where no episode tells, or where tools are nearer to their commands than to what is
+    expected of them, in episodes that the fit was not given.
+    """
+    recordings, reason = [], ''
+    for path in paths[:: max(1, len(paths) // _MOST)]:
+        try:
+            recordings.append(joint_recording(path, robot))
+        except MtvWorldError as error:
+            reason = str(error)
+    if len(recordings) < 2:
+        return None, f'arms are taken to follow their commands at once: {reason or "one episode"}'
+    held_out = recordings[::4]
+    response = fit_response(robot, [r for n, r in enumerate(recordings) if n % 4])
+    commanded = tool_errors(robot, held_out)
+    expected = tool_errors(robot, held_out, response)
+    text = (
+        f'tools that move are {1e3 * np.median(commanded):.1f} mm from their commands, '
+        f'{1e3 * np.median(expected):.1f} mm from where they are expected (medians, '
+        f'{len(held_out)} episodes held out)'
+    )
+    return (response if np.median(expected) < np.median(commanded) else None), text
+
+
+def tool_errors(
+    robot: RobotModel, recordings: Sequence[Recording], response: ArmResponse | None = None
+) -> FloatArray:
+    """Returns (N,) how far moving tools are from where they are expected [m].
+
+    Args:
+        robot: of the recordings.
+        recordings: what to compare with.
+        response: what says where they are; None = their commands.
+    """
+    errors = []
+    for commands, positions in recordings:
+        given = commands if response is None else response.follow(robot, commands)[0]
+        wanted, true, found = (
+            robot.tool_poses(joints)[..., :3, 3] for joints in (commands, positions, given)
+        )
+        moving = np.linalg.norm(np.diff(wanted, axis=1), axis=-1) > _TOOL_MOVES * PERIOD_S
+        errors.append(np.linalg.norm(found - true, axis=-1)[:, 1:][moving])
+    return np.concatenate(errors)
+
+
+def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmResponse:
+    """Returns the response that explains recorded joints best.
+
+    Args:
+        robot: gives the inertia.
+        recordings: commands and measured positions, both (T, J), `PERIOD_S` apart.
+    """
+    parts = [_equations(robot, *recording) for recording in recordings]
+    left = np.concatenate([part[0] for part in parts])  # (N, J, 4)
+    right = np.concatenate([part[1] for part in parts])  # (N, J)
+    found = np.array([_robust(left[:, j], right[:, j]) for j in range(right.shape[1])])
+    compliance, armature, damping, lead = found.T
+    added = np.maximum(_LEAST_DAMPING - damping, 0.0)
+    return ArmResponse(
+        compliance=compliance,
+        armature=np.maximum(armature, _LEAST_ARMATURE),
+        damping=damping + added,
+        lead=lead + added,
+    )
+
+
+def _equations(
+    robot: RobotModel, commands: FloatArray, positions: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Of each inner row: what the four numbers of each joint multiply, and their sum."""
+    inner = slice(1, -1)
+    velocity = (positions[2:] - positions[:-2]) / (2 * PERIOD_S)
+    acceleration = np.diff(positions, n=2, axis=0) / PERIOD_S**2
+    # as `follow` does, where a command is that of the period before its row
+    way = (commands[2:] - commands[:-2]) / (2 * PERIOD_S)
+    driven = (commands[1:-1] + commands[2:]) / 2
+    torques = []
+    for q, v, a in zip(positions[inner], velocity, acceleration, strict=True):
+        mass, bias = robot.dynamics(q, v)
+        torques.append(mass @ a + bias)
+    left = np.stack([np.array(torques), acceleration, velocity, -way], axis=-1)
+    moving = (np.abs(velocity) > _MOVES)[..., None]
+    return left * moving, (driven - positions[inner]) * moving[..., 0]
+
+
+def _robust(left: FloatArray, right: FloatArray) -> FloatArray:
+    """(4,) numbers, none below 0, without rows that are far from what the others tell."""
+    kept = left.any(-1)
+    scales = np.sqrt((left**2).mean(0)) + 1e-12
+    found = np.zeros(left.shape[1])
+    for _ in range(_ROUNDS):
+        if not kept.any():
+            break
+        found = nnls(left[kept] / scales, right[kept])[0] / scales
+        error = np.abs(left @ found - right)
+        kept = left.any(-1) & (error <= _FAR * np.median(error[kept]) + 1e-9)
+    return found

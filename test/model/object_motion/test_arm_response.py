@@ -1,0 +1,131 @@
+"""How arms follow their commands, and how that is found in recordings."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.model.object_motion.predictor import load_response, save_response
+from mtv_world_ros.training.object_motion.response_fit import (
+    fit_response,
+    found_response,
+    joint_recording,
+    tool_errors,
+)
+
+ROBOTS = ('yam_bimanual', 'franka')
+DEMO = share_path('resource', 'demo_episode')
+
+
+def robot_of(name: str):
+    return load_robot(share_path('config', 'robots', f'{name}.yaml'))
+
+
+def response_of(robot, compliance: float) -> ArmResponse:
+    each = np.ones(len(robot.joint_names))
+    return ArmResponse(
+        compliance=compliance * each, armature=0.002 * each, damping=0.07 * each, lead=0.03 * each
+    )
+
+
+def commands_of(robot, num: int = 300, seed: int = 0) -> np.ndarray:
+    """(T, J) commands that turn about the middle of every joint's range, at a speed of its own."""
+    rng = np.random.default_rng(seed)
+    low, high = np.clip(robot.lower, -2, 2), np.clip(robot.upper, -2, 2)
+    times = np.arange(num)[:, None] * PERIOD_S
+    speeds = rng.uniform(1.0, 4.0, len(low))
+    return (low + high) / 2 + 0.2 * (high - low) * (1 - np.cos(speeds * times))
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_the_fit_finds_the_numbers_that_moved_the_joints(name):
+    """The first robot's description has inertias, the second's has none."""
+    robot = robot_of(name)
+    true = response_of(robot, 0.02)
+    recordings = []
+    for seed in range(4):
+        commands = commands_of(robot, seed=seed)
+        recordings.append((commands, true.follow(robot, commands)[0]))
+    found = fit_response(robot, recordings)
+    np.testing.assert_allclose(found.damping, true.damping, atol=0.01)
+    np.testing.assert_allclose(found.lead, true.lead, atol=0.01)
+    lag = np.median(tool_errors(robot, recordings))
+    assert np.median(tool_errors(robot, recordings, found)) < 0.05 * lag
+
+
+def test_joints_that_follow_at_once_are_found_to_do_so():
+    robot = robot_of('yam_bimanual')
+    commands = commands_of(robot)
+    found = fit_response(robot, [(commands, commands)])
+    assert np.abs(found.follow(robot, commands)[0] - commands).max() < 0.01
+
+
+def test_heavy_arms_swing_and_others_respond_each_for_itself():
+    robot = robot_of('yam_bimanual')
+    still = np.repeat(commands_of(robot)[:1], 100, axis=0)
+    step = still.copy()
+    step[10:, 1] += 0.3
+    heavy, _ = response_of(robot, 0.03).follow(robot, step)
+    light, _ = response_of(robot, 0.0).follow(robot, step)
+    others = [column for column in range(still.shape[1]) if column != 1]
+    assert np.abs(light[:, others] - still[:, others]).max() < 1e-9
+    assert np.abs(heavy[:, others] - still[:, others]).max() > 1e-3
+    assert np.abs(heavy[12, 1] - still[0, 1]) < np.abs(light[12, 1] - still[0, 1])
+    np.testing.assert_allclose(light[-1], step[-1], atol=1e-3)
+
+
+def test_chunks_go_on_where_the_last_one_ended():
+    robot = robot_of('yam_bimanual')
+    response, commands = response_of(robot, 0.02), commands_of(robot)
+    whole, _ = response.follow(robot, commands)
+    first, state = response.follow(robot, commands[:101])
+    second, _ = response.follow(robot, commands[100:], state=state)
+    np.testing.assert_allclose(np.concatenate([first, second[1:]]), whole, atol=1e-12)
+
+
+def test_rows_further_apart_are_joined_by_cubics():
+    robot = robot_of('yam_bimanual')
+    response, commands = response_of(robot, 0.02), commands_of(robot, 301)
+    fine, _ = response.follow(robot, commands)
+    coarse, _ = response.follow(robot, commands[::5], 5 * PERIOD_S)
+    assert coarse.shape == (61, len(robot.joint_names))
+    assert np.abs(coarse - fine[::5]).max() < 0.01
+
+
+def test_recorded_arms_are_nearer_to_what_is_expected_than_to_their_commands():
+    robot = robot_of('yam_bimanual')
+    response, text = found_response([DEMO, DEMO], robot)
+    assert response is not None and 'mm from where they are expected' in text
+    recording = [joint_recording(DEMO, robot)]
+    assert np.median(tool_errors(robot, recording, response)) < 0.5 * np.median(
+        tool_errors(robot, recording)
+    )
+
+
+def test_without_recordings_arms_are_taken_to_follow_at_once(tmp_path):
+    response, text = found_response([tmp_path], robot_of('yam_bimanual'))
+    assert response is None and 'at once' in text and str(tmp_path) in text
+
+
+def test_a_response_is_read_again_by_joint_and_refused_for_another_robot(tmp_path):
+    robot = robot_of('yam_bimanual')
+    assert load_response(tmp_path, robot) is None
+    save_response(response_of(robot, 0.02), robot, tmp_path)
+    file = tmp_path / 'arm_response.json'
+    values = dict(reversed(json.loads(file.read_text()).items()))
+    values['left_joint1']['lead'] = 0.5
+    file.write_text(json.dumps(values))
+    read = load_response(tmp_path, robot)
+    assert read is not None and read.lead[robot.joint_names.index('left_joint1')] == 0.5
+    with pytest.raises(CheckpointError, match="which robot 'franka' has; run 'mtv-world train-m"):
+        load_response(tmp_path, robot_of('franka'))
+    values['left_joint1']['lead'] = 'much'
+    file.write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match=r'arm_response\.json.* cannot be used'):
+        load_response(tmp_path, robot)
