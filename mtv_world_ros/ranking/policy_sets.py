@@ -97,6 +97,19 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-weak-0.4',
         'expert-undo-0.03',
         'expert-undo-0.05',
+        # added last, by somebody who had seen no measurement
+        'expert-skip-1.2',
+        'expert-skip-1.6',
+        'expert-slide-0.015',
+        'expert-slide-0.02',
+        'expert-twitch-0.3',
+        'expert-twitch-0.35',
+        'expert-mirror-1',
+        'expert-mirror-1.1',
+        'expert-choppy-0.5',
+        'expert-choppy-0.7',
+        'expert-tremble-0.03',
+        'expert-tremble-0.04',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

@@ -82,6 +82,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'soft': _kind('timing', 'test', 0.6, 1.5, 's', 'time constant with which the grippers follow'),
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
     'loop': _kind('timing', 'test', 2.0, 4.0, 's', 'commands of this length are repeated once'),
+    'skip': _kind('timing', 'test', 1.4, 3.0, 's', 'commands of this length are left out'),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -100,6 +101,14 @@ FAULTS: Mapping[str, FaultKind] = {
     'aside': _kind('lateral', 'train', 0.025, 0.08, 'm', 'a grasp is shifted across the fingers'),
     'along': _kind(
         'lateral', 'calibrate', 0.015, 0.08, 'm', "a grasp is shifted along the fingers' travel"
+    ),
+    'slide': _kind(
+        'lateral',
+        'test',
+        0.02,
+        0.08,
+        'm',
+        "it comes down this far off along the fingers' travel and moves in while they close",
     ),
     'wander': _kind(
         'lateral', 'train', 0.015, 0.08, 'm', 'standard deviation of every way point, in x, y, z'
@@ -129,6 +138,9 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'narrow': _kind(
         'opening', 'test', 0.5, 1.0, '', 'share of its opening that lacks before a grasp; 1 = shut'
+    ),
+    'twitch': _kind(
+        'opening', 'test', 0.3, 1.0, '', 'again and again the gripper jerks open, to this share'
     ),
     # release
     'drops': _kind(
@@ -198,6 +210,14 @@ FAULTS: Mapping[str, FaultKind] = {
     'sweep': _kind(
         'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push the object before the grasp'
     ),
+    'mirror': _kind(
+        'collision',
+        'test',
+        1.0,
+        1.2,
+        '',
+        "an arm at rest mirrors this share of the other's motion",
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -241,11 +261,17 @@ FAULTS: Mapping[str, FaultKind] = {
     'spike': _kind(
         'speed', 'test', 0.3, 1.0, 'rad', 'standard deviation of short outliers of every joint'
     ),
+    'choppy': _kind(
+        'speed', 'test', 0.6, 2.0, 's', 'it gets a command this seldom, and jumps to it'
+    ),
     # joint
     'zero': _kind(
         'joint', 'test', 0.04, 0.2, 'rad', 'standard deviation of a constant error of every joint'
     ),
     'weak': _kind('joint', 'test', 0.25, 0.5, '', 'share that lacks of the travel of one joint'),
+    'tremble': _kind(
+        'joint', 'test', 0.03, 0.3, 'rad', 'amplitude of a fast oscillation of every joint'
+    ),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -432,6 +458,12 @@ _SET_IN_S = 1.0
 _NUM_LOST = 3
 #: outliers of a plan, and how long each lasts [s]
 _NUM_SPIKES, _SPIKE_S = 3, 0.4
+#: in which a jump of the commands is carried out [s]
+_JUMP_S = 0.1
+#: from one jerk of a gripper to the next [s]
+_TWITCH_EVERY_S = 0.8
+#: of an oscillation [Hz]
+_TREMBLE_HZ = 2.5
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -450,11 +482,17 @@ def with_faults(
     period = float(plan.times[1] - plan.times[0])
     tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
     grippers = [robot.joint_names.index(tool.gripper_joint or '') for tool in tools]
-    opens = np.array([np.sign(tool.gripper_open - tool.gripper_closed) for tool in tools])
+    travel = np.array([tool.gripper_open - tool.gripper_closed for tool in tools])
+    opens = np.sign(travel)
     positions = _late(np.array(plan.positions), grippers, round(variant.size('late') / period))
     positions = _early(positions, grippers, round(variant.size('early') / period))
     positions = _hang(positions, grippers, opens, round(variant.size('hang') / period))
     positions = _soft(positions, grippers, variant.size('soft') / period)
+    if variant.size('twitch'):
+        closed = np.array([tool.gripper_closed for tool in tools])
+        jerks = closed + variant.size('twitch') * travel * _twitches(len(positions), period)
+        both = np.stack([positions[:, grippers], jerks]) * opens
+        positions[:, grippers] = both.max(axis=0) * opens
     if variant.size('stall'):
         share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.6)
         positions = _stall(
@@ -470,7 +508,6 @@ def with_faults(
         positions = np.clip(positions + error, robot.lower, robot.upper)
     if variant.size('fumble'):
         error = _slow_noise(times, len(robot.joint_names), variant.size('fumble'), rng)
-        travel = np.array([tool.gripper_open - tool.gripper_closed for tool in tools])
         positions[:, grippers] = np.clip(
             positions[:, grippers] + error[:, grippers] * travel,
             robot.lower[grippers],
@@ -502,6 +539,10 @@ def _controller_faults(
     if variant.size('loop'):
         share = np.random.default_rng(rng.integers(2**32)).uniform(0.35, 0.75)
         positions = _loop(positions, float(share), round(variant.size('loop') / period), period)
+    if variant.size('skip'):
+        share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.65)
+        positions = _skip(positions, float(share), round(variant.size('skip') / period), period)
+    positions = _choppy(positions, round(variant.size('choppy') / period), period)
     if variant.size('weak'):
         own = np.random.default_rng(rng.integers(2**32))
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -513,6 +554,10 @@ def _controller_faults(
     rows, joints = error.shape
     if variant.size('zero'):
         error += _offset(rows, joints, variant.size('zero'), period, rng)
+    if variant.size('mirror'):
+        error += variant.size('mirror') * _mirrored(positions, len(robot.tools), period)
+    if variant.size('tremble'):
+        error += _tremble(rows, joints, variant.size('tremble'), period, rng)
     if variant.size('spike'):
         error += _spikes(rows, joints, variant.size('spike'), period, rng)
     error[:, grippers] = 0.0
@@ -594,6 +639,54 @@ def _loop(positions: FloatArray, share: float, num: int, period: float) -> Float
     blend = (np.arange(1, back + 1) / back)[:, None]
     again[:back] = (1 - blend) * positions[end - 1] + blend * again[:back]
     return np.concatenate([positions[:end], again])
+
+
+def _skip(positions: FloatArray, share: float, num: int, period: float) -> FloatArray:
+    """(T - num, J): at a share of the plan, it jumps ahead by `num` samples."""
+    begin = int(share * len(positions))
+    rest = positions[begin + num :].copy()
+    jump = min(round(_JUMP_S / period), len(rest))
+    blend = (np.arange(1, jump + 1) / jump)[:, None]
+    rest[:jump] = (1 - blend) * positions[begin - 1] + blend * rest[:jump]
+    return np.concatenate([positions[:begin], rest])
+
+
+def _choppy(positions: FloatArray, num: int, period: float) -> FloatArray:
+    """(T, J): the first of every `num` samples is held until the next."""
+    if num < 2:
+        return positions
+    rows = np.arange(len(positions))
+    held = rows // num * num
+    blend = np.minimum((rows - held + 1) * period / _JUMP_S, 1.0)[:, None]
+    return (1 - blend) * positions[np.maximum(held - num, 0)] + blend * positions[held]
+
+
+def _twitches(num: int, period: float) -> FloatArray:
+    """(T, 1) from 0, which is most of the time, to 1."""
+    times = np.arange(num) * period % _TWITCH_EVERY_S
+    return np.interp(times, _JUMP_S * np.arange(4), [0.0, 1.0, 1.0, 0.0])[:, None]
+
+
+def _mirrored(positions: FloatArray, num_arms: int, period: float) -> FloatArray:
+    """(T, J) errors: of arms at rest, the motion of the arm before in the order of the joints.
+
+    Joints that are at opposite angles in the first row turn to opposite sides.
+    """
+    home, ways = positions[0], positions - positions[0]
+    to_next = len(home) // num_arms
+    signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
+    at_rest = _smooth((ways == 0).astype(np.float64), [], round(_SET_IN_S / period))
+    return at_rest * signs * np.roll(ways, to_next, axis=1)
+
+
+def _tremble(
+    num: int, num_joints: int, amplitude: float, period: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J) errors: waves, each joint's with a phase of its own, once they have set in."""
+    phases = np.random.default_rng(rng.integers(2**32)).uniform(0.0, 2 * np.pi, num_joints)
+    times = np.arange(num)[:, None] * period
+    waves = np.sin(2 * np.pi * _TREMBLE_HZ * times + phases)
+    return amplitude * np.minimum(times / _SET_IN_S, 1.0) * waves
 
 
 def _weak(

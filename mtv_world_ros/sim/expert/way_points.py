@@ -165,6 +165,10 @@ def _along(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _GRASP, lambda stop: stop.moved(size * side.along))
 
 
+def _slide(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('above', 'grasp'), lambda stop: stop.moved(size * side.along))
+
+
 def _turn(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _GRASP, lambda s: replace(s, yaw=s.yaw + side.sign * size))
 
@@ -455,6 +459,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'drop_high': _drop_high,
     'aside': _aside,
     'along': _along,
+    'slide': _slide,
     'turn': _turn,
     'lean': _lean,
     'loose': _loose,

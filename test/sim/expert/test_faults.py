@@ -102,6 +102,40 @@ def test_a_wrong_zero_is_constant_once_it_has_set_in(expert):
     assert (np.abs(error[-1, arm_columns(expert)]) > 1e-4).all()
 
 
+def test_commands_are_left_out_or_held(expert):
+    expert_plan, skip = plan(expert, 'expert'), plan(expert, 'expert-skip-1')
+    assert len(skip) == len(expert_plan) - 50
+    np.testing.assert_array_equal(skip[-50:], expert_plan[-50:])
+    choppy = plan(expert, 'expert-choppy-1')
+    # of every second, the first tenth is the way to the command that is then held
+    held = choppy[: len(choppy) // 50 * 50].reshape(-1, 50, choppy.shape[1])[:, 5:]
+    np.testing.assert_allclose(held, np.broadcast_to(held[:, :1], held.shape), atol=1e-12)
+    np.testing.assert_allclose(choppy[90], expert_plan[50])
+
+
+def test_a_twitch_is_of_the_grippers_and_a_tremble_of_the_arms(expert):
+    expert_plan, arms = plan(expert, 'expert'), arm_columns(expert)
+    twitch = plan(expert, 'expert-twitch-0.3')
+    np.testing.assert_array_equal(twitch[:, arms], expert_plan[:, arms])
+    openings = expert.robot.gripper_openings(twitch)
+    assert (openings >= expert.robot.gripper_openings(expert_plan) - 1e-9).all()
+    assert openings.min() == pytest.approx(0, abs=1e-9)
+    error = plan(expert, 'expert-tremble-0.03') - expert_plan
+    assert np.abs(error[:, arms]).max() == pytest.approx(0.03, rel=0.02)
+    assert np.abs(np.delete(error, arms, axis=1)).max() == 0
+
+
+def test_the_arm_at_rest_mirrors_the_other(expert):
+    expert_plan, mirror = plan(expert, 'expert'), plan(expert, 'expert-mirror-1')
+    heights, across = (
+        [poses[:, axis, 3] for poses in expert.robot.tool_poses(mirror)] for axis in (2, 0)
+    )
+    np.testing.assert_allclose(heights[0], heights[1], atol=0.01)
+    np.testing.assert_allclose(across[0], -across[1], atol=0.01)
+    moves = np.ptp(expert_plan, axis=0) > 0
+    np.testing.assert_array_equal(mirror[:, moves], expert_plan[:, moves])
+
+
 def heights_where_it_lets_go(expert, name: str) -> list[float]:
     """Tool heights [m] at which the gripper of the arm that moves opens."""
     positions = plan(expert, name)
