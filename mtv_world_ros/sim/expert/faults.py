@@ -550,18 +550,30 @@ def _controller_faults(
     if variant.size('freeze'):
         own = np.random.default_rng(rng.integers(2**32))
         positions = _freeze(positions, round(variant.size('freeze') / period), own)
+    error = _errors(positions, variant, len(robot.tools), period, rng)
+    error[:, grippers] = 0.0
+    return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
+
+
+def _errors(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    num_arms: int,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J) that is added to the commands (T, J)."""
     error = np.zeros_like(positions)
     rows, joints = error.shape
     if variant.size('zero'):
         error += _offset(rows, joints, variant.size('zero'), period, rng)
     if variant.size('mirror'):
-        error += variant.size('mirror') * _mirrored(positions, len(robot.tools), period)
+        error += variant.size('mirror') * _mirrored(positions, num_arms, period)
     if variant.size('tremble'):
         error += _tremble(rows, joints, variant.size('tremble'), period, rng)
     if variant.size('spike'):
         error += _spikes(rows, joints, variant.size('spike'), period, rng)
-    error[:, grippers] = 0.0
-    return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
+    return error
 
 
 def _delayed(positions: FloatArray, num: int) -> tuple[FloatArray, FloatArray]:
