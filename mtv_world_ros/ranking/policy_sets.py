@@ -48,6 +48,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-low_carry-0.09',
         'expert-fast-2',
         'expert-fast-3',
+        'expert-freeze-0.7',
+        'expert-freeze-1',
     ),
     'test': (
         'expert',

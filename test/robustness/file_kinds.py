@@ -422,6 +422,18 @@ def _read_network(data: bytes, folder: Path) -> Any:
     return load_network(folder / 'motion')
 
 
+def _responses() -> list[bytes]:
+    folder = share_path('resource', 'checkpoint', 'object_motion')
+    return [(folder / 'arm_response.json').read_bytes()]
+
+
+def _read_response(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.object_motion.predictor import load_response
+
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_response(_file(folder / 'arm_response.json', data).parent, robot)
+
+
 KINDS = {
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
@@ -448,6 +460,7 @@ KINDS = {
     'features': Kind(_features, _read_features),
     'weights': Kind(_weights, _read_weights),
     'object motion': Kind(_networks, _read_network),
+    'arm response': Kind(_responses, _read_response),
     'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, _mutated_content, 0.1),
     'instruction': Kind(_instructions, _match),
     'answer, msgpack': Kind(_answers, _read_answer),

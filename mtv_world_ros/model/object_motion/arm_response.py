@@ -55,6 +55,12 @@ class ArmResponse:
     damping: FloatArray
     lead: FloatArray
 
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            values = getattr(self, name)
+            if not (np.isfinite(values) & (values >= 0)).all():
+                raise ValueError(f'{name} is {values.tolist()}; give finite numbers from 0 on')
+
     def follow(
         self,
         robot: RobotModel,
@@ -118,7 +124,7 @@ def from_json(
 
     Raises:
         KeyError: a joint or number is missing.
-        TypeError, ValueError: a value is no number.
+        TypeError, ValueError: a value is no finite number from 0 on.
     """
     rows = {
         name: np.array([float(values[joint][name]) for joint in joint_names])

@@ -125,7 +125,8 @@ def test_a_response_is_read_again_by_joint_and_refused_for_another_robot(tmp_pat
     assert read is not None and read.lead[robot.joint_names.index('left_joint1')] == 0.5
     with pytest.raises(CheckpointError, match="which robot 'franka' has; run 'mtv-world train-m"):
         load_response(tmp_path, robot_of('franka'))
-    values['left_joint1']['lead'] = 'much'
-    file.write_text(json.dumps(values))
-    with pytest.raises(CheckpointError, match=r'arm_response\.json.* cannot be used'):
-        load_response(tmp_path, robot)
+    for wrong in ('much', -1.0):
+        values['left_joint1']['lead'] = wrong
+        file.write_text(json.dumps(values))
+        with pytest.raises(CheckpointError, match=r'arm_response\.json.* cannot be used'):
+            load_response(tmp_path, robot)
