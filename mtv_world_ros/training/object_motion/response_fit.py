@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import stitch
@@ -32,6 +32,10 @@ _ROUNDS = 5
 _FAR = 4.0
 #: joints that are quicker cannot be integrated; damping that is added is led as much [s^2, s]
 _LEAST_ARMATURE, _LEAST_DAMPING = 1e-4, 0.02
+#: largest compliance, armature, damping and lead
+_LARGEST = np.array([10.0, 1.0, 1.0, 1.0])
+#: of a joint that moves in fewer rows nothing is said
+_LEAST_ROWS = 100
 #: slower joints tell nothing [rad/s or m/s]
 _MOVES = 0.02
 #: joint states further apart do not show how joints accelerate [s]
@@ -156,14 +160,15 @@ def _equations(
 
 
 def _robust(left: FloatArray, right: FloatArray) -> FloatArray:
-    """(4,) numbers, none below 0, without rows that are far from what the others tell."""
+    """(4,) numbers from 0 to `_LARGEST`, without rows that are far from what the others tell."""
     kept = left.any(-1)
-    scales = np.sqrt((left**2).mean(0)) + 1e-12
+    scales = np.sqrt((left**2).mean(0)) + 1e-9
     found = np.zeros(left.shape[1])
     for _ in range(_ROUNDS):
-        if not kept.any():
-            break
-        found = nnls(left[kept] / scales, right[kept])[0] / scales
+        if kept.sum() < _LEAST_ROWS:
+            return np.zeros(left.shape[1])
+        bounds = (0.0, _LARGEST * scales)
+        found = lsq_linear(left[kept] / scales, right[kept], bounds).x / scales
         error = np.abs(left @ found - right)
         kept = left.any(-1) & (error <= _FAR * np.median(error[kept]) + 1e-9)
     return found

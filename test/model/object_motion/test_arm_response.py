@@ -34,7 +34,7 @@ def response_of(robot, compliance: float) -> ArmResponse:
     )
 
 
-def commands_of(robot, num: int = 300, seed: int = 0) -> np.ndarray:
+def commands_of(robot, num: int = 400, seed: int = 0) -> np.ndarray:
     """(T, J) commands that turn about the middle of every joint's range, at a speed of its own."""
     rng = np.random.default_rng(seed)
     low, high = np.clip(robot.lower, -2, 2), np.clip(robot.upper, -2, 2)
