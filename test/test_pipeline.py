@@ -24,7 +24,7 @@ from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
-from mtv_world_ros.model.object_motion.predictor import ObjectMotionPredictor
+from mtv_world_ros.model.object_motion.predictor import Member, ObjectMotionPredictor
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.vision.describers.scene_objects import SceneObject
@@ -332,7 +332,7 @@ def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
     pipeline = assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM)
-    predictor = ObjectMotionPredictor(ObjectMotionNetwork(), pipeline.robot)
+    predictor = ObjectMotionPredictor([Member(network=ObjectMotionNetwork())], pipeline.robot)
     episode = replace(pipeline, object_motion=predictor).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
     assert len(chunks) == 2 and chunks[-1].masks.names == ()

@@ -30,6 +30,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='start from DIR/object_motion; of several, from the mean of their '
         'weights, which says something only of networks that went on from the same one',
     )
+    parser.add_argument(
+        '--ensemble',
+        type=names,
+        default=(),
+        metavar='DIR[,DIR]',
+        help='also foresee with DIR/object_motion: networks that err in different places tell '
+        'more together; the new one says what is shown',
+    )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument(
@@ -74,7 +82,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.predictor import load_network, save_response
+    from mtv_world_ros.model.object_motion.predictor import add_members, load_network
     from mtv_world_ros.model.runtime import set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
@@ -90,6 +98,9 @@ def _train(arguments: argparse.Namespace) -> int:
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     given = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
     init = mean_network(given) if given else None
+    others = [Path(folder) / OBJECT_MOTION_FOLDER for folder in arguments.ensemble]
+    for folder in others:
+        load_network(folder)
     set_num_threads(arguments.threads)
     robot = load_robot(robot_path(arguments.robot))
     paths = find_episodes(arguments.dataset)
@@ -114,10 +125,10 @@ def _train(arguments: argparse.Namespace) -> int:
             hidden=arguments.hidden,
         ),
         init=init,
+        response=response,
         overwrite=arguments.overwrite,
     )
-    if response is not None:
-        save_response(response, robot, arguments.out / OBJECT_MOTION_FOLDER)
+    add_members(arguments.out / OBJECT_MOTION_FOLDER, others)
     errors, ways = end_errors(network, held_out)
     moved = ways > 0.015
     print(f'{len(tracks)} episodes, {len(skipped)} left out; {len(held_out)} held out:')

@@ -16,7 +16,7 @@ Shape letters: T steps, J joints.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -28,6 +28,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 PERIOD_S = 0.02
 #: integration steps in it
 _SUBSTEPS = 2
+#: of each joint
+NUMBERS = ('compliance', 'armature', 'damping', 'lead')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,25 +43,51 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmResponse:
-    """See the module; all (J,).
+    """See the module.
 
     Attributes:
-        compliance: 1 / k [rad / N m].
-        armature: [s^2].
-        damping: [s].
-        lead: [s].
+        joint_names: J, of the robot.
+        compliance: (J,) 1 / k [rad / N m].
+        armature: (J,) [s^2].
+        damping: (J,) [s].
+        lead: (J,) [s].
+
+    Raises:
+        ValueError: a number is not finite, or below 0.
     """
 
+    joint_names: tuple[str, ...]
     compliance: FloatArray
     armature: FloatArray
     damping: FloatArray
     lead: FloatArray
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
+        for name in NUMBERS:
             values = getattr(self, name)
             if not (np.isfinite(values) & (values >= 0)).all():
                 raise ValueError(f'{name} is {values.tolist()}; give finite numbers from 0 on')
+
+    @classmethod
+    def from_json(
+        cls, values: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]
+    ) -> ArmResponse:
+        """Returns what `as_json` gave, of a robot with these joints.
+
+        Raises:
+            KeyError: a joint or number is missing.
+            TypeError, ValueError: a value is no finite number from 0 on.
+        """
+        rows = {name: [float(values[joint][name]) for joint in joint_names] for name in NUMBERS}
+        arrays = {name: np.array(row) for name, row in rows.items()}
+        return cls(joint_names=tuple(joint_names), **arrays)
+
+    def as_json(self) -> dict[str, dict[str, float]]:
+        """Returns the numbers by joint."""
+        return {
+            joint: {name: float(getattr(self, name)[column]) for name in NUMBERS}
+            for column, joint in enumerate(self.joint_names)
+        }
 
     def follow(
         self,
@@ -106,28 +134,3 @@ def _between(commands: FloatArray, every: int) -> FloatArray:
     rows = np.arange(len(commands), dtype=float)
     cubic = CubicHermiteSpline(rows, commands, np.gradient(commands, axis=0))
     return cubic(np.arange(every * (len(commands) - 1) + 1) / every)
-
-
-def as_json(response: ArmResponse, joint_names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Returns its numbers by joint."""
-    columns = {name: value.tolist() for name, value in asdict(response).items()}
-    return {
-        joint: {name: values[column] for name, values in columns.items()}
-        for column, joint in enumerate(joint_names)
-    }
-
-
-def from_json(
-    values: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]
-) -> ArmResponse:
-    """Returns what `as_json` was given, of a robot with these joints.
-
-    Raises:
-        KeyError: a joint or number is missing.
-        TypeError, ValueError: a value is no finite number from 0 on.
-    """
-    rows = {
-        name: np.array([float(values[joint][name]) for joint in joint_names])
-        for name in ArmResponse.__slots__
-    }
-    return ArmResponse(**rows)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
+import shutil
 
 import numpy as np
 from safetensors import SafetensorError
@@ -24,8 +25,6 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import (
     ArmResponse,
     ArmState,
-    as_json,
-    from_json,
 )
 from mtv_world_ros.model.object_motion.network import (
     Memory,
@@ -44,32 +43,51 @@ _LEAST_HEIGHT_M = 0.004
 #: travel of a finger where the robot's file does not say it [m]
 _TRAVEL_M = 0.04
 _CONFIG, _WEIGHTS, _RESPONSE = 'config.json', 'model.safetensors', 'arm_response.json'
+#: folders of further networks, in that of the first
+_MEMBER = 'member_'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Member:
+    """A trained network.
+
+    Attributes:
+        network: it.
+        response: how the arms follow their commands, as it was trained with; None = at once.
+    """
+
+    network: ObjectMotionNetwork
+    response: ArmResponse | None = None
 
 
 class ObjectMotionPredictor:
     """Finds objects in a frame; `TrackedObjects` says where they go.
 
+    Several networks share the motions that are foreseen, since they err in different places: the
+    mean of their verdicts tells more than each alone.
+
     Args:
-        network: trained.
+        members: the first says what is expected.
         robot: gives tools and grippers.
         num_disturbed: motions beside the expected one, from places and sizes within the error of
             what masks tell.
-        response: how the arms follow their commands, as the network was trained with; None = at
-            once.
     """
 
     def __init__(
-        self,
-        network: ObjectMotionNetwork,
-        robot: RobotModel,
-        num_disturbed: int = 12,
-        response: ArmResponse | None = None,
+        self, members: Sequence[Member], robot: RobotModel, num_disturbed: int = 12
     ) -> None:
-        self.network, self.robot, self.response = network.eval(), robot, response
+        for member in members:
+            member.network.eval()
+        self.members, self.robot = tuple(members), robot
         rng = np.random.default_rng(0)
         self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
         self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
         self._places[0], self._scales[0] = 0.0, 1.0
+
+    @property
+    def shares(self) -> list[np.ndarray]:
+        """Which of the motions each member foresees."""
+        return np.array_split(np.arange(len(self._places)), len(self.members))
 
     def with_robot(self, robot: RobotModel) -> ObjectMotionPredictor:
         """Returns the same for a robot of the same joints and tools."""
@@ -105,19 +123,13 @@ class TrackedObjects:
         model: says where they go.
         reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
         features: (O, V, F) of `object_shapes`.
-        memory: of the network; None = nothing has moved yet.
-        tools: (A, 4, 4) T_base_tool one step before.
-        gaps: (A,) one step before [m].
-        arms: where the arms really are by now, with a response.
+        before: of each member, when it was last asked; empty = nothing has moved yet.
     """
 
     model: ObjectMotionPredictor
     reference: FloatArray
     features: FloatArray
-    memory: Memory | None = None
-    tools: FloatArray | None = None
-    gaps: FloatArray | None = None
-    arms: ArmState | None = None
+    before: tuple[_Before, ...] = ()
 
     @property
     def step_s(self) -> float:
@@ -138,39 +150,66 @@ class TrackedObjects:
         The first motion is the expected one, the others are of disturbed places and sizes. Row 0
         is where they are now.
         """
-        robot, response = self.model.robot, self.model.response
-        followed, arms = positions, None
-        if response is not None:
-            followed, arms = response.follow(robot, positions, STEP_S, self.arms)
-        tools = robot.tool_poses(followed).transpose(1, 0, 2, 3)
-        gaps = finger_gaps(robot, positions)
-        before = tools[0] if self.tools is None else self.tools
-        apart = gaps[0] if self.gaps is None else self.gaps
-        tools = np.concatenate([before[None], tools])
-        gaps = np.concatenate([apart[None], gaps])
         known = np.asarray(np.isfinite(self.reference).all(-1))
         places, features = self.model.disturbed(
             np.where(known[:, None], self.reference, 0.0), self.features
         )
-        count = len(places)
-        scene = Scene(
-            points=_tensor(places),
-            features=_tensor(features),
-            present=torch.from_numpy(known).expand(count, -1),
-            tools=_tensor(tools).expand(count, -1, -1, -1, -1),
-            gaps=_tensor(gaps).expand(count, -1, -1),
-        )
-        with torch.inference_mode():
-            motion, memory = self.model.network.roll(scene, self.memory, skip=1)
-        ways = motion.points.double().numpy() - places[:, None]
-        points = np.where(known[:, None], self.reference + ways, np.nan)
-        rotations = motion.rotations.double().numpy()
+        points, rotations, thens = [], [], []
+        for number, rows in enumerate(self.model.shares):
+            member, robot = self.model.members[number], self.model.robot
+            last = self.before[number] if self.before else None
+            tools, gaps, arms = _tools(member, robot, positions, last)
+            scene = Scene(
+                points=_tensor(places[rows]),
+                features=_tensor(features[rows]),
+                present=torch.from_numpy(known).expand(len(rows), -1),
+                tools=_tensor(tools).expand(len(rows), -1, -1, -1, -1),
+                gaps=_tensor(gaps).expand(len(rows), -1, -1),
+            )
+            with torch.inference_mode():
+                motion, memory = member.network.roll(scene, last and last.memory, skip=1)
+            ways = motion.points.double().numpy() - places[rows, None]
+            points += list(np.where(known[:, None], self.reference + ways, np.nan))
+            rotations += list(motion.rotations.double().numpy())
+            thens.append(_Before(memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms))
         moved = tuple(
-            ObjectMotion(reference=self.reference, points=points[k], rotations=rotations[k])
-            for k in range(count)
+            ObjectMotion(reference=self.reference, points=way, rotations=turns)
+            for way, turns in zip(points, rotations, strict=True)
         )
-        then = replace(self, memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms)
-        return moved, then
+        return moved, replace(self, before=tuple(thens))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Before:
+    """What a member goes on from.
+
+    Attributes:
+        memory: of the network.
+        tools: (A, 4, 4) T_base_tool one step before.
+        gaps: (A,) one step before [m].
+        arms: where the arms really are by now, with a response.
+    """
+
+    memory: Memory
+    tools: FloatArray
+    gaps: FloatArray
+    arms: ArmState | None
+
+
+def _tools(
+    member: Member, robot: RobotModel, positions: FloatArray, last: _Before | None
+) -> tuple[FloatArray, FloatArray, ArmState | None]:
+    """Tools (T + 2, A, 4, 4) and gaps (T + 2, A) as a member is given them; row 0 one step before.
+
+    And the state of the arms.
+    """
+    followed, arms = positions, None
+    if member.response is not None:
+        followed, arms = member.response.follow(robot, positions, STEP_S, last and last.arms)
+    tools = robot.tool_poses(followed).transpose(1, 0, 2, 3)
+    gaps = finger_gaps(robot, positions)
+    before = (tools[0], gaps[0]) if last is None else (last.tools, last.gaps)
+    return np.concatenate([before[0][None], tools]), np.concatenate([before[1][None], gaps]), arms
 
 
 def finger_gaps(robot: RobotModel, positions: FloatArray) -> FloatArray:
@@ -185,18 +224,22 @@ def _tensor(values: FloatArray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
-def save_network(network: ObjectMotionNetwork, folder: Path) -> None:
-    """Writes a network into a folder; one that was there stays until the new one is complete."""
+def save_network(
+    network: ObjectMotionNetwork, folder: Path, response: ArmResponse | None = None
+) -> None:
+    """Writes a network into a folder; one that was there stays until the new one is complete.
+
+    Args:
+        network: trained.
+        folder: of it.
+        response: how the arms follow their commands, as it was trained with.
+    """
     tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
     with disk_errors(), whole_folder(folder) as partial:
         save_file(tensors, partial / _WEIGHTS)
         write_json(partial / _CONFIG, network.config)
-
-
-def save_response(response: ArmResponse, robot: RobotModel, folder: Path) -> None:
-    """Writes the response of a robot's arms beside the network that was trained with it."""
-    with disk_errors():
-        write_json(folder / _RESPONSE, as_json(response, robot.joint_names))
+        if response is not None:
+            write_json(partial / _RESPONSE, response.as_json())
 
 
 def load_network(folder: Path) -> ObjectMotionNetwork:
@@ -223,7 +266,7 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
     if not file.exists():
         return None
     try:
-        return from_json(read_json(file), robot.joint_names)
+        return ArmResponse.from_json(read_json(file), robot.joint_names)
     except KeyError as error:
         raise CheckpointError(
             f"'{file}' has no {error}, which robot '{robot.name}' has; run 'mtv-world "
@@ -233,15 +276,37 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
         raise CheckpointError(f"'{file}' cannot be used: {error}; train it anew") from error
 
 
+def add_members(folder: Path, others: Sequence[Path]) -> None:
+    """Copies networks into the folder of another, which they foresee with from now on.
+
+    Raises:
+        CheckpointError: one of them is not there, not whole, or of another number of views.
+    """
+    views = load_network(folder).config['num_features']
+    for number, other in enumerate(others, 1):
+        given = load_network(other).config['num_features']
+        if given != views:
+            raise CheckpointError(
+                f"'{other}' describes objects by {given} numbers, '{folder}' by {views}; give "
+                'networks of the same views'
+            )
+        with disk_errors(), whole_folder(folder / f'{_MEMBER}{number}') as partial:
+            for name in (_CONFIG, _WEIGHTS, _RESPONSE):
+                if (other / name).exists():
+                    shutil.copyfile(other / name, partial / name)
+
+
 def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
     """Reads what `train-motion` wrote.
 
     Raises:
         CheckpointError: see `load_network`, `load_response`.
     """
-    return ObjectMotionPredictor(
-        load_network(folder), robot, response=load_response(folder, robot)
-    )
+    folders = [folder, *sorted(folder.glob(f'{_MEMBER}*'))]
+    members = [
+        Member(network=load_network(each), response=load_response(each, robot)) for each in folders
+    ]
+    return ObjectMotionPredictor(members, robot)
 
 
 def num_features(num_views: int) -> int:

@@ -135,6 +135,7 @@ def train_motion(
     config: MotionTraining,
     *,
     init: ObjectMotionNetwork | None = None,
+    response: ArmResponse | None = None,
     overwrite: bool = False,
 ) -> ObjectMotionNetwork:
     """Trains, writes the averaged weights into `out/object_motion`, and returns the network.
@@ -147,6 +148,7 @@ def train_motion(
         out: folder.
         config: how.
         init: network to go on from.
+        response: that the tracks were read with.
         overwrite: `out/object_motion` may be there already, and is replaced.
 
     Raises:
@@ -169,10 +171,10 @@ def train_motion(
             losses.append(loss)
             bar.set_postfix(loss=f'{np.mean(losses[-50:]):.3f}')
             if len(losses) % _SAVE_EVERY == 0 or len(losses) == config.steps:
-                _save(_network_of(averaged), folder, losses)
+                _save(_network_of(averaged), folder, losses, response)
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
-        _save(_network_of(averaged), folder, losses)
+        _save(_network_of(averaged), folder, losses, response)
     return _network_of(averaged).eval()
 
 
@@ -255,8 +257,13 @@ def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.O
     ]
 
 
-def _save(network: ObjectMotionNetwork, folder: Path, losses: Sequence[float]) -> None:
-    save_network(network, folder)
+def _save(
+    network: ObjectMotionNetwork,
+    folder: Path,
+    losses: Sequence[float],
+    response: ArmResponse | None,
+) -> None:
+    save_network(network, folder, response)
     rows = [
         f'{first + _CURVE_EVERY},{np.mean(losses[first : first + _CURVE_EVERY]):.4f}'
         for first in range(0, len(losses), _CURVE_EVERY)

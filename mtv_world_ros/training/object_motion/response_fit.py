@@ -133,6 +133,7 @@ def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmRespo
     compliance, armature, damping, lead = found.T
     added = np.maximum(_LEAST_DAMPING - damping, 0.0)
     return ArmResponse(
+        joint_names=robot.joint_names,
         compliance=compliance,
         armature=np.maximum(armature, _LEAST_ARMATURE),
         damping=damping + added,

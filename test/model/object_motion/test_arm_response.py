@@ -11,7 +11,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.predictor import load_response, save_response
+from mtv_world_ros.model.object_motion.predictor import load_response
 from mtv_world_ros.training.object_motion.response_fit import (
     fit_response,
     found_response,
@@ -30,7 +30,11 @@ def robot_of(name: str):
 def response_of(robot, compliance: float) -> ArmResponse:
     each = np.ones(len(robot.joint_names))
     return ArmResponse(
-        compliance=compliance * each, armature=0.002 * each, damping=0.07 * each, lead=0.03 * each
+        joint_names=robot.joint_names,
+        compliance=compliance * each,
+        armature=0.002 * each,
+        damping=0.07 * each,
+        lead=0.03 * each,
     )
 
 
@@ -116,9 +120,8 @@ def test_without_recordings_arms_are_taken_to_follow_at_once(tmp_path):
 def test_a_response_is_read_again_by_joint_and_refused_for_another_robot(tmp_path):
     robot = robot_of('yam_bimanual')
     assert load_response(tmp_path, robot) is None
-    save_response(response_of(robot, 0.02), robot, tmp_path)
     file = tmp_path / 'arm_response.json'
-    values = dict(reversed(json.loads(file.read_text()).items()))
+    values = dict(reversed(response_of(robot, 0.02).as_json().items()))
     values['left_joint1']['lead'] = 0.5
     file.write_text(json.dumps(values))
     read = load_response(tmp_path, robot)

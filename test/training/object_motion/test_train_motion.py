@@ -17,7 +17,7 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
-from mtv_world_ros.model.object_motion.predictor import load_network, save_network
+from mtv_world_ros.model.object_motion.predictor import load_network, load_predictor, save_network
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
@@ -108,15 +108,18 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
         train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
-def test_training_goes_on_from_networks_and_replaces_none_unasked(episodes, tmp_path, capsys):
+def test_training_goes_on_from_networks_and_replaces_none_unasked(
+    episodes, robot, tmp_path, capsys
+):
     one, two = tmp_path / 'one', tmp_path / 'two'
     small = ['--steps', '1', '--batch-size', '2', '--threads', '1']
     train = ['train-motion', str(episodes[0].parent), *small]
     assert main([*train, '--out', str(one), '--width', '16', '--hidden', '8']) == 0
-    again = [*train, '--out', str(two), '--init', f'{one},{one}', '--seed', '1']
+    again = [*train, '--out', str(two), '--init', f'{one},{one}', '--ensemble', str(one)]
     assert main(again) == 0
     loaded = load_network(two / 'object_motion')
     assert (loaded.width, loaded.hidden) == (16, 8)
+    assert len(load_predictor(two / 'object_motion', robot).members) == 2
     assert main(again) == 1
     assert "two/object_motion' exists; give another --out" in capsys.readouterr().err
     assert main([*again, '--overwrite']) == 0
