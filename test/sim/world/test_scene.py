@@ -7,6 +7,7 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import TASKS
 from mtv_world_ros.sim.world.arm import actuators_of
@@ -23,6 +24,14 @@ def scene(workcell):
     return draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell)
 
 
+def put(model, data, robot, row):
+    """Puts the simulated robot where its joints have these positions."""
+    for actuator in actuators_of(robot):
+        driven = actuator.multiplier * row[actuator.column] + actuator.offset
+        data.joint(actuator.joint).qpos = driven
+    load_mujoco(rendering=False).mj_forward(model, data)
+
+
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_simulated_arms_stand_where_pinocchio_puts_them(name):
     mujoco = load_mujoco(rendering=False)
@@ -35,10 +44,7 @@ def test_simulated_arms_stand_where_pinocchio_puts_them(name):
     tools = robot.tool_poses(positions)
     cameras = {c.view: camera_poses(c, robot, positions) for c in drawn.cameras}
     for t, row in enumerate(positions):
-        for actuator in actuators_of(robot):
-            driven = actuator.multiplier * row[actuator.column] + actuator.offset
-            data.joint(actuator.joint).qpos = driven
-        mujoco.mj_forward(model, data)
+        put(model, data, robot, row)
         for a, tool in enumerate(robot.tools):
             site = data.site(f'{tool.arm}_tool')
             np.testing.assert_allclose(site.xpos, tools[a, t, :3, 3], atol=1e-6)
@@ -50,6 +56,27 @@ def test_simulated_arms_stand_where_pinocchio_puts_them(name):
             # x right; MuJoCo's y is up and it looks along -z
             axes = pose[:3, :3] * [1, -1, -1]
             np.testing.assert_allclose(seen.xmat.reshape(3, 3), axes, atol=1e-6)
+
+
+@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+def test_the_urdf_is_drawn_where_the_simulator_draws_the_robot(name, opengl):
+    mujoco = load_mujoco()
+    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    drawn = draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell_of(robot))
+    fixed = [c for c in drawn.cameras if c.mount_link == robot.base_link]
+    model = mujoco.MjModel.from_xml_string(scene_xml(replace(drawn, objects=()), robot))
+    model.geom('table').rgba[3] = 0  # or it hides what reaches below it
+    data = mujoco.MjData(model)
+    positions = np.random.default_rng(0).uniform(robot.lower, robot.upper, (4, len(robot.lower)))
+    for camera in fixed:
+        outlines = draw_silhouettes(load_shape(robot).parts, camera, robot, positions) > 0
+        with mujoco.Renderer(model, camera.height, camera.width) as renderer:
+            renderer.enable_segmentation_rendering()
+            for row, outline in zip(positions, outlines, strict=True):
+                put(model, data, robot, row)
+                renderer.update_scene(data, camera.view)
+                seen = renderer.render()[..., 0] >= 0
+                assert (outline & seen).sum() > 0.95 * (outline | seen).sum(), camera.view
 
 
 def test_projected_block_corners_bound_the_rendered_mask(robot, expert, opengl):
