@@ -160,9 +160,9 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network,
         assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
     np.testing.assert_allclose(tracked.sizes[0], [0.04, 0.04, 0.04])
     # between commands .1 s apart a response knows less at the end of a chunk
-    close = {'atol': 1e-6 if kind != 'response' else 1e-3}
-    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], **close)
-    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], **close)
+    close = 1e-6 if kind != 'response' else 1e-3
+    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=close)
+    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=close)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()
 
 
