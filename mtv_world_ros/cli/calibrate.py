@@ -85,14 +85,14 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     from mtv_world_ros.evaluation.calibration.calibration_report import write_calibration_report
     from mtv_world_ros.evaluation.calibration.fit import calibrate, samples_of
-    from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds, refuse_test_kinds
+    from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 
     print(f'{arguments.dataset}: {selection}')
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
     runs = _imagine(arguments, selection)
     segmenter = str(runs[0].settings['segmenter'])
-    samples = samples_of([run.results for run in runs], recorded_kinds(selection.paths))
+    samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
     found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
@@ -102,6 +102,20 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             print(f'stored: {save_horizon(folder, horizon)}')
     print(text)
     return 0
+
+
+def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies, by what their results are called.
+
+    Raises:
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: a policy has an unknown fault.
+    """
+    from mtv_world_ros.evaluation.evaluate_episodes import result_names
+    from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds
+
+    names = result_names(paths)
+    return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}
 
 
 def _check_places(arguments: argparse.Namespace, folder: Path) -> None:

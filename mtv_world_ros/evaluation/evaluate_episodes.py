@@ -130,18 +130,24 @@ def evaluate(
     return summary
 
 
-def make_jobs(paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int) -> list[Job]:
-    """Returns the episodes in an order in which each lends its actions to the next.
+def result_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Returns what results are called: as the folder, or by the whole path if two are alike."""
+    count = Counter(Path(path).name for path in paths)
+    return {
+        path: path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/')
+        for path in map(Path, paths)
+    }
 
-    Results are called like the episode's folder, or by the whole path where two are called alike.
-    """
+
+def make_jobs(paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int) -> list[Job]:
+    """Returns the episodes in an order in which each lends its actions to the next."""
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
-    count = Counter(path.name for path in shuffled)
+    names = result_names(paths)
     return [
         Job(
             path=path,
-            name=path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/'),
+            name=names[path],
             donor=shuffled[index - 1] if len(shuffled) > 1 else None,
             zero_shot=zero_shot.get(path, ''),
         )

@@ -22,15 +22,15 @@ def recorded_policy(path: Path) -> str:
     return name if name.split('-')[0] == EXPERT else ''
 
 
-def recorded_kinds(paths: Iterable[Path]) -> dict[str, tuple[str, ...]]:
-    """Returns the fault kinds of episodes of scripted policies by folder name.
+def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies.
 
     Raises:
         EpisodeError: the metadata of an episode cannot be used.
         PolicyError: a policy has an unknown fault.
     """
-    named = {Path(path).name: recorded_policy(path) for path in paths}
-    return {name: parse_variant(policy).kinds for name, policy in named.items() if policy}
+    named = {Path(path): recorded_policy(path) for path in paths}
+    return {path: parse_variant(policy).kinds for path, policy in named.items() if policy}
 
 
 def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:

@@ -1,7 +1,12 @@
+import shutil
+
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.cli.calibrate import result_kinds
+from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.evaluation.evaluate_episodes import make_jobs
 from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds
 
 
@@ -22,8 +27,20 @@ def dataset(tmp_path):
 
 def test_kinds_are_those_of_the_recorded_policy(dataset):
     assert recorded_kinds(sorted(dataset.iterdir())) == {
-        'stack_00000': (), 'stack_00001': ('late',), 'stack_00002': ('high', 'lean'),
-    }  # fmt: skip
+        dataset / 'stack_00000': (),
+        dataset / 'stack_00001': ('late',),
+        dataset / 'stack_00002': ('high', 'lean'),
+    }
+
+
+def test_episodes_that_are_called_alike_have_kinds_of_their_own(dataset):
+    shutil.copytree(dataset / 'stack_00001', dataset / 'more' / 'stack_00002')
+    paths = list_episodes(dataset)
+    kinds = result_kinds(paths)
+    for job in make_jobs(paths, {}, seed=0):
+        wanted = recorded_kinds([job.path]).get(job.path)
+        assert kinds.get(job.name) == wanted
+    assert sorted(kinds.values()) == [(), ('high', 'lean'), ('late',), ('late',)]
 
 
 @pytest.mark.parametrize(
