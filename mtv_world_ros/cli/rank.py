@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
 agree. DIR gets ranking.json, ranking.md, ranking.html, flips.png (six commands that change what
-happens, real and imagined) and two files for every rollout: the result, and the last real frames
-over the last imagined ones. Running the same command again goes on where it was stopped.
+happens, real and imagined) and three files for every rollout: the result, the last real frames
+over the last imagined ones, and where objects are. Running the same command again goes on where it
+was stopped.
 """
 _EPILOG = """\
 A scripted policy is `expert`, followed by faults with their sizes, e.g.

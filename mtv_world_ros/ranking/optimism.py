@@ -30,6 +30,8 @@ from mtv_world_ros.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.rendering.images import encode_png
 from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, parse_variant
 
+#: end of the names of pictures of where objects are
+OBJECTS = '.objects.png'
 #: who judges: field of a result -> words
 JUDGES = {
     'imagined': 'imagination',
@@ -93,7 +95,8 @@ class Optimism:
         results: one a rollout; some of the policy `expert`.
         flips: of rollouts whose true outcome is another than the expert's in the same scene, by
             `name_of`: whether the imagined last frame is nearer to what really happened than to
-            what happened under the expert's commands.
+            what happened under the expert's commands, where objects are in either. Arms do not
+            count: they follow the commands in imagination as well.
     """
 
     results: Sequence[Result]
@@ -279,8 +282,8 @@ def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
 
     Args:
         results: of all policies.
-        folder: with their last frames as `last_frames_png` writes them, `<name>.png`; rollouts
-            without are left out.
+        folder: with their last frames as `last_frames_png` writes them, `<name>.png`, and where
+            objects are, `<name>.objects.png`; rollouts without are left out.
     """
     experts = {(r.task, r.index): r for r in results if r.policy == EXPERT}
     found = {}
@@ -288,18 +291,21 @@ def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
         expert = experts.get((result.task, result.index))
         if expert is None or result.final == expert.final:
             continue
-        own, other = (read_last_frames(folder / f'{name_of(r)}.png') for r in (result, expert))
-        if own is not None and other is not None:
-            found[name_of(result)] = is_nearer(own[1], own[0], other[0])
+        names = [name_of(r) for r in (result, expert)]
+        own, other = (read_last_frames(folder / f'{name}.png') for name in names)
+        masks = [_read_objects(folder / f'{name}{OBJECTS}') for name in names]
+        if own is not None and other is not None and masks[0] is not None and masks[1] is not None:
+            found[name_of(result)] = is_nearer(own[1], own[0], other[0], masks[0] | masks[1])
     return found
 
 
-def is_nearer(imagined: ByteArray, real: ByteArray, other: ByteArray) -> bool:
+def is_nearer(imagined: ByteArray, real: ByteArray, other: ByteArray, objects: BoolArray) -> bool:
     """Returns whether imagined frames are nearer to the real ones than to others, (..., 3) each.
 
-    By squared distance over the pixels in which the real ones and the others differ.
+    By squared distance over the pixels of objects (...) in which the real ones and the others
+    differ.
     """
-    differs = (real != other).any(-1)
+    differs = (real != other).any(-1) & objects
     shown, *ends = (frames[differs].astype(np.float64) for frames in (imagined, real, other))
     near, far = (((shown - end) ** 2).sum() for end in ends)
     return bool(near < far)
@@ -309,6 +315,18 @@ def last_frames_png(real: ByteArray, imagined: ByteArray) -> bytes:
     """Returns a PNG of a rollout's last frames (V, H, W, 3): views in a row, real ones on top."""
     rows = [np.concatenate(list(frames), axis=1) for frames in (real, imagined)]
     return encode_png(np.concatenate(rows))
+
+
+def objects_png(masks: BoolArray) -> bytes:
+    """Returns a PNG of where objects (V, N, H, W) are: white, views in a row."""
+    shown = np.concatenate(list(masks.any(1)), axis=1)
+    return encode_png(np.repeat(255 * shown[..., None].astype(np.uint8), 3, axis=-1))
+
+
+def _read_objects(path: Path) -> BoolArray | None:
+    """(H, V * W) of `objects_png`; None = there is no such file."""
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    return None if picture is None else np.asarray(picture > 127)
 
 
 def read_last_frames(path: Path) -> tuple[ByteArray, ByteArray] | None:

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.both_worlds import BothWorlds
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.ranking.optimism import last_frames_png
+from mtv_world_ros.ranking.optimism import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
 from mtv_world_ros.ranking.worlds import (
     ImaginedWorld,
@@ -145,6 +146,7 @@ class RolloutRunner:
             course=both.course(),
             files={
                 '.png': base64.b64encode(last).decode(),
+                **({OBJECTS: _objects_shown(found[-1].masks)} if found else {}),
                 **(both.files() if self.config.clips else {}),
             },
         )
@@ -238,6 +240,11 @@ class WantedJob:
 
     job: Job
     checkpoints: tuple[int, ...]
+
+
+def _objects_shown(masks: ObjectMasks) -> str:
+    """Where objects are in the last of the real frames, as `Result.files` has it."""
+    return base64.b64encode(objects_png(masks.masks[:, :, -1])).decode()
 
 
 def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> Judged:

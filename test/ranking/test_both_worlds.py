@@ -121,7 +121,7 @@ def test_objects_that_are_imagined_elsewhere_part_and_the_page_says_when(
     pipeline = replace(runner.pipeline, world_model=Shifted(runner.pipeline.world_model, 40))
     (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
     moved = type(runner)(pipeline, replace(runner.config, clips=False)).score(job)
-    assert set(moved.files) == {'.png'}
+    assert set(moved.files) == {'.png', '.objects.png'}
     assert moved.course.objects_part_s == pytest.approx(0.2) and moved.course.parted_object
     assert np.isnan(moved.course.commands_part_s)
     what = f'objects ({moved.course.parted_object})'

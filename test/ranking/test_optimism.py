@@ -11,6 +11,7 @@ from mtv_world_ros.ranking.optimism import (
     is_nearer,
     last_frames_png,
     name_of,
+    objects_png,
     Optimism,
     read_last_frames,
 )
@@ -117,6 +118,8 @@ def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_pat
     for result in results[:-1]:  # the last one has no picture
         png = last_frames_png(*ends[result.policy])
         (tmp_path / f'{name_of(result)}.png').write_bytes(png)
+        shown = objects_png((ends[result.policy][0] == 255).all(-1)[:, None])
+        (tmp_path / f'{name_of(result)}.objects.png').write_bytes(shown)
     assert find_flips(results, tmp_path) == {
         'stack_blocks_two_00000_expert-high-0.03': False,
         'stack_blocks_two_00000_expert-late-0.6': True,
@@ -138,10 +141,23 @@ def test_pixels_that_are_alike_in_both_ends_do_not_count():
     real, other = np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)
     other[0, 0] = 100
     imagined = np.full((4, 4, 3), 255, np.uint8)
+    everywhere = np.ones((4, 4), bool)
     imagined[0, 0] = 49
-    assert is_nearer(imagined, real, other)
+    assert is_nearer(imagined, real, other, everywhere)
     imagined[0, 0] = 51
-    assert not is_nearer(imagined, real, other)
+    assert not is_nearer(imagined, real, other, everywhere)
+
+
+def test_arms_that_end_elsewhere_do_not_count():
+    """The object is imagined at its goal, where it is not; the arm is where it is."""
+    real, other = np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)
+    real[2:], other[0, 0] = 90, 200  # a large arm, a small object
+    imagined = real.copy()
+    imagined[0, 0] = 200
+    objects = np.zeros((4, 4), bool)
+    objects[0, 0] = True
+    assert not is_nearer(imagined, real, other, objects)
+    assert is_nearer(imagined, real, other, np.ones((4, 4), bool))
 
 
 def test_contact_is_in_the_catalogue():
