@@ -319,7 +319,7 @@ def last_frames_png(real: ByteArray, imagined: ByteArray) -> bytes:
 
 def objects_png(masks: BoolArray) -> bytes:
     """Returns a PNG of where objects (V, N, H, W) are: white, views in a row."""
-    shown = np.concatenate(list(masks.any(1)), axis=1)
+    shown = np.concatenate([view.any(axis=0) for view in masks], axis=1)
     return encode_png(np.repeat(255 * shown[..., None].astype(np.uint8), 3, axis=-1))
 
 
