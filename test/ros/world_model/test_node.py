@@ -383,6 +383,9 @@ def test_no_frame_of_a_long_burst_is_lost(client, ros):
     viewer = ros.Client()
     try:
         viewer.connect_outputs({PREDICTED['high']: Image}, depth=100)
+        # the node must know of the viewer as well: it has the client already
+        count = f'subscribers.{PREDICTED["high"]}'
+        client.wait(lambda: client.diagnostic_values().get(count) == '2', 'the viewer')
         client.imagine_one(seconds=8.0)  # ten chunks as fast as the fake model makes them
         viewer.wait(lambda: len(viewer.received[PREDICTED['high']]) == 40, '40 frames')
         assert set(np.diff(stamps(viewer.received[PREDICTED['high']]))) == {FRAME_NS}
