@@ -199,7 +199,6 @@ def load_recording(
         raise EpisodeError(f"episode '{path}' has no frames of view '{spec.views[0]}'")
     frames = [_on_clock(episode, view, stamps, spec) for view in spec.views]
     origin = int(stamps[0])
-    matched = [(s, match_joints(t, robot, None)) for s, t in episode.trajectories]
     return Recording(
         path=Path(path),
         task=episode.info.task,
@@ -212,8 +211,8 @@ def load_recording(
         times=np.asarray((stamps - origin) * 1e-9, np.float64),
         frames=np.stack(frames),
         object_ids=_object_ids(episode, stamps, spec),
-        positions=_measured(episode, robot, stamps),
-        commands=stitch(matched, origin),
+        positions=measured_positions(episode, robot, stamps),
+        commands=stitched_commands(episode, robot, origin),
         stamp_ns=origin,
         object_poses=_object_poses(episode, stamps),
         masks_by=episode.info.metadata.get(MASKS_BY, ''),
@@ -276,7 +275,19 @@ def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
     return found.T_base_object[nearest_rows(found.stamps_ns, stamps)]
 
 
-def _measured(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
+def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:
+    """Returns what was commanded in the robot's joint order; see `stitch`."""
+    matched = [(s, match_joints(t, robot, None)) for s, t in episode.trajectories]
+    return stitch(matched, origin_ns)
+
+
+def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
+    """Returns the joint states (T, J) at stamps (T,) [ns], in the robot's joint order.
+
+    Raises:
+        EpisodeError: it has none.
+        TrajectoryError: they lack joints of the robot.
+    """
     states = episode.joint_states
     if states is None or len(states.stamps_ns) == 0:
         raise EpisodeError(f"episode '{episode.info.path}' has no joint_states")

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import stitch
+from mtv_world_ros.data.recording import measured_positions, stitched_commands
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
-from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 
@@ -51,6 +51,7 @@ def joint_recording(path: Path, robot: RobotModel) -> Recording:
 
     Raises:
         EpisodeError: it lacks either, or its joint states are too far apart.
+        TrajectoryError: either lacks joints of the robot.
     """
     episode = read_episode(path, with_cameras=False, with_masks=False)
     states = episode.joint_states
@@ -63,13 +64,11 @@ def joint_recording(path: Path, robot: RobotModel) -> Recording:
             f"joint states of '{path}' are {period:.3f} s apart; how arms follow shows at "
             f'{_LONGEST_PERIOD_S} s or less'
         )
-    columns = [states.joint_names.index(name) for name in robot.joint_names]
     wanted = np.arange(0.0, times[-1] + PERIOD_S / 2, PERIOD_S)
-    measured = [np.interp(wanted, times, states.positions[:, column]) for column in columns]
     start = int(states.stamps_ns[0])
-    plans = [(stamp, match_joints(plan, robot, None)) for stamp, plan in episode.trajectories]
-    positions = np.stack(measured, axis=1)
-    return resample(stitch(plans, start), positions[0], wanted), positions
+    stamps = start + np.rint(wanted * 1e9).astype(np.int64)
+    positions = measured_positions(episode, robot, stamps)
+    return resample(stitched_commands(episode, robot, start), positions[0], wanted), positions
 
 
 def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmResponse | None, str]:

@@ -13,13 +13,13 @@ import numpy as np
 
 from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import stitch
+from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_shape import object_shapes
-from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
+from mtv_world_ros.geometry.resample import nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import STEP_S
@@ -79,9 +79,8 @@ def object_tracks(
         raise EpisodeError(f"'{path}' has no object masks, joint states or commands")
     masks = {view: episode.masks[view] for view in views}
     stamps = masks[views[0]].stamps_ns
-    matched = [(stamp, match_joints(t, robot, None)) for stamp, t in episode.trajectories]
     columns = [states.joint_names.index(name) for name in robot.joint_names]
-    commands = stitch(matched, int(stamps[0]))
+    commands = stitched_commands(episode, robot, int(stamps[0]))
     count = int(_last_ns(episode, masks) / 1e9 / STEP_S + 1e-6)
     times = np.arange(count + 1, dtype=np.float64) * STEP_S
     positions = resample(commands, states.positions[0][columns], times)
