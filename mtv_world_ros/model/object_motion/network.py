@@ -25,6 +25,8 @@ import torch.nn.functional as F
 STEP_S = 0.1
 _SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
 _NEAR = 100.0  # 1 / 1 cm: clearances enter in this unit, cut off at 3
+#: further than anything [m]
+_FAR = 1e3
 #: clearances of a tool and an object, and of two objects
 _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
 #: heights of two fingertips over bottom and top, now and next
@@ -259,6 +261,7 @@ class ObjectMotionNetwork(nn.Module):
         extents = self._extents(scene)
         now = memory or self._begin(scene)
         track = [now]
+        tools, gaps = (torch.cat([rows[:, :1], rows], 1) for rows in (scene.tools, scene.gaps))
         for step in range(skip, scene.tools.shape[1] - 1):
             if truth is not None and forced is not None:
                 known = forced[:, step][:, None, None]
@@ -267,10 +270,10 @@ class ObjectMotionNetwork(nn.Module):
                     points=torch.where(known, truth[0][:, step], now.points),
                     rotations=torch.where(known[..., None], truth[1][:, step], now.rotations),
                 )
-            rows = [max(step - 1, 0), step, step + 1]
+            rows = slice(step, step + 3)  # the step before, this one, the next
             moved, turned, held, hidden, more = self.step(
-                scene.tools[:, rows],
-                scene.gaps[:, rows],
+                tools[:, rows],
+                gaps[:, rows],
                 scene.present,
                 extents.turned(now.rotations),
                 now,
@@ -294,17 +297,16 @@ class ObjectMotionNetwork(nn.Module):
         features = scene.features
         described = torch.cat([features.flatten(2) * _SCALE, scene.points[..., 2:] * _SCALE], -1)
         seen = (features[..., :4] > 0).any(-1, keepdim=True)
-        far = features.new_tensor(1e3)
-        widths = torch.where(seen, features[..., :4], far).amin(2)
-        low = torch.where(seen[..., 0], features[..., 4], -far).amax(2)
-        high = torch.where(seen[..., 0], features[..., 5], far).amin(2)
+        widths = torch.where(seen, features[..., :4], _FAR).amin(2)
+        low = torch.where(seen[..., 0], features[..., 4], -_FAR).amax(2)
+        high = torch.where(seen[..., 0], features[..., 5], _FAR).amin(2)
         known = seen.any(2)
         return _Extents(
             shape=self.shape(described),
             widths=torch.where(known, widths, 0.0),
             low=torch.where(known[..., 0], low, 0.0),
             high=torch.where(known[..., 0], high, 0.0),
-            yaw=features.new_tensor([1.0, 0.0]).expand(*scene.present.shape, 2),
+            yaw=torch.eye(2, device=features.device)[0].expand(*scene.present.shape, 2),
         )
 
     def _begin(self, scene: Scene) -> Memory:

@@ -15,6 +15,7 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.sim.expert.glitches import Commands, with_glitches
 
 EXPERT = 'expert'
 #: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
@@ -181,6 +182,15 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'number of runs of one to three way points with another opening, place or turn, or a '
         'detour, drawn at random',
+    ),
+    'glitch': _kind(
+        'any',
+        'train',
+        3,
+        12,
+        '',
+        'number of glitches of the commands drawn at random: grippers that jerk, joints that are '
+        'off or swing, time that stands, jumps or runs, an arm at rest that moves along',
     ),
     'visit': _kind(
         'collision',
@@ -550,6 +560,19 @@ def _controller_faults(
     if variant.size('freeze'):
         own = np.random.default_rng(rng.integers(2**32))
         positions = _freeze(positions, round(variant.size('freeze') / period), own)
+    if variant.size('glitch'):
+        tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
+        commands = Commands(
+            positions=positions,
+            period=period,
+            grippers=grippers,
+            closed=np.array([tool.gripper_closed for tool in tools]),
+            travel=np.array([tool.gripper_open - tool.gripper_closed for tool in tools]),
+            num_arms=len(robot.tools),
+        )
+        own = np.random.default_rng(rng.integers(2**32))
+        positions = with_glitches(commands, round(variant.size('glitch')), own)
+        positions = np.clip(positions, robot.lower, robot.upper)
     error = _errors(positions, variant, len(robot.tools), period, rng)
     error[:, grippers] = 0.0
     return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions

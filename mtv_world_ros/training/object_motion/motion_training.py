@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 import math
 from pathlib import Path
 
@@ -22,19 +22,11 @@ from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Scene
+from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
+from mtv_world_ros.training.object_motion.windows import Batch, pools_of, TrackPool
 
-#: steps of a training window
-_WINDOW = 48
-#: share of the windows that begin where their episode does
-_FROM_START = 0.35
-#: standard deviation of where objects are thought to be at first [m]; masks of 384x288 pixels tell
-#: it to .6 mm in the plane and 2 mm in height
-_PLACE_NOISE_M = 0.001
-#: relative one of their features
-_SHAPE_NOISE = 0.02
 _EMA_DECAY = 0.999
 #: outputs of a layer that Muon trains
 _LEAST_ROWS = 8
@@ -53,10 +45,8 @@ _WAY_M, _NEAR_M, _SLIP = 0.005, 0.15, 0.35
 _STANDS_M, _GOES_M, _RIGHT_M = 0.001, 0.004, 0.015
 #: what a turn of a tool counts as a way [m / rad]
 _LEVER_M = 0.05
-#: an object has moved if it went further than this, and siblings have parted [m]
+#: an object has moved if it went further than this [m]
 _MOVED_M = 0.01
-#: of batches, the share drawn as groups of siblings, and the most siblings of a group
-_SIBLINGS_SHARE, _GROUP = 0.15, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +61,7 @@ class MotionTraining:
             after it windows run free from their first step.
         seed: of weights and windows.
         compile: with torch.compile, which needs a C++ compiler and is 1.8 times as fast.
+        device: to train on; on a GPU a step's passes are captured and replayed.
         width: D of the network; what it goes on from is widened and computes the same at first;
             None = as it is, or 128.
         hidden: numbers that an object remembers from step to step; likewise, or 48.
@@ -82,26 +73,9 @@ class MotionTraining:
     forced_share: float = 0.35
     seed: int = 0
     compile: bool = False
+    device: str = 'cpu'
     width: int | None = None
     hidden: int | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Pool:
-    """Tracks of one number of objects, and those of them that share a scene, by scene."""
-
-    tracks: list[ObjectTracks]
-    siblings: list[list[ObjectTracks]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Batch:
-    scene: Scene
-    points: Tensor
-    rotations: Tensor
-    known: Tensor
-    turns_known: Tensor
-    parted: Tensor
 
 
 def read_tracks(
@@ -160,7 +134,7 @@ def train_motion(
     if not tracks:
         raise TrainingError('no episode is left to train on beside those held out; give more')
     torch.manual_seed(config.seed)
-    network = _network(init, num_features(tracks[0].features.shape[1]), config)
+    network = _network(init, num_features(tracks[0].features.shape[1]), config).to(config.device)
     averaged = torch.optim.swa_utils.AveragedModel(
         network, avg_fn=lambda old, new, n: old.lerp(new, 1 - min(_EMA_DECAY, _warm(int(n))))
     )
@@ -175,7 +149,7 @@ def train_motion(
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
         _save(_network_of(averaged), folder, losses, response)
-    return _network_of(averaged).eval()
+    return _network_of(averaged).cpu().eval()
 
 
 def mean_network(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
@@ -219,29 +193,93 @@ def _losses(
     """Trains, and yields the loss of each step."""
     rng = np.random.default_rng(config.seed)
     optimizers = _optimizers(network, config.learning_rate)
-    pools = _pools(tracks)
-    shares = np.array([len(pool.tracks) for pool in pools]) / len(tracks)
+    pools = pools_of(tracks, config.device)
+    shares = np.array([len(pool) for pool in pools]) / len(tracks)
     if config.compile:
         network.step = torch.compile(network.step)
+    passes = _Passes(network)
     for step in range(config.steps):
         for optimizer in optimizers:
             for group in optimizer.param_groups:
                 group['lr'] = _rate(step, config)
-            optimizer.zero_grad()
-        pool = pools[int(rng.choice(len(pools), p=shares))]
-        groups = _drawn(pool, config.batch_size, rng)
-        batch = _turned(_stacked([part for group in groups for part in _windows(group, rng)]), rng)
-        forced = _forced(step / config.steps, config, batch, rng)
-        loss = _loss(network(batch.scene, (batch.points, batch.rotations), forced), batch)
+        batch = pools[int(rng.choice(len(pools), p=shares))].draw(config.batch_size, rng)
+        loss = passes(batch, _forced(step / config.steps, config, batch, rng))
         if not math.isfinite(loss.item()):
             raise TrainingError(f'the loss is {loss.item()} at step {step}; lower --learning-rate')
-        loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         if torch.isfinite(norm):
             for optimizer in optimizers:
                 optimizer.step()
         averaged.update_parameters(network)
         yield loss.item()
+
+
+class _Passes:
+    """Forward and backward: the loss of a batch, its gradients left at the network's parameters.
+
+    On a GPU they are captured once for each size of a batch, as a CUDA graph: thousands of small
+    kernels, one launch.
+
+    Args:
+        network: where it is trained.
+    """
+
+    def __init__(self, network: ObjectMotionNetwork) -> None:
+        self._network = network
+        self._parameters = list(network.parameters())
+        self._captured: dict[torch.Size, _Captured] = {}
+
+    def __call__(self, batch: Batch, forced: Tensor) -> Tensor:
+        if not batch.points.is_cuda:
+            return self._run(batch, forced)
+        size = batch.points.shape
+        if size not in self._captured:
+            self._captured[size] = self._capture(batch, forced)
+        captured = self._captured[size]
+        for own, new in zip(captured.given, _tensors(batch, forced), strict=True):
+            own.copy_(new)
+        captured.graph.replay()
+        for parameter, gradient in zip(self._parameters, captured.gradients, strict=True):
+            parameter.grad = gradient
+        return captured.loss
+
+    def _run(self, batch: Batch, forced: Tensor) -> Tensor:
+        loss = _loss(self._network(batch.scene, (batch.points, batch.rotations), forced), batch)
+        gradients = torch.autograd.grad(loss, self._parameters)
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
+        return loss.detach()
+
+    def _capture(self, batch: Batch, forced: Tensor) -> _Captured:
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(3):  # compiles, and lets libraries set up
+                self._run(batch, forced)
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            loss = self._run(batch, forced)
+        gradients = [parameter.grad for parameter in self._parameters]
+        return _Captured(
+            graph=graph, given=_tensors(batch, forced), loss=loss, gradients=gradients
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Captured:
+    """A CUDA graph, and where it reads and writes."""
+
+    graph: torch.cuda.CUDAGraph
+    given: list[Tensor]
+    loss: Tensor
+    gradients: list[Tensor | None]
+
+
+def _tensors(batch: Batch, forced: Tensor) -> list[Tensor]:
+    scene = [getattr(batch.scene, field.name) for field in fields(batch.scene)]
+    rest = [getattr(batch, field.name) for field in fields(batch) if field.name != 'scene']
+    return [*scene, *rest, forced]
 
 
 def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.Optimizer]:
@@ -280,7 +318,7 @@ def end_errors(
     """
     errors, ways = [], []
     for track in tracks:
-        batch = _whole(track)
+        batch = TrackPool([track]).whole(0)
         with torch.inference_mode():
             motion = network(batch.scene)
         ok = batch.scene.present[0]
@@ -299,7 +337,7 @@ def _rate(step: int, config: MotionTraining) -> float:
 
 
 def _forced(
-    progress: float, config: MotionTraining, batch: _Batch, rng: np.random.Generator
+    progress: float, config: MotionTraining, batch: Batch, rng: np.random.Generator
 ) -> Tensor:
     """(B, T) which steps start from the truth: fewer and fewer; the first of a window always."""
     share = max(0.0, 1 - progress / max(config.forced_share, 1e-6))
@@ -309,133 +347,7 @@ def _forced(
     if share == 0:
         forced[:] = False
     forced[:, 0] = True
-    return torch.from_numpy(forced)
-
-
-def _pools(tracks: Sequence[ObjectTracks]) -> list[_Pool]:
-    pools: dict[int, list[ObjectTracks]] = {}
-    scenes: dict[str, list[ObjectTracks]] = {}
-    for track in tracks:
-        pools.setdefault(len(track.features), []).append(track)
-        if track.scene:
-            scenes.setdefault(track.scene, []).append(track)
-    families = [family for family in scenes.values() if len(family) > 1]
-    return [
-        _Pool(tracks=own, siblings=[one for one in families if len(one[0].features) == count])
-        for count, own in pools.items()
-    ]
-
-
-def _drawn(pool: _Pool, size: int, rng: np.random.Generator) -> list[list[ObjectTracks]]:
-    """A batch of `size` tracks: some in groups of siblings if there are any, others alone."""
-    groups: list[list[ObjectTracks]] = []
-    left = size
-    while pool.siblings and left > size * (1 - _SIBLINGS_SHARE):
-        family = pool.siblings[int(rng.integers(len(pool.siblings)))]
-        picked = rng.permutation(len(family))[: min(_GROUP, left)]
-        groups.append([family[k] for k in picked])
-        left -= len(picked)
-    return groups + [[pool.tracks[k]] for k in rng.integers(len(pool.tracks), size=left)]
-
-
-def _windows(
-    group: Sequence[ObjectTracks], rng: np.random.Generator
-) -> list[dict[str, np.ndarray]]:
-    """Rows of a batch: windows of tracks of one scene that begin at the same time."""
-    parts, last = [], min(len(track.points) for track in group) - 1
-    start = 0
-    if last > _WINDOW and rng.random() >= _FROM_START:
-        start = int(rng.integers(0, last - _WINDOW))
-    wanted = np.arange(start, start + _WINDOW + 1)
-    shown = [np.minimum(wanted, len(track.points) - 1) for track in group]
-    points = np.stack([track.points[rows] for track, rows in zip(group, shown, strict=True)])
-    for track, rows, own in zip(group, shown, points, strict=True):
-        order = rng.permutation(len(track.features))
-        noise = rng.normal(0.0, _PLACE_NOISE_M, (len(order), 3))
-        scale = rng.normal(1.0, _SHAPE_NOISE, (len(order), 1, track.features.shape[2]))
-        parted = (np.linalg.norm(points - own, axis=-1) > _MOVED_M).any(0)
-        parts.append(_part(track, rows, order, noise, scale, parted))
-    return parts
-
-
-def _whole(track: ObjectTracks) -> _Batch:
-    order = np.arange(len(track.features))
-    rows = np.arange(len(track.points))
-    parted = np.zeros((len(rows), len(order)), bool)
-    return _stacked([_part(track, rows, order, np.zeros((len(order), 3)), 1.0, parted)])
-
-
-def _part(
-    track: ObjectTracks,
-    rows: np.ndarray,
-    order: np.ndarray,
-    noise: np.ndarray,
-    scale: np.ndarray | float,
-    parted: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """One row of a batch, its objects in an order."""
-    points = (track.points + noise[np.argsort(order)])[:, order]
-    return {
-        'start': points[0],
-        'features': track.features[order] * scale,
-        'present': track.known[0][order],
-        'tools': track.tools[rows],
-        'gaps': track.gaps[rows],
-        'points': points[rows],
-        'rotations': track.rotations[rows][:, order],
-        'known': track.known[rows][:, order],
-        'turns_known': np.array(track.turns_known),
-        'parted': parted[:, order],
-    }
-
-
-def _stacked(parts: Sequence[dict[str, np.ndarray]]) -> _Batch:
-    def of(name: str) -> Tensor:
-        values = torch.from_numpy(np.stack([part[name] for part in parts]))
-        return values if values.dtype == torch.bool else values.float()
-
-    scene = Scene(
-        points=of('start'),
-        features=of('features'),
-        present=of('present'),
-        tools=of('tools'),
-        gaps=of('gaps'),
-    )
-    return _Batch(
-        scene=scene,
-        points=of('points'),
-        rotations=of('rotations'),
-        known=of('known'),
-        turns_known=of('turns_known'),
-        parted=of('parted'),
-    )
-
-
-def _turned(batch: _Batch, rng: np.random.Generator) -> _Batch:
-    """The batch turned by a multiple of 45 degrees about the vertical, or mirrored as well.
-
-    Contact does not know where on the table it happens. Mirrored tools have their x axis turned
-    back, which two-fingered grippers do not notice.
-    """
-    turns, mirrored = int(rng.integers(8)), bool(rng.random() < 0.5)
-    cos, sin = math.cos(turns * math.pi / 4), math.sin(turns * math.pi / 4)
-    mirror = torch.diag(torch.tensor([-1.0 if mirrored else 1.0, 1.0, 1.0]))
-    turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    both, scene = turn @ mirror, batch.scene
-    widths, heights = scene.features[..., :4], scene.features[..., 4:6]
-    if mirrored:
-        widths = widths[..., [0, 3, 2, 1]]
-    widths = torch.roll(widths, turns % 4, -1)
-    tools = scene.tools.clone()
-    tools[..., :3, :3] = both @ scene.tools[..., :3, :3] @ mirror
-    tools[..., :3, 3] = scene.tools[..., :3, 3] @ both.T
-    features = torch.cat([widths, heights, scene.features[..., 6:] @ both.T], -1)
-    return replace(
-        batch,
-        scene=replace(scene, points=scene.points @ both.T, features=features, tools=tools),
-        points=batch.points @ both.T,
-        rotations=both @ batch.rotations @ both.T,
-    )
+    return torch.from_numpy(forced).to(batch.points.device)
 
 
 def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
@@ -443,7 +355,7 @@ def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
     return 3 - (first.mT @ second).diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
-def _carried(batch: _Batch) -> tuple[Tensor, Tensor]:
+def _carried(batch: Batch) -> tuple[Tensor, Tensor]:
     """(B, T, O, A) whether a tool carries an object in a step, and whether that is known."""
     rotations, places = batch.scene.tools[..., :3, :3], batch.scene.tools[..., :3, 3]
     offset = batch.points[:, :, :, None] - places[:, :, None]
@@ -456,7 +368,7 @@ def _carried(batch: _Batch) -> tuple[Tensor, Tensor]:
     return carried, asked & (carried | (gone < _STANDS_M))
 
 
-def _loss(motion: Motion, batch: _Batch) -> Tensor:
+def _loss(motion: Motion, batch: Batch) -> Tensor:
     error = (motion.points - batch.points).norm(dim=-1)
     place = F.huber_loss(motion.points, batch.points, reduction='none', delta=0.01).sum(-1) * 1e4
     square = _squared_angle(motion.rotations, batch.rotations) * batch.turns_known[:, None, None]

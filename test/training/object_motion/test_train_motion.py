@@ -23,7 +23,7 @@ from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
 from mtv_world_ros.sim.expert.faults import kinds_of
 from mtv_world_ros.sim.world.opengl import missing_opengl
-from mtv_world_ros.training.object_motion import motion_training
+from mtv_world_ros.training.object_motion import motion_training, windows
 from mtv_world_ros.training.object_motion.motion_training import (
     end_errors,
     mean_network,
@@ -32,6 +32,7 @@ from mtv_world_ros.training.object_motion.motion_training import (
     train_motion,
 )
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
+from mtv_world_ros.training.object_motion.windows import filled_up, pools_of, TrackPool
 
 VIEWS = ('low', 'high')
 
@@ -78,7 +79,7 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
     """Mean error [m] after one step of 0.1 s from where the moving objects really were."""
     errors = []
     for track in tracks:
-        batch = motion_training._whole(track)
+        batch = TrackPool([track]).whole(0)
         forced = torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1]
         with torch.inference_mode():
             motion = network(batch.scene, (batch.points, batch.rotations), forced)
@@ -141,22 +142,61 @@ def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, rob
     assert track.scene == ''
     away = track.points + np.linspace(0, 0.05, len(track.points))[:, None, None] * [1, 0, 0]
     first, second = replace(track, scene='a'), replace(track, scene='a', points=away)
-    rng = np.random.default_rng(0)
-    monkeypatch.setattr(motion_training, '_FROM_START', 1.0)
+    monkeypatch.setattr(windows, '_FROM_START', 1.0)
+    monkeypatch.setattr(windows, '_SIBLINGS_SHARE', 0.5)
     more = replace(track, features=np.concatenate([track.features, track.features[:1]]))
-    pool, other = motion_training._pools([track, first, second, more])
-    assert (pool.siblings, other.siblings) == ([[first, second]], [])
-    monkeypatch.setattr(motion_training, '_SIBLINGS_SHARE', 0.5)
-    groups = motion_training._drawn(pool, 8, rng)
-    assert [len(group) for group in groups] == [2, 2, 1, 1, 1, 1]
-    parts = motion_training._windows([first, second], rng)
+    pool, other = pools_of([track, first, second, more], 'cpu')
+    assert [family.tolist() for family in pool.families] == [[1, 2]] and not other.families
+    rng = np.random.default_rng(0)
+    assert [len(group) for group in pool._drawn(8, rng)] == [2, 2, 1, 1, 1, 1]
+    parted = pool.draw(8, rng).parted
     shift = 0.05 * np.arange(len(track.points)) / (len(track.points) - 1)
-    for part in parts:
-        rows = np.arange(motion_training._WINDOW + 1)
-        np.testing.assert_array_equal(part['parted'].all(1), shift[rows] > 0.01)
-        np.testing.assert_array_equal(part['parted'].any(1), shift[rows] > 0.01)
-    (alone,) = motion_training._windows([first], rng)
-    assert not alone['parted'].any()
+    wanted = torch.from_numpy(shift[: windows.WINDOW + 1] > 0.01)
+    assert (parted[:4] == wanted[:, None]).all()
+    assert not parted[4:].any()
+
+
+def test_windows_are_of_their_tracks_turned_and_seen_a_little_elsewhere(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    pool, rng = TrackPool([track]), np.random.default_rng(1)
+    recorded = torch.from_numpy(track.points).float()
+    found = _distances(recorded, torch.from_numpy(track.tools).float())
+    for _ in range(8):
+        batch = pool.draw(16, rng)
+        assert batch.points.shape == (16, windows.WINDOW + 1, *recorded.shape[1:])
+        begins = batch.scene.points[..., 2].sort(-1).values - recorded[0, :, 2].sort().values
+        assert begins.abs().max() < 0.006
+        # how far apart tools and objects are does not turn
+        near = _distances(batch.points, batch.scene.tools)
+        starts = torch.arange(len(recorded) - windows.WINDOW)
+        rows = starts[:, None] + torch.arange(windows.WINDOW + 1)
+        for window in near:
+            assert (window - found[rows]).abs().amax((1, 2, 3)).min() < 0.006
+
+
+def test_objects_that_are_not_there_change_nothing(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    count = len(track.features)
+    torch.manual_seed(0)
+    network = ObjectMotionNetwork(width=24, hidden=8)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    losses, motions = [], []
+    for one in (track, filled_up(track, count + 2)):
+        batch = TrackPool([one]).whole(0)
+        motions.append(network(batch.scene))
+        losses.append(motion_training._loss(motions[-1], batch))
+    assert motions[1].points.shape[2] == count + 2
+    torch.testing.assert_close(motions[1].points[:, :, :count], motions[0].points)
+    torch.testing.assert_close(losses[1], losses[0])
+    losses[1].backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())
+
+
+def _distances(points, tools):
+    """(..., T, O, A) of points (..., T, O, 3), objects in the order of their distance."""
+    apart = points[..., :, None, :] - tools[..., None, :, :3, 3]
+    return apart.norm(dim=-1).sort(-2).values
 
 
 def test_episodes_that_cannot_be_used_are_named(tmp_path, robot):
@@ -184,7 +224,7 @@ def test_a_full_disk_leaves_the_last_network_whole(tmp_path):
 
 def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, robot):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
-    stays = motion_training._whole(track)
+    stays = TrackPool([track]).whole(0)
     still = stays.points[:, :1].expand_as(stays.points)
     carried = still + torch.linspace(0, 0.1, still.shape[1])[None, :, None, None]
     turns = torch.eye(3).expand_as(stays.rotations)
@@ -201,7 +241,7 @@ def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, ro
 
 def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
-    real = motion_training._whole(track)
+    real = TrackPool([track]).whole(0)
     held = torch.zeros(*real.points.shape[:3], 2)
 
     def cost(angle=0.0, aside=0.0):
@@ -221,7 +261,7 @@ def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
 
 def test_what_follows_a_tool_is_carried_and_what_stays_is_not(episodes, robot):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
-    real = motion_training._whole(track)
+    real = TrackPool([track]).whole(0)
     tools = torch.eye(4).repeat(1, 9, 2, 1, 1)
     tools[0, :, 0, 2, 3] = 0.01 * torch.arange(9)  # the first tool rises, the second stands still
     points = torch.zeros(1, 9, 3, 3)
