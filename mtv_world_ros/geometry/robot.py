@@ -162,7 +162,7 @@ class RobotModel:
         frames = [self._frame(tool.link) for tool in self.tools]
         chains = [list(model.supports[model.frames[frame].parentJoint])[1:] for frame in frames]
         base = self._frame(self.base_link)
-        configurations = self._configurations(positions)
+        configurations = self.configurations(positions)
         arms = [np.empty((len(chain) + 1, len(configurations), 3)) for chain in chains]
         for t, configuration in enumerate(configurations):
             pin.forwardKinematics(model, data, configuration)
@@ -184,28 +184,19 @@ class RobotModel:
                 openings[arm] = (values - tool.gripper_closed) / travel
         return openings.clip(0.0, 1.0)
 
-    def dynamics(
-        self, positions: FloatArray, velocities: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Returns the mass matrix (J, J), and the forces (J,) of joints (J,) without gravity.
-
-        Both are zero where the description has no inertias.
-        """
-        model, data = self.pinocchio_model, self.pinocchio_model.createData()
-        q = self._configurations(positions[None])[0]
-        follows = np.zeros((model.nv, len(self.joint_names)))
+    @property
+    def joint_motions(self) -> FloatArray:
+        """(nv, J) how Pinocchio's velocities follow those of the joints."""
+        follows = np.zeros((self.pinocchio_model.nv, len(self.joint_names)))
         for joint, column, multiplier, _ in self._setters:
             follows[joint.idx_v, column] = multiplier
-        v = follows @ velocities
-        mass = follows.T @ pin.crba(model, data, q) @ follows
-        still = pin.computeGeneralizedGravity(model, data, q)
-        return mass, follows.T @ (pin.nonLinearEffects(model, data, q, v) - still)
+        return follows
 
     def _poses(self, positions: FloatArray, links: Sequence[str]) -> FloatArray:
         """(len(links), T, 4, 4)."""
         model, data = self.pinocchio_model, self.pinocchio_model.createData()
         frames = [self._frame(link) for link in (*links, self.base_link)]
-        configurations = self._configurations(positions)
+        configurations = self.configurations(positions)
         poses = np.empty((len(frames), len(configurations), 4, 4))
         for t, configuration in enumerate(configurations):
             pin.forwardKinematics(model, data, configuration)
@@ -214,7 +205,7 @@ class RobotModel:
                 poses[f, t] = pin.updateFramePlacement(model, data, frame).homogeneous
         return inverse(poses[-1]) @ poses[:-1]
 
-    def _configurations(self, positions: FloatArray) -> FloatArray:
+    def configurations(self, positions: FloatArray) -> FloatArray:
         """Pinocchio's (T, nq) for positions (T, J): mimics follow, endless joints as cos, sin."""
         positions = np.asarray(positions, dtype=float)
         if positions.ndim != 2 or positions.shape[1] != len(self.joint_names):

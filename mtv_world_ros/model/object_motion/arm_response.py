@@ -8,28 +8,37 @@ and the bias forces b (J,) of the robot's description at positions q:
 
 The numbers are found in recordings (`training/object_motion/response_fit.py`), so gains need not
 be known; a robot described without inertias has M = 0, and its joints respond each for itself.
-What arms do when they touch something nobody can say ahead.
+Fingertips stop at the table, which pushes back like a stiff spring and rubs; what arms do when
+they touch something else nobody can say ahead.
 
-Shape letters: T steps, J joints.
+Shape letters: T steps, J joints, P fingertips.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 
 #: after which the inertia is computed again [s]
 PERIOD_S = 0.02
 #: integration steps in it
 _SUBSTEPS = 2
+#: of the table, under a fingertip: stiffness [N/m], damping [N s/m], friction, and the speed below
+#: which that is viscous [m/s]
+_STIFFNESS, _DAMPING, _FRICTION, _SLOW = 5000.0, 100.0, 0.9, 0.02
+#: fingertips that are higher over the table do not get there within a period [m]
+_NEAR_M = 0.03
 #: of each joint
 NUMBERS = ('compliance', 'armature', 'damping', 'lead')
+_FLOOR = 'floor'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +60,7 @@ class ArmResponse:
         armature: (J,) [s^2].
         damping: (J,) [s].
         lead: (J,) [s].
+        floor: lowest height of fingertips, in the base frame [m]; None = not known.
 
     Raises:
         ValueError: a number is not finite, or below 0.
@@ -61,17 +71,18 @@ class ArmResponse:
     armature: FloatArray
     damping: FloatArray
     lead: FloatArray
+    floor: float | None = None
 
     def __post_init__(self) -> None:
         for name in NUMBERS:
             values = getattr(self, name)
             if not (np.isfinite(values) & (values >= 0)).all():
                 raise ValueError(f'{name} is {values.tolist()}; give finite numbers from 0 on')
+        if self.floor is not None and not np.isfinite(self.floor):
+            raise ValueError(f'floor is {self.floor}; give a finite number')
 
     @classmethod
-    def from_json(
-        cls, values: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]
-    ) -> ArmResponse:
+    def from_json(cls, values: Mapping[str, Any], joint_names: Sequence[str]) -> ArmResponse:
         """Returns what `as_json` gave, of a robot with these joints.
 
         Raises:
@@ -80,14 +91,18 @@ class ArmResponse:
         """
         rows = {name: [float(values[joint][name]) for joint in joint_names] for name in NUMBERS}
         arrays = {name: np.array(row) for name, row in rows.items()}
-        return cls(joint_names=tuple(joint_names), **arrays)
+        floor = values.get(_FLOOR)
+        return cls(
+            joint_names=tuple(joint_names), **arrays, floor=None if floor is None else float(floor)
+        )
 
-    def as_json(self) -> dict[str, dict[str, float]]:
-        """Returns the numbers by joint."""
-        return {
+    def as_json(self) -> dict[str, Any]:
+        """Returns the numbers by joint, and the floor."""
+        joints: dict[str, Any] = {
             joint: {name: float(getattr(self, name)[column]) for name in NUMBERS}
             for column, joint in enumerate(self.joint_names)
         }
+        return joints | ({} if self.floor is None else {_FLOOR: self.floor})
 
     def follow(
         self,
@@ -110,13 +125,20 @@ class ArmResponse:
         )
         positions, velocities, last = now.positions, now.velocities, now.commands
         rows, every, h = [positions], round(step_s / PERIOD_S), PERIOD_S / _SUBSTEPS
+        mechanics = RobotMechanics(robot)
         for number, command in enumerate(_between(commands, every)[1:], 1):
-            mass, bias = robot.dynamics(positions, velocities)
+            mass, bias = mechanics.inertia(positions, velocities)
             driven = self.compliance[:, None] * mass + np.diag(self.armature)
-            solve = np.linalg.inv(driven + np.diag(h / 2 * self.damping + h * h / 4))
+            system = driven + np.diag(h / 2 * self.damping + h * h / 4)
             drive = command + self.lead * (command - last) / PERIOD_S - self.compliance * bias
+            solve = np.linalg.inv(system)
+            tips = self._tips_near(mechanics, positions)
             for _ in range(_SUBSTEPS):  # implicit midpoint
                 force = drive - positions - (h / 2 + self.damping) * velocities
+                table = tips and tips.forces(positions, velocities, h)
+                if table:  # scaled by the stiffness of the joints, as all of it
+                    force = force + self.compliance * table[0]
+                    solve = np.linalg.inv(system + self.compliance[:, None] * table[1])
                 acceleration = solve @ force
                 positions = positions + h * velocities + h * h / 2 * acceleration
                 velocities = velocities + h * acceleration
@@ -125,6 +147,55 @@ class ArmResponse:
                 rows.append(positions)
         then = ArmState(positions=positions, velocities=velocities, commands=last)
         return np.stack(rows), then
+
+    def _tips_near(self, mechanics: RobotMechanics, positions: FloatArray) -> _Tips | None:
+        if self.floor is None:
+            return None
+        points, jacobians = mechanics.fingertips(positions)
+        heights = points[:, 2] - self.floor
+        near = heights < _NEAR_M
+        if not near.any():
+            return None
+        return _Tips(heights=heights[near], jacobians=jacobians[near], positions=positions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Tips:
+    """Fingertips near the table.
+
+    Attributes:
+        heights: (P,) over it [m].
+        jacobians: (P, 3, J).
+        positions: (J,) that both are of.
+    """
+
+    heights: FloatArray
+    jacobians: FloatArray
+    positions: FloatArray
+
+    def forces(
+        self, positions: FloatArray, velocities: FloatArray, step_s: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Returns what the table does to joints: (J,) now, and (J, J) of an acceleration then.
+
+        None where nothing touches it.
+        """
+        up = self.jacobians[:, 2]
+        depths = -(self.heights + up @ (positions - self.positions))
+        sinks = -(up @ velocities)
+        touching = depths + step_s * sinks > 0
+        if not touching.any():
+            return None
+        up, depths, sinks = up[touching], depths[touching], sinks[touching]
+        push = _STIFFNESS * (depths + step_s / 2 * sinks) + _DAMPING * sinks
+        forces = up.T @ push
+        resists = (_STIFFNESS * step_s**2 / 4 + _DAMPING * step_s / 2) * up.T @ up
+        for along, depth in zip(self.jacobians[touching, :2], depths, strict=True):
+            slip = along @ velocities
+            rubs = _FRICTION * _STIFFNESS * max(depth, 0.0) / max(float(np.hypot(*slip)), _SLOW)
+            forces = forces - rubs * along.T @ slip
+            resists = resists + rubs * step_s / 2 * along.T @ along
+        return forces, resists
 
 
 def _between(commands: FloatArray, every: int) -> FloatArray:

@@ -10,6 +10,7 @@ Shape letters: N rows, T steps, J joints.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 
 #: commands and measured positions of an episode, both (T, J), `PERIOD_S` apart
@@ -42,6 +44,9 @@ _MOVES = 0.02
 _LONGEST_PERIOD_S = 0.035
 #: episodes that are read
 _MOST = 100
+#: a fingertip was stopped where it is so much higher than expected [m]; of their heights, the
+#: table's; rows of a recording that are looked at
+_STOPPED_M, _LOWEST_PERCENT, _EVERY = 0.005, 5.0, 5
 #: slower tools do not count in the error [m/s]
 _TOOL_MOVES = 0.02
 
@@ -86,13 +91,20 @@ def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmRespons
     if len(recordings) < 2:
         return None, f'arms are taken to follow their commands at once: {reason or "one episode"}'
     held_out = recordings[::4]
-    response = fit_response(robot, [r for n, r in enumerate(recordings) if n % 4])
+    fitted = [r for n, r in enumerate(recordings) if n % 4]
+    response = with_floor(fit_response(robot, fitted), robot, fitted)
     commanded = tool_errors(robot, held_out)
     expected = tool_errors(robot, held_out, response)
     text = (
         f'tools that move are {1e3 * np.median(commanded):.1f} mm from their commands, '
-        f'{1e3 * np.median(expected):.1f} mm from where they are expected (medians, '
-        f'{len(held_out)} episodes held out)'
+        f'{1e3 * np.median(expected):.1f} mm from where they are expected (medians; means '
+        f'{1e3 * np.mean(commanded):.1f} and {1e3 * np.mean(expected):.1f} mm; {len(held_out)} '
+        'episodes held out); '
+    )
+    text += (
+        'the table was not touched'
+        if response.floor is None
+        else f'fingertips stop at a height of {1e3 * response.floor:.1f} mm'
     )
     return (response if np.median(expected) < np.median(commanded) else None), text
 
@@ -140,6 +152,33 @@ def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmRespo
     )
 
 
+def with_floor(
+    response: ArmResponse, robot: RobotModel, recordings: Sequence[Recording]
+) -> ArmResponse:
+    """Returns the response with the height at which fingertips stopped though they were to sink.
+
+    As it is where too few did, or where that does not explain the recordings better.
+
+    Args:
+        response: of arms in free air.
+        robot: whose fingertips they are.
+        recordings: commands and measured positions, both (T, J), `PERIOD_S` apart.
+    """
+    mechanics, stopped = RobotMechanics(robot), []
+    for commands, positions in recordings:
+        expected = response.follow(robot, commands)[0]
+        for wanted, true in zip(expected[::_EVERY], positions[::_EVERY], strict=True):
+            heights = mechanics.fingertips(true)[0][:, 2]
+            sinks = mechanics.fingertips(wanted)[0][:, 2] < heights - _STOPPED_M
+            stopped += heights[sinks].tolist()
+    if len(stopped) < _LEAST_ROWS:
+        return response
+    # what lies on the table stops some of them, too
+    floor = replace(response, floor=float(np.percentile(stopped, _LOWEST_PERCENT)))
+    errors = [tool_errors(robot, recordings, one).mean() for one in (response, floor)]
+    return floor if errors[1] < errors[0] else response
+
+
 def _equations(
     robot: RobotModel, commands: FloatArray, positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -150,9 +189,9 @@ def _equations(
     # as `follow` does, where a command is that of the period before its row
     way = (commands[2:] - commands[:-2]) / (2 * PERIOD_S)
     driven = (commands[1:-1] + commands[2:]) / 2
-    torques = []
+    torques, mechanics = [], RobotMechanics(robot)
     for q, v, a in zip(positions[inner], velocity, acceleration, strict=True):
-        mass, bias = robot.dynamics(q, v)
+        mass, bias = mechanics.inertia(q, v)
         torques.append(mass @ a + bias)
     left = np.stack([np.array(torques), acceleration, velocity, -way], axis=-1)
     moving = (np.abs(velocity) > _MOVES)[..., None]

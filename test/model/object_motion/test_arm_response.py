@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.model.object_motion.predictor import load_response
 from mtv_world_ros.training.object_motion.response_fit import (
@@ -17,6 +19,7 @@ from mtv_world_ros.training.object_motion.response_fit import (
     found_response,
     joint_recording,
     tool_errors,
+    with_floor,
 )
 
 ROBOTS = ('yam_bimanual', 'franka')
@@ -102,6 +105,70 @@ def test_rows_further_apart_are_joined_by_cubics():
     assert np.abs(coarse - fine[::5]).max() < 0.01
 
 
+def dips(robot, floor: float, num: int = 200) -> np.ndarray:
+    """(T, J) commands of the first arm to 5 cm below a height and up again, seen by a tip."""
+    mechanics, rest = RobotMechanics(robot), commands_of(robot)[0]
+
+    def lowered(height: float) -> np.ndarray:
+        positions = rest.copy()
+        for _ in range(50):
+            points, jacobians = mechanics.fingertips(positions)
+            tip = int(points[:2, 2].argmin())
+            up = jacobians[tip, 2] * (np.arange(len(rest)) < 6)
+            positions = positions + up * (height - points[tip, 2]) / (up @ up)
+        return positions
+
+    above, below = lowered(floor + 0.05), lowered(floor - 0.05)
+    share = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(num) / (num - 1))[:, None]
+    return above + share * (below - above)
+
+
+def tips_of(robot, positions: np.ndarray) -> np.ndarray:
+    mechanics = RobotMechanics(robot)
+    return np.array([mechanics.fingertips(row)[0] for row in positions])
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_fingertips_move_as_their_jacobians_say(name):
+    robot = robot_of(name)
+    positions = commands_of(robot)[100]
+    points, jacobians = RobotMechanics(robot).fingertips(positions)
+    assert points.shape == (2 * len(robot.tools), 3)
+    tools = robot.tool_poses(positions[None])[:, 0, :3, 3]
+    np.testing.assert_allclose(points.reshape(-1, 2, 3).mean(1), tools, atol=1e-9)
+    grippers = [tool.gripper_joint for tool in robot.tools]
+    arms = [j for j, joint in enumerate(robot.joint_names) if joint not in grippers]
+    for joint in arms:
+        step = 1e-6 * (np.arange(len(positions)) == joint)
+        moved = (tips_of(robot, [positions + step])[0] - points) / 1e-6
+        np.testing.assert_allclose(moved, jacobians[..., joint], atol=1e-4)
+
+
+def test_fingertips_stop_at_the_table_and_nothing_else_changes():
+    robot = robot_of('yam_bimanual')
+    air = response_of(robot, 0.02)
+    commands = dips(robot, 0.01)
+    free, _ = air.follow(robot, commands)
+    met, _ = replace(air, floor=0.01).follow(robot, commands)
+    assert tips_of(robot, free)[..., 2].min() < -0.03
+    assert tips_of(robot, met)[..., 2].min() > 0.006
+    np.testing.assert_allclose(met[:40], free[:40], atol=1e-12)
+    assert np.abs(tips_of(robot, met[-1:]) - tips_of(robot, free[-1:])).max() < 0.005
+    high, _ = replace(air, floor=-1.0).follow(robot, commands)
+    np.testing.assert_allclose(high, free, atol=1e-12)
+
+
+def test_the_table_is_found_where_fingertips_were_to_sink_and_did_not():
+    robot = robot_of('yam_bimanual')
+    air = response_of(robot, 0.02)
+    commands = dips(robot, 0.03, 1000)
+    true = replace(air, floor=0.03)
+    met, free = (one.follow(robot, commands)[0] for one in (true, air))
+    found = with_floor(air, robot, [(commands, met)])
+    assert found.floor == pytest.approx(0.03, abs=0.004)
+    assert with_floor(air, robot, [(commands, free)]).floor is None
+
+
 def test_recorded_arms_are_nearer_to_what_is_expected_than_to_their_commands():
     robot = robot_of('yam_bimanual')
     response, text = found_response([DEMO, DEMO], robot)
@@ -122,10 +189,13 @@ def test_a_response_is_read_again_by_joint_and_refused_for_another_robot(tmp_pat
     assert load_response(tmp_path, robot) is None
     file = tmp_path / 'arm_response.json'
     values = dict(reversed(response_of(robot, 0.02).as_json().items()))
+    assert 'floor' not in values
+    values |= {'floor': 0.012}
     values['left_joint1']['lead'] = 0.5
     file.write_text(json.dumps(values))
     read = load_response(tmp_path, robot)
     assert read is not None and read.lead[robot.joint_names.index('left_joint1')] == 0.5
+    assert read.floor == 0.012 and read.as_json()['floor'] == 0.012
     with pytest.raises(CheckpointError, match="which robot 'franka' has; run 'mtv-world train-m"):
         load_response(tmp_path, robot_of('franka'))
     for wrong in ('much', -1.0):
