@@ -99,7 +99,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-weak-0.4',
         'expert-undo-0.03',
         'expert-undo-0.05',
-        # added last, by somebody who had seen no measurement
+        # added next, by somebody who had seen no measurement
         'expert-skip-1.2',
         'expert-skip-1.6',
         'expert-slide-0.015',
@@ -112,6 +112,19 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-choppy-0.7',
         'expert-tremble-0.03',
         'expert-tremble-0.04',
+        # added after those, by somebody who had seen no measurement of any
+        'expert-stir-0.028',
+        'expert-stir-0.03',
+        'expert-meddle-0.04',
+        'expert-meddle-0.06',
+        'expert-ragged-0.3',
+        'expert-ragged-0.4',
+        'expert-seams-0.8',
+        'expert-seams-0.9',
+        'expert-ring-0.9',
+        'expert-ring-0.95',
+        'expert-swap-0.4',
+        'expert-swap-0.5',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

@@ -84,6 +84,10 @@ FAULTS: Mapping[str, FaultKind] = {
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
     'loop': _kind('timing', 'test', 2.0, 4.0, 's', 'commands of this length are repeated once'),
     'skip': _kind('timing', 'test', 1.4, 3.0, 's', 'commands of this length are left out'),
+    'ragged': _kind('timing', 'test', 0.3, 2.0, 's', 'each arm joint is late, by up to this'),
+    'seams': _kind(
+        'timing', 'test', 0.8, 2.0, 's', 'every chunk of commands is up to this long off its time'
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -228,9 +232,20 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         "an arm at rest mirrors this share of the other's motion",
     ),
+    'stir': _kind(
+        'collision', 'test', 0.03, 0.08, 'm', 'it circles this wide before the fingers close'
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
+    ),
+    'meddle': _kind(
+        'object',
+        'test',
+        0.04,
+        0.12,
+        'm',
+        'once done, it takes what it has put the object on or beside, and moves it this far',
     ),
     'place': _kind(
         'place',
@@ -274,6 +289,9 @@ FAULTS: Mapping[str, FaultKind] = {
     'choppy': _kind(
         'speed', 'test', 0.6, 2.0, 's', 'it gets a command this seldom, and jumps to it'
     ),
+    'ring': _kind(
+        'speed', 'test', 0.9, 3.0, 's', 'period with which the arms swing about their commands'
+    ),
     # joint
     'zero': _kind(
         'joint', 'test', 0.04, 0.2, 'rad', 'standard deviation of a constant error of every joint'
@@ -281,6 +299,9 @@ FAULTS: Mapping[str, FaultKind] = {
     'weak': _kind('joint', 'test', 0.25, 0.5, '', 'share that lacks of the travel of one joint'),
     'tremble': _kind(
         'joint', 'test', 0.03, 0.3, 'rad', 'amplitude of a fast oscillation of every joint'
+    ),
+    'swap': _kind(
+        'joint', 'test', 0.4, 1.0, '', "share that the arms take of each other's commands, once"
     ),
     # regrasp
     'retry': _kind(
@@ -474,6 +495,12 @@ _JUMP_S = 0.1
 _TWITCH_EVERY_S = 0.8
 #: of an oscillation [Hz]
 _TREMBLE_HZ = 2.5
+#: length of a chunk of commands [s]
+_CHUNK_S = 0.8
+#: of arms that swing, as a share of the critical damping
+_DAMPING = 0.2
+#: time in which the arms begin to swap their commands, and in which they do [s]
+_SWAP_S = (0.2, 0.4)
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -552,11 +579,13 @@ def _controller_faults(
     if variant.size('skip'):
         share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.65)
         positions = _skip(positions, float(share), round(variant.size('skip') / period), period)
+    positions = _out_of_time(positions, variant, grippers, period, rng)
     positions = _choppy(positions, round(variant.size('choppy') / period), period)
     if variant.size('weak'):
         own = np.random.default_rng(rng.integers(2**32))
         positions = _weak(positions, grippers, variant.size('weak'), own)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
+    positions = _off_course(positions, variant, robot, grippers, period, rng)
     if variant.size('freeze'):
         own = np.random.default_rng(rng.integers(2**32))
         positions = _freeze(positions, round(variant.size('freeze') / period), own)
@@ -576,6 +605,44 @@ def _controller_faults(
     error = _errors(positions, variant, len(robot.tools), period, rng)
     error[:, grippers] = 0.0
     return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
+
+
+def _out_of_time(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    grippers: list[int],
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T', J): chunks, or joints, each with a timing of its own."""
+    if variant.size('seams'):
+        own = np.random.default_rng(rng.integers(2**32))
+        positions = _seams(positions, variant.size('seams') / period, period, own)
+    if variant.size('ragged'):
+        own = np.random.default_rng(rng.integers(2**32))
+        positions = _ragged(positions, grippers, variant.size('ragged') / period, own)
+    return positions
+
+
+def _off_course(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    robot: RobotModel,
+    grippers: list[int],
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): away from the commands for a while, within the joints' limits."""
+    if variant.size('swap'):
+        share = np.random.default_rng(rng.integers(2**32)).uniform(0.1, 0.9)
+        weights = variant.size('swap') * _swap_weights(len(positions), float(share), period)
+        crossed = positions[0] + _crossed(positions, len(robot.tools))
+        positions = positions + weights * (crossed - positions)
+        positions = np.clip(positions, robot.lower, robot.upper)
+    if variant.size('ring'):
+        positions = _ring(positions, grippers, 2 * np.pi * period / variant.size('ring'))
+        positions = np.clip(positions, robot.lower, robot.upper)
+    return positions
 
 
 def _errors(
@@ -696,6 +763,48 @@ def _choppy(positions: FloatArray, num: int, period: float) -> FloatArray:
     return (1 - blend) * positions[np.maximum(held - num, 0)] + blend * positions[held]
 
 
+def _seams(
+    positions: FloatArray, most: float, period: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T', J): every chunk but the first is ahead or behind, by up to `most` samples."""
+    whole, _ = _delayed(positions, int(np.ceil(most)))
+    rows, num = np.arange(len(whole)), round(_CHUNK_S / period)
+    chunks = rows // num
+    ahead = np.rint(most * rng.uniform(-1.0, 1.0, chunks[-1] + 1)).astype(int)
+    ahead[0] = 0
+    before, now = (
+        whole[np.clip(rows + ahead[numbers], 0, len(whole) - 1)]
+        for numbers in (np.maximum(chunks - 1, 0), chunks)
+    )
+    blend = np.minimum((rows % num + 1) * period / _JUMP_S, 1.0)[:, None]
+    return (1 - blend) * before + blend * now
+
+
+def _ragged(
+    positions: FloatArray, grippers: list[int], most: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T', J): every arm joint is behind, by up to `most` samples."""
+    whole, _ = _delayed(positions, int(np.ceil(most)))
+    rows, behind = np.arange(len(whole)), most * rng.uniform(size=whole.shape[1])
+    behind[grippers] = 0.0
+    columns = zip(behind, whole.T, strict=True)
+    return np.stack([np.interp(rows - by, rows, column) for by, column in columns], axis=1)
+
+
+def _ring(positions: FloatArray, grippers: list[int], angle: float) -> FloatArray:
+    """(T, J): the arms follow as masses on springs do, which swing by `angle` [rad] a sample."""
+    damped = angle * np.sqrt(1 - _DAMPING**2)
+    decay, cos, sin = np.exp(-_DAMPING * angle), np.cos(damped), np.sin(damped)
+    lag = _DAMPING * angle / damped
+    whole, speed = positions.copy(), np.zeros_like(positions[0])
+    for row in range(1, len(whole)):
+        away = whole[row - 1] - positions[row]
+        whole[row] += decay * ((cos + lag * sin) * away + sin / damped * speed)
+        speed = decay * ((cos - lag * sin) * speed - angle**2 / damped * sin * away)
+    whole[:, grippers] = positions[:, grippers]
+    return whole
+
+
 def _twitches(num: int, period: float) -> FloatArray:
     """(T, 1) from 0, which is most of the time, to 1."""
     times = np.arange(num) * period % _TWITCH_EVERY_S
@@ -703,15 +812,29 @@ def _twitches(num: int, period: float) -> FloatArray:
 
 
 def _mirrored(positions: FloatArray, num_arms: int, period: float) -> FloatArray:
-    """(T, J) errors: of arms at rest, the motion of the arm before in the order of the joints.
+    """(T, J) errors: of arms at rest, the motion of the arm before in the order of the joints."""
+    is_still = positions == positions[0]
+    at_rest = _smooth(is_still.astype(np.float64), [], round(_SET_IN_S / period))
+    return at_rest * _crossed(positions, num_arms)
+
+
+def _crossed(positions: FloatArray, num_arms: int) -> FloatArray:
+    """(T, J) from the first row on, the mirrored motion of the arm before.
 
     Joints that are at opposite angles in the first row turn to opposite sides.
     """
     home, ways = positions[0], positions - positions[0]
     to_next = len(home) // num_arms
     signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
-    at_rest = _smooth((ways == 0).astype(np.float64), [], round(_SET_IN_S / period))
-    return at_rest * signs * np.roll(ways, to_next, axis=1)
+    return signs * np.roll(ways, to_next, axis=1)
+
+
+def _swap_weights(num: int, share: float, period: float) -> FloatArray:
+    """(T, 1) from 0 to 1 and back, once, from a share of the plan on."""
+    (begins, lasts), first = _SWAP_S, int(share * num)
+    knots = np.cumsum([0.0, begins, lasts, begins])
+    times = (np.arange(num) - first) * period
+    return np.interp(times, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
 
 
 def _tremble(

@@ -153,7 +153,8 @@ class ScriptedPolicy:
     ) -> Iterator[tuple[Task, Scene]]:
         """What it may set out to do, in order of preference."""
         if not is_wrong:
-            yield self.task, self.scene
+            size = self.variant.size('meddle')
+            yield self._meddled(size, rng) if size else (self.task, self.scene)
             return
         number = int(rng.integers(len(self.task.moves)))
         for move in self._wrong_moves(self.task.moves[number], rng):
@@ -164,6 +165,28 @@ class ScriptedPolicy:
             goals = list(self.scene.goals)
             goals[number] = goals_of(task, items, [(0.0, 0.0)] * len(moves))[number]
             yield task, replace(self.scene, goals=tuple(goals))
+
+    def _meddled(self, size: float, rng: np.random.Generator) -> tuple[Task, Scene]:
+        """With one more move: what one was put on or beside is moved by `size` [m].
+
+        Where nothing like it can be grasped, another move's subject, else its own once more.
+        """
+        own = np.random.default_rng(rng.integers(2**32))
+        moves, places = self.task.moves, {i.role: i.position for i in self.scene.objects}
+        places |= {m.subject: goal for m, goal in zip(moves, self.scene.goals, strict=True)}
+        can_be_held = {i.role for i in self.scene.objects if SHAPES[i.shape].grasp is not None}
+        move = moves[int(own.integers(len(moves)))]
+        role = move.reference if isinstance(move, PickPlace) else START
+        if role not in can_be_held:
+            others = (other.subject for other in moves if other is not move)
+            role = next(others, move.subject)
+        angle, (x, y, z) = own.uniform(0, 2 * np.pi), places[role]
+        goal = (x + size * float(np.cos(angle)), y + size * float(np.sin(angle)), z)
+        more = PickPlace(subject=role, reference=START)
+        return (
+            replace(self.task, moves=(*moves, more)),
+            replace(self.scene, goals=(*self.scene.goals, goal)),
+        )
 
     def _wrong_moves(self, move: Move, rng: np.random.Generator) -> list[Move]:
         """The move with another object: put where the right one belongs, else put back."""

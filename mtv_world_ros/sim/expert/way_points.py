@@ -23,6 +23,8 @@ _MOST_STOPS = 40
 _PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
 #: an odd way point: standard deviations of its place [m], yaw and lean [rad]; the longest run
 _ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
+#: way points of a circle, and time from one to the next [s]
+_NUM_CIRCLE, _CIRCLE_S = 8, 0.25
 #: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
 #: high over it, how much it rises before and after [m]; standard deviations beside the centre [m],
 #: of yaw and lean [rad]
@@ -271,6 +273,15 @@ def _sweep(stops: Stops, size: float, side: _Side) -> Stops:
     return [*_pushed(grasp, size, above.position - grasp.position, side.across), *stops]
 
 
+def _stir(stops: Stops, size: float, side: _Side) -> Stops:
+    """Down at the object, it circles about it as if it looked for it."""
+    first = _first(stops, 'close')
+    grasp = replace(stops[first - 1], phase='above', seconds=_CIRCLE_S)
+    angles = side.angle + side.sign * np.linspace(0.0, 2 * np.pi, _NUM_CIRCLE + 1)
+    ways = (size * np.array([np.cos(angle), np.sin(angle), 0.0]) for angle in angles)
+    return [*stops[:first], *(grasp.moved(way) for way in ways), grasp, *stops[first:]]
+
+
 def _knock(stops: Stops, size: float, side: _Side) -> Stops:
     """The same at the goal, lower than where the object is let go."""
     lower = stops[_first(stops, 'lower')]
@@ -480,6 +491,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'low_carry': _low_carry,
     'push': _push,
     'sweep': _sweep,
+    'stir': _stir,
     'elsewhere': _elsewhere,
     'retry': _retry,
     'regrasp': _regrasp,

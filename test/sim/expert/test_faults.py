@@ -136,6 +136,87 @@ def test_the_arm_at_rest_mirrors_the_other(expert):
     np.testing.assert_array_equal(mirror[:, moves], expert_plan[:, moves])
 
 
+def test_every_chunk_is_off_its_time_by_as_much_as_it_says(expert):
+    expert_plan, seams = plan(expert, 'expert'), plan(expert, 'expert-seams-0.8')
+    assert len(seams) == len(expert_plan) + 40
+    np.testing.assert_allclose(seams[:40], expert_plan[:40], atol=1e-12)
+    # the first tenth of a second of a chunk is the jump; the rest are commands of the expert
+    for chunk in (2, 4, 6):
+        rows = np.arange(chunk * 40 + 5, chunk * 40 + 40)
+        errors = [
+            np.abs(seams[rows] - expert_plan[np.clip(rows + by, 0, len(expert_plan) - 1)]).max()
+            for by in range(-40, 41)
+        ]
+        assert min(errors) < 1e-12
+
+
+def test_joints_are_late_each_by_its_own_time_and_swing_about_their_commands(expert):
+    expert_plan, arms = plan(expert, 'expert'), arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    ragged, ring = plan(expert, 'expert-ragged-0.4'), plan(expert, 'expert-ring-0.8')
+    assert len(ragged) == len(expert_plan) + 20
+    for changed in (ragged, ring):
+        np.testing.assert_array_equal(
+            changed[: len(expert_plan), grippers], expert_plan[:, grippers]
+        )
+    np.testing.assert_allclose(ragged[-1], expert_plan[-1])
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0.2]
+    begins = [
+        np.argmax(np.abs(positions[:, moves] - positions[0, moves]) > 0.05, axis=0)
+        for positions in (expert_plan, ragged)
+    ]
+    late = begins[1] - begins[0]
+    assert (late >= 0).all() and late.max() <= 21 and np.ptp(late) > 0
+    # a joint that overshoots goes a longer way
+    ways = [np.abs(np.diff(p[:, moves], axis=0)).sum(axis=0) for p in (expert_plan, ring)]
+    assert (ways[1] > 1.2 * ways[0]).all()
+    np.testing.assert_allclose(plan(expert, 'expert-ring-0.001'), expert_plan, atol=1e-9)
+
+
+def test_arms_that_swap_their_commands_do_so_once(expert):
+    expert_plan, swap = plan(expert, 'expert'), plan(expert, 'expert-swap-1')
+    rows = np.flatnonzero(np.abs(swap - expert_plan).max(axis=1) > 1e-9)
+    assert 0 < len(rows) <= 40 and np.ptp(rows) == len(rows) - 1
+    half, middle = plan(expert, 'expert-swap-0.5'), int(rows[len(rows) // 2])
+    np.testing.assert_allclose(half, (swap + expert_plan) / 2, atol=1e-9)
+    # the arm at rest is where the other would have been, which is at home
+    moves = np.ptp(expert_plan, axis=0) > 0
+    np.testing.assert_allclose(swap[middle, moves], expert_plan[0, moves], atol=1e-9)
+    assert np.abs(swap[middle, ~moves] - expert_plan[0, ~moves]).max() > 0.1
+
+
+def test_it_circles_about_its_object_at_its_height():
+    place, up = np.array([0.0, 0.3, 0.03]), np.array([0, 0, 0.1])
+    stops = [
+        WayPoint('above', place + up, 0.0, 1.0), WayPoint('grasp', place, 0.0, 1.0),
+        WayPoint('close', place, 0.0, 0.0), WayPoint('lift', place + up, 0.0, 0.0),
+    ]  # fmt: skip
+    faults = WayPointFaults(parse_variant('expert-stir-0.03'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [place])
+    assert changed[:2] == stops[:2] and changed[-2:] == stops[2:] and len(changed) == 14
+    ways = np.array([stop.position - place for stop in changed[2:11]])
+    np.testing.assert_allclose(np.linalg.norm(ways[:, :2], axis=1), 0.03)
+    np.testing.assert_allclose(ways[:, 2], 0.0)
+    np.testing.assert_allclose(ways[:8].sum(axis=0), 0.0, atol=1e-9)
+    np.testing.assert_array_equal(changed[11].position, place)
+
+
+@pytest.mark.parametrize(
+    'task', ['stack_blocks_two', 'move_object_two', 'collect_toy', 'shake_bottle']
+)
+def test_it_meddles_with_another_object_once_the_task_is_done(expert, task):
+    plans = []
+    for name in ('expert', 'expert-meddle-0.04'):
+        policy = scripted_policy(name, task, SEED, expert)
+        policy.reset(seed=SEED)
+        plans.append(policy.plan.positions)
+    openings = [expert.robot.gripper_openings(positions) for positions in plans]
+    closed = [
+        int((np.diff((opening < 0.05).astype(int), axis=1) == 1).sum()) for opening in openings
+    ]
+    assert closed[1] == closed[0] + 1
+
+
 def heights_where_it_lets_go(expert, name: str) -> list[float]:
     """Tool heights [m] at which the gripper of the arm that moves opens."""
     positions = plan(expert, name)
