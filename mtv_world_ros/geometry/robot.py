@@ -110,12 +110,14 @@ class RobotModel:
         self.mimics = tuple(mimics)
         self._frames = _link_frames(model)
         self._setters = [
-            (self._joint(joint), column, 1.0, 0.0) for column, joint in enumerate(self.joint_names)
+            _Setter.of(self._joint(joint), column) for column, joint in enumerate(self.joint_names)
         ]
         self.lower, self.upper, self.velocity_limits = self._limits()
         self._check_names(mimics)
         self._setters += [
-            (self._joint(m.joint), self.joint_names.index(m.source), m.multiplier, m.offset)
+            _Setter.of(
+                self._joint(m.joint), self.joint_names.index(m.source), m.multiplier, m.offset
+            )
             for m in mimics
         ]
         for link in (base_link, *(tool.link for tool in self.tools)):
@@ -136,7 +138,7 @@ class RobotModel:
         model = self.pinocchio_model
         ends = [model.frames[self._frame(name)].parentJoint for name in (link, self.base_link)]
         between = set(model.supports[ends[0]]) ^ set(model.supports[ends[1]])
-        known = {joint.id for joint, *_ in self._setters}
+        known = {setter.joint for setter in self._setters}
         return tuple(model.names[joint] for joint in sorted(between - known))
 
     def forward_kinematics(self, positions: FloatArray) -> dict[str, FloatArray]:
@@ -188,8 +190,8 @@ class RobotModel:
     def joint_motions(self) -> FloatArray:
         """(nv, J) how Pinocchio's velocities follow those of the joints."""
         follows = np.zeros((self.pinocchio_model.nv, len(self.joint_names)))
-        for joint, column, multiplier, _ in self._setters:
-            follows[joint.idx_v, column] = multiplier
+        for setter in self._setters:
+            follows[setter.velocity, setter.column] = setter.multiplier
         return follows
 
     def _poses(self, positions: FloatArray, links: Sequence[str]) -> FloatArray:
@@ -214,22 +216,22 @@ class RobotModel:
                 f'(T, {len(self.joint_names)})'
             )
         configurations = np.repeat(pin.neutral(self.pinocchio_model)[None], len(positions), axis=0)
-        for joint, column, multiplier, offset in self._setters:
-            values = multiplier * positions[:, column] + offset
-            if joint.nq == 1:
-                configurations[:, joint.idx_q] = values
+        for setter in self._setters:
+            values = setter.multiplier * positions[:, setter.column] + setter.offset
+            if not setter.endless:
+                configurations[:, setter.first] = values
             else:
-                configurations[:, joint.idx_q] = np.cos(values)
-                configurations[:, joint.idx_q + 1] = np.sin(values)
+                configurations[:, setter.first] = np.cos(values)
+                configurations[:, setter.first + 1] = np.sin(values)
         return configurations
 
     def _limits(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        model, joints = self.pinocchio_model, [setter[0] for setter in self._setters]
+        model, joints = self.pinocchio_model, self._setters
         rows = [
-            (model.lowerPositionLimit[j.idx_q], model.upperPositionLimit[j.idx_q])
-            if j.nq == 1
-            else (-np.inf, np.inf)
-            for j in joints
+            (-np.inf, np.inf)
+            if joint.endless
+            else (model.lowerPositionLimit[joint.first], model.upperPositionLimit[joint.first])
+            for joint in joints
         ]
         lower, upper = np.array(rows, dtype=float).reshape(-1, 2).T.copy()
         if (lower > upper).any():
@@ -238,7 +240,7 @@ class RobotModel:
                 f"joint '{self.joint_names[joint]}' of robot '{self.name}' has its lower limit "
                 f'{lower[joint]} above the upper one {upper[joint]}'
             )
-        speeds = np.array([model.velocityLimit[j.idx_v] for j in joints])
+        speeds = np.array([model.velocityLimit[joint.velocity] for joint in joints])
         for array in (lower, upper, speeds):
             array.flags.writeable = False
         return lower, upper, speeds
@@ -288,6 +290,43 @@ class RobotModel:
                 f"robot '{self.name}': {why} '{joint}', which is not among the joints "
                 f'{list(self.joint_names)}{nearest(joint, self.joint_names)}'
             )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Setter:
+    """Where Pinocchio keeps a joint, and which of the robot's it follows.
+
+    Attributes:
+        joint: its number.
+        first: first of its numbers in a configuration.
+        velocity: its velocity's.
+        endless: it has two numbers, cosine and sine.
+        column: of the robot's joint.
+        multiplier: of that.
+        offset: added.
+    """
+
+    joint: int
+    first: int
+    velocity: int
+    endless: bool
+    column: int
+    multiplier: float
+    offset: float
+
+    @classmethod
+    def of(
+        cls, joint: pin.JointModel, column: int, multiplier: float = 1.0, offset: float = 0.0
+    ) -> _Setter:
+        return cls(
+            joint=joint.id,
+            first=joint.idx_q,
+            velocity=joint.idx_v,
+            endless=joint.nq > 1,
+            column=column,
+            multiplier=multiplier,
+            offset=offset,
+        )
 
 
 def _link_frames(model: pin.Model) -> dict[str, int]:

@@ -45,28 +45,41 @@ class RobotMechanics:
         moving = pin.nonLinearEffects(model, data, q, follows @ velocities)
         return mass, follows.T @ (moving - still)
 
-    def fingertips(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns the tips of all fingers (P, 3) in the base frame, and their Jacobians (P, 3, J).
+    def fingertips(self, positions: FloatArray) -> FloatArray:
+        """Returns the tips of all fingers (P, 3) in the base frame [m].
 
-        Two of each tool, as far apart as the gripper is open; that it opens is not in them.
+        Two of each tool, as far apart as the gripper is open.
+        """
+        model, data = self._model, self._data
+        q = self._robot.configurations(positions[None])[0]
+        pin.forwardKinematics(model, data, q)
+        base = pin.updateFramePlacement(model, data, self._base).inverse()
+        gaps = self._robot.gripper_openings(positions[None])[:, 0] * self._travels
+        points = []
+        for (frame, offset), gap in zip(self._tools, gaps, strict=True):
+            tool = base * pin.updateFramePlacement(model, data, frame) * offset
+            middle, way = tool.translation, gap * tool.rotation[:, 1]
+            points += [middle + way, middle - way]
+        return np.array(points)
+
+    def fingertip_jacobians(self, positions: FloatArray, points: FloatArray) -> FloatArray:
+        """Returns how `fingertips` at positions (J,) move with the joints (P, 3, J).
+
+        That the gripper opens is not in them.
         """
         model, data = self._model, self._data
         q = self._robot.configurations(positions[None])[0]
         pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacements(model, data)
-        base = data.oMf[self._base]
-        gaps = self._robot.gripper_openings(positions[None])[:, 0] * self._travels
-        points, jacobians = [], []
-        for (frame, offset), gap in zip(self._tools, gaps, strict=True):
-            link = data.oMf[frame]
+        turn = pin.updateFramePlacement(model, data, self._base)
+        jacobians = []
+        for number, (frame, _) in enumerate(self._tools):
+            link = turn.actInv(pin.updateFramePlacement(model, data, frame).translation)
             jacobian = pin.getFrameJacobian(
                 model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
             )
-            tool = link * offset
-            for side in (gap, -gap):
-                tip = tool.translation + side * tool.rotation[:, 1]
-                arm = pin.skew(tip - link.translation)
-                moves = (jacobian[:3] - arm @ jacobian[3:]) @ self._follows
-                points.append(base.actInv(tip))
-                jacobians.append(base.rotation.T @ moves)
-        return np.array(points), np.array(jacobians)
+            linear, angular = (
+                turn.rotation.T @ half @ self._follows for half in (jacobian[:3], jacobian[3:])
+            )
+            for tip in points[2 * number : 2 * number + 2]:
+                jacobians.append(linear - pin.skew(tip - link) @ angular)
+        return np.array(jacobians)

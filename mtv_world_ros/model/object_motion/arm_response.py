@@ -151,11 +151,12 @@ class ArmResponse:
     def _tips_near(self, mechanics: RobotMechanics, positions: FloatArray) -> _Tips | None:
         if self.floor is None:
             return None
-        points, jacobians = mechanics.fingertips(positions)
+        points = mechanics.fingertips(positions)
         heights = points[:, 2] - self.floor
         near = heights < _NEAR_M
         if not near.any():
             return None
+        jacobians = mechanics.fingertip_jacobians(positions, points)
         return _Tips(heights=heights[near], jacobians=jacobians[near], positions=positions)
 
 

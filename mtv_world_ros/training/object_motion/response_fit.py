@@ -168,8 +168,8 @@ def with_floor(
     for commands, positions in recordings:
         expected = response.follow(robot, commands)[0]
         for wanted, true in zip(expected[::_EVERY], positions[::_EVERY], strict=True):
-            heights = mechanics.fingertips(true)[0][:, 2]
-            sinks = mechanics.fingertips(wanted)[0][:, 2] < heights - _STOPPED_M
+            heights = mechanics.fingertips(true)[:, 2]
+            sinks = mechanics.fingertips(wanted)[:, 2] < heights - _STOPPED_M
             stopped += heights[sinks].tolist()
     if len(stopped) < _LEAST_ROWS:
         return response

@@ -112,7 +112,8 @@ def dips(robot, floor: float, num: int = 200) -> np.ndarray:
     def lowered(height: float) -> np.ndarray:
         positions = rest.copy()
         for _ in range(50):
-            points, jacobians = mechanics.fingertips(positions)
+            points = mechanics.fingertips(positions)
+            jacobians = mechanics.fingertip_jacobians(positions, points)
             tip = int(points[:2, 2].argmin())
             up = jacobians[tip, 2] * (np.arange(len(rest)) < 6)
             positions = positions + up * (height - points[tip, 2]) / (up @ up)
@@ -125,14 +126,16 @@ def dips(robot, floor: float, num: int = 200) -> np.ndarray:
 
 def tips_of(robot, positions: np.ndarray) -> np.ndarray:
     mechanics = RobotMechanics(robot)
-    return np.array([mechanics.fingertips(row)[0] for row in positions])
+    return np.array([mechanics.fingertips(row) for row in positions])
 
 
 @pytest.mark.parametrize('name', ROBOTS)
 def test_fingertips_move_as_their_jacobians_say(name):
     robot = robot_of(name)
     positions = commands_of(robot)[100]
-    points, jacobians = RobotMechanics(robot).fingertips(positions)
+    mechanics = RobotMechanics(robot)
+    points = mechanics.fingertips(positions)
+    jacobians = mechanics.fingertip_jacobians(positions, points)
     assert points.shape == (2 * len(robot.tools), 3)
     tools = robot.tool_poses(positions[None])[:, 0, :3, 3]
     np.testing.assert_allclose(points.reshape(-1, 2, 3).mean(1), tools, atol=1e-9)
