@@ -105,7 +105,7 @@ def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
     rows, joints = commands.positions.shape
     off = _log_uniform(_OFF_RAD, rng) * rng.normal(size=joints)
     if rng.random() < _ALONE:
-        off *= np.arange(joints) == rng.integers(joints)
+        off *= np.arange(joints) == rng.choice(np.delete(np.arange(joints), commands.grippers))
     off[commands.grippers] = 0.0
     wave: FloatArray | float = 1.0
     frequency, phases = _log_uniform(_SWING_HZ, rng), rng.uniform(0.0, 2 * np.pi, joints)
