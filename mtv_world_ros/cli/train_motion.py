@@ -67,6 +67,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action='store_true',
         help='torch.compile: 1.8 times as fast; needs a C++ compiler',
     )
+    parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1')
     parser.add_argument('--threads', type=int, default=0, help='0 = all cores but one')
     add_overwrite(parser)
     parser.set_defaults(handler=_train)
@@ -83,7 +84,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
     from mtv_world_ros.model.object_motion.predictor import add_members, load_network
-    from mtv_world_ros.model.runtime import set_num_threads
+    from mtv_world_ros.model.runtime import check_device, set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
         end_errors,
@@ -95,6 +96,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.object_motion.response_fit import found_response
     from mtv_world_ros.training.training_run import find_episodes
 
+    check_device(arguments.device)
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     given = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
     init = mean_network(given) if given else None
@@ -121,6 +123,7 @@ def _train(arguments: argparse.Namespace) -> int:
             forced_share=0.0 if init else 0.35,
             seed=arguments.seed,
             compile=arguments.compile,
+            device=arguments.device,
             width=arguments.width,
             hidden=arguments.hidden,
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -124,6 +125,8 @@ def test_training_goes_on_from_networks_and_replaces_none_unasked(
     assert main(again) == 1
     assert "two/object_motion' exists; give another --out" in capsys.readouterr().err
     assert main([*again, '--overwrite']) == 0
+    assert main([*train, '--out', str(tmp_path / 'new'), '--device', 'gpu']) == 1
+    assert "device 'gpu' is not known" in capsys.readouterr().err
     assert main([*train, '--out', str(tmp_path / 'new'), '--init', str(tmp_path)]) == 1
     assert 'cannot be used' in capsys.readouterr().err and not (tmp_path / 'new').exists()
 
@@ -191,6 +194,30 @@ def test_objects_that_are_not_there_change_nothing(episodes, robot):
     torch.testing.assert_close(losses[1], losses[0])
     losses[1].backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())
+
+
+@pytest.mark.gpu
+def test_captured_passes_give_the_loss_and_gradients_of_plain_ones(episodes, robot):
+    tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
+    torch.manual_seed(0)
+    plain = ObjectMotionNetwork(width=24, hidden=8)
+    for parameter in plain.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    quick = copy.deepcopy(plain).to('cuda')
+    passes, captured = motion_training._Passes(plain), motion_training._Passes(quick)
+    (pool,) = pools_of(tracks, 'cuda')
+    most = max(len(track.features) for track in tracks)
+    (same,) = pools_of([filled_up(track, most) for track in tracks], 'cpu')
+    for seed in range(3):
+        losses = []
+        for one, run in ((same, passes), (pool, captured)):
+            batch = one.draw(8, np.random.default_rng(seed))
+            forced = torch.zeros(8, windows.WINDOW, dtype=torch.bool, device=batch.points.device)
+            forced[:, 0] = True
+            losses.append(run(batch, forced).item())
+        assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+        for wanted, found in zip(plain.parameters(), quick.parameters(), strict=True):
+            torch.testing.assert_close(found.grad.cpu(), wanted.grad, rtol=0.01, atol=1e-3)
 
 
 def _distances(points, tools):
