@@ -17,6 +17,10 @@ from mtv_world_ros.geometry.transforms import inverse, is_rigid
 LIMIT_TOLERANCE = 1e-3
 
 
+#: travel of a finger where the robot's file does not say it [m]
+_TRAVEL_M = 0.04
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tool:
     """Tool of an arm: its tool centre point and gripper.
@@ -29,7 +33,7 @@ class Tool:
         gripper_closed: its value when closed [rad or m].
         gripper_open: its value when open [rad or m].
         finger_travel_m: how far each finger is from the tool point along the tool's y axis when
-            the gripper is open [m]; None = fingers are not drawn.
+            the gripper is open [m]; None = fingers are not drawn, and taken to be 40 mm away.
     """
 
     arm: str
@@ -185,6 +189,14 @@ class RobotModel:
                 travel = tool.gripper_open - tool.gripper_closed
                 openings[arm] = (values - tool.gripper_closed) / travel
         return openings.clip(0.0, 1.0)
+
+    def finger_gaps(self, positions: FloatArray) -> FloatArray:
+        """Returns (T, A) how far each finger is from its tool at positions (T, J) [m]."""
+        travels = [
+            _TRAVEL_M if tool.finger_travel_m is None else tool.finger_travel_m
+            for tool in self.tools
+        ]
+        return self.gripper_openings(positions).T * np.array(travels)
 
     @property
     def joint_motions(self) -> FloatArray:

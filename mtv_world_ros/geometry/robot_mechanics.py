@@ -29,7 +29,6 @@ class RobotMechanics:
             for tool in robot.tools
         ]
         self._base = self._model.getFrameId(robot.base_link, pin.BODY)
-        self._travels = np.array([tool.finger_travel_m or 0.0 for tool in robot.tools])
 
     def inertia(
         self, positions: FloatArray, velocities: FloatArray
@@ -54,7 +53,7 @@ class RobotMechanics:
         q = self._robot.configurations(positions[None])[0]
         pin.forwardKinematics(model, data, q)
         base = pin.updateFramePlacement(model, data, self._base).inverse()
-        gaps = self._robot.gripper_openings(positions[None])[:, 0] * self._travels
+        gaps = self._robot.finger_gaps(positions[None])[0]
         points = []
         for (frame, offset), gap in zip(self._tools, gaps, strict=True):
             tool = base * pin.updateFramePlacement(model, data, frame) * offset
@@ -70,16 +69,22 @@ class RobotMechanics:
         model, data = self._model, self._data
         q = self._robot.configurations(positions[None])[0]
         pin.computeJointJacobians(model, data, q)
-        turn = pin.updateFramePlacement(model, data, self._base)
+        base = pin.updateFramePlacement(model, data, self._base)
         jacobians = []
         for number, (frame, _) in enumerate(self._tools):
-            link = turn.actInv(pin.updateFramePlacement(model, data, frame).translation)
-            jacobian = pin.getFrameJacobian(
-                model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            )
-            linear, angular = (
-                turn.rotation.T @ half @ self._follows for half in (jacobian[:3], jacobian[3:])
-            )
+            link = pin.updateFramePlacement(model, data, frame)
             for tip in points[2 * number : 2 * number + 2]:
-                jacobians.append(linear - pin.skew(tip - link) @ angular)
+                place = base.act(tip)
+                # a base link that joints move takes the point along
+                moves = self._carried(frame, place - link.translation) - self._carried(
+                    self._base, place - base.translation
+                )
+                jacobians.append(base.rotation.T @ moves)
         return np.array(jacobians)
+
+    def _carried(self, frame: int, arm: FloatArray) -> FloatArray:
+        """(3, J) how a point that is `arm` (3,) away from a frame moves with it, in the world."""
+        jacobian = pin.getFrameJacobian(
+            self._model, self._data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )
+        return (jacobian[:3] - pin.skew(arm) @ jacobian[3:]) @ self._follows

@@ -100,7 +100,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-weak-0.4',
         'expert-undo-0.03',
         'expert-undo-0.05',
-        # added next, by somebody who had seen no measurement
+        # added next, by somebody who had seen no measurement; once these were measured, the
+        # training kind `glitch` was written, which is like them
         'expert-skip-1.2',
         'expert-skip-1.6',
         'expert-slide-0.015',

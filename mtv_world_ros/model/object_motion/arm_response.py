@@ -60,7 +60,8 @@ class ArmResponse:
         armature: (J,) [s^2].
         damping: (J,) [s].
         lead: (J,) [s].
-        floor: lowest height of fingertips, in the base frame [m]; None = not known.
+        floor: lowest height of fingertips, in the base frame [m]; None = not known. It stops
+            joints with a compliance, which are those of a description with inertias.
 
     Raises:
         ValueError: a number is not finite, or below 0.

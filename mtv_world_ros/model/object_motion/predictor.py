@@ -40,8 +40,6 @@ _PLACE_ERROR_M, _SIZE_ERROR = 0.003, 0.04
 _MAX_OBJECTS = 16
 #: least height of an object's centre over the table [m]
 _LEAST_HEIGHT_M = 0.004
-#: travel of a finger where the robot's file does not say it [m]
-_TRAVEL_M = 0.04
 _CONFIG, _WEIGHTS, _RESPONSE = 'config.json', 'model.safetensors', 'arm_response.json'
 #: folders of further networks, in that of the first
 _MEMBER = 'member_'
@@ -207,17 +205,9 @@ def _tools(
     if member.response is not None:
         followed, arms = member.response.follow(robot, positions, STEP_S, last and last.arms)
     tools = robot.tool_poses(followed).transpose(1, 0, 2, 3)
-    gaps = finger_gaps(robot, positions)
+    gaps = robot.finger_gaps(positions)
     before = (tools[0], gaps[0]) if last is None else (last.tools, last.gaps)
     return np.concatenate([before[0][None], tools]), np.concatenate([before[1][None], gaps]), arms
-
-
-def finger_gaps(robot: RobotModel, positions: FloatArray) -> FloatArray:
-    """Returns (T, A) how far each finger is from its tool at positions (T, J) [m]."""
-    travels = [
-        _TRAVEL_M if tool.finger_travel_m is None else tool.finger_travel_m for tool in robot.tools
-    ]
-    return robot.gripper_openings(positions).T * np.array(travels)
 
 
 def _tensor(values: FloatArray) -> Tensor:

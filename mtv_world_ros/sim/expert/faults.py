@@ -15,7 +15,7 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.sim.expert.glitches import Commands, with_glitches
+from mtv_world_ros.sim.expert.glitches import Commands, crossed, with_glitches
 
 EXPERT = 'expert'
 #: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
@@ -501,6 +501,8 @@ _CHUNK_S = 0.8
 _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
+#: kinds in which one arm does what another should
+_OF_TWO_ARMS = ('mirror', 'swap')
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -515,7 +517,16 @@ def with_faults(
         variant: its faults of timing and speed are applied.
         robot: whose joints they are.
         rng: draws the noise.
+
+    Raises:
+        PolicyError: a fault of two arms, of a robot that has one.
     """
+    of_two = [kind for kind in variant.kinds if kind in _OF_TWO_ARMS]
+    if of_two and len(robot.tools) < 2:
+        raise PolicyError(
+            f"policy '{variant.name}': {', '.join(of_two)} takes two arms, robot '{robot.name}' "
+            f'has {len(robot.tools)}; leave it out'
+        )
     period = float(plan.times[1] - plan.times[0])
     tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
     grippers = [robot.joint_names.index(tool.gripper_joint or '') for tool in tools]
@@ -636,8 +647,8 @@ def _off_course(
     if variant.size('swap'):
         share = np.random.default_rng(rng.integers(2**32)).uniform(0.1, 0.9)
         weights = variant.size('swap') * _swap_weights(len(positions), float(share), period)
-        crossed = positions[0] + _crossed(positions, len(robot.tools))
-        positions = positions + weights * (crossed - positions)
+        others = positions[0] + crossed(positions, positions.shape[1] // len(robot.tools))
+        positions = positions + weights * (others - positions)
         positions = np.clip(positions, robot.lower, robot.upper)
     if variant.size('ring'):
         positions = _ring(positions, grippers, 2 * np.pi * period / variant.size('ring'))
@@ -815,18 +826,7 @@ def _mirrored(positions: FloatArray, num_arms: int, period: float) -> FloatArray
     """(T, J) errors: of arms at rest, the motion of the arm before in the order of the joints."""
     is_still = positions == positions[0]
     at_rest = _smooth(is_still.astype(np.float64), [], round(_SET_IN_S / period))
-    return at_rest * _crossed(positions, num_arms)
-
-
-def _crossed(positions: FloatArray, num_arms: int) -> FloatArray:
-    """(T, J) from the first row on, the mirrored motion of the arm before.
-
-    Joints that are at opposite angles in the first row turn to opposite sides.
-    """
-    home, ways = positions[0], positions - positions[0]
-    to_next = len(home) // num_arms
-    signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
-    return signs * np.roll(ways, to_next, axis=1)
+    return at_rest * crossed(positions, positions.shape[1] // num_arms)
 
 
 def _swap_weights(num: int, share: float, period: float) -> FloatArray:

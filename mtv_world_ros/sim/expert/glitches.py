@@ -7,7 +7,7 @@ over orders of magnitude, so that a few hundred episodes hold what nobody though
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,26 +51,35 @@ class Commands:
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
-    """Returns the positions (T', J) with so many glitches; they may leave the joints' limits."""
+    """Returns the positions (T, J) with so many glitches; they may leave the joints' limits."""
+    changed = commands
     for _ in range(count):
         glitch = _GLITCHES[int(rng.choice(len(_GLITCHES), p=_OFTEN))]
-        changed = glitch(commands, rng)
-        commands = Commands(
-            positions=changed,
-            period=commands.period,
-            grippers=commands.grippers,
-            closed=commands.closed,
-            travel=commands.travel,
-            num_arms=commands.num_arms,
-        )
-    return _published(commands)
+        changed = replace(changed, positions=glitch(changed, rng))
+    return _published(commands, changed.positions)
 
 
-def _published(commands: Commands) -> FloatArray:
-    """As points of a trajectory tell it, straight in between: what is quicker nobody is told."""
-    rows = np.arange(len(commands.positions))
+def _published(commands: Commands, changed: FloatArray) -> FloatArray:
+    """(T, J) as points of a trajectory tell it: what is quicker nobody is told.
+
+    Straight from point to point where something changed, else as it was.
+    """
+    rows = np.arange(len(changed))
     points = np.append(rows[:: round(_POINTS_S / commands.period)], rows[-1])
-    return np.stack([np.interp(rows, points, c[points]) for c in commands.positions.T], axis=1)
+    straight = np.stack([np.interp(rows, points, c[points]) for c in changed.T], axis=1)
+    differs = np.abs(changed - commands.positions).max(axis=1) > 0
+    between = np.searchsorted(points, rows, side='right')
+    return np.where(np.isin(between, between[differs])[:, None], straight, commands.positions)
+
+
+def crossed(positions: FloatArray, to_next: int) -> FloatArray:
+    """Returns (T, J), from the first row on, the mirrored motion of joints `to_next` before.
+
+    Joints that are at opposite angles in the first row turn to opposite sides.
+    """
+    home, ways = positions[0], positions - positions[0]
+    signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
+    return signs * np.roll(ways, to_next, axis=1)
 
 
 def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float:
@@ -90,7 +99,9 @@ def _presence(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _gripper(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """One gripper or all are as far open as drawn."""
+    """One gripper or all are as far open as drawn; without one, joints are off."""
+    if not commands.grippers:
+        return _joints(commands, rng)
     there = _presence(commands, rng)
     chosen = rng.random(len(commands.grippers)) < 0.5
     chosen[rng.integers(len(chosen))] = True
@@ -107,7 +118,6 @@ def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
     if rng.random() < _ALONE:
         off *= np.arange(joints) == rng.choice(np.delete(np.arange(joints), commands.grippers))
     off[commands.grippers] = 0.0
-    wave: FloatArray | float = 1.0
     frequency, phases = _log_uniform(_SWING_HZ, rng), rng.uniform(0.0, 2 * np.pi, joints)
     if rng.random() < _SWINGS:
         times = np.arange(rows)[:, None] * commands.period
@@ -151,20 +161,22 @@ def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _other_arm(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """An arm that rests moves as another does, to this side or that; with one arm, joints."""
+    """An arm that rests moves as another does, to this side or that, as some joints do anyway.
+
+    With one arm alone, joints are off.
+    """
     if commands.num_arms < 2:
         return _joints(commands, rng)
     positions = commands.positions
     joints = positions.shape[1]
     to_next = joints // commands.num_arms * int(rng.integers(1, commands.num_arms))
-    ways, home = positions - positions[0], positions[0]
-    signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
+    ways, signs = positions - positions[0], np.ones(joints)
     if rng.random() < 0.5:
-        signs = signs * rng.choice((-1.0, 1.0), joints, p=(0.2, 0.8))
+        signs = rng.choice((-1.0, 1.0), joints, p=(0.2, 0.8))
     late = np.maximum(np.arange(len(ways)) - int(rng.uniform(0, _LAG_S) / commands.period), 0)
     resting = (np.abs(ways) < 1e-9).all(axis=0) | (rng.random(joints) < 0.3)
     there = (ways == 0) | resting
-    error = rng.uniform(*_SHARE) * signs * np.roll(ways[late], to_next, axis=1)
+    error = rng.uniform(*_SHARE) * signs * crossed(positions, to_next)[late]
     num = max(round(_log_uniform(_ONSET_S, rng) / commands.period), 1)
     weights = np.stack([np.convolve(column, np.ones(num) / num, 'same') for column in there.T], 1)
     error = error * weights

@@ -238,7 +238,8 @@ class _Passes:
         captured = self._captured[size]
         for own, new in zip(captured.given, _tensors(batch, forced), strict=True):
             own.copy_(new)
-        captured.graph.replay()
+        with torch.cuda.device(batch.points.device):
+            captured.graph.replay()
         for parameter, gradient in zip(self._parameters, captured.gradients, strict=True):
             parameter.grad = gradient
         return captured.loss
@@ -251,6 +252,10 @@ class _Passes:
         return loss.detach()
 
     def _capture(self, batch: Batch, forced: Tensor) -> _Captured:
+        with torch.cuda.device(batch.points.device):
+            return self._capture_here(batch, forced)
+
+    def _capture_here(self, batch: Batch, forced: Tensor) -> _Captured:
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):

@@ -102,7 +102,7 @@ def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmRespons
         'episodes held out); '
     )
     text += (
-        'the table was not touched'
+        'no height was found at which fingertips stop'
         if response.floor is None
         else f'fingertips stop at a height of {1e3 * response.floor:.1f} mm'
     )

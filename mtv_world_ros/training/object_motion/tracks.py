@@ -23,7 +23,6 @@ from mtv_world_ros.geometry.resample import nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import STEP_S
-from mtv_world_ros.model.object_motion.predictor import finger_gaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +91,7 @@ def object_tracks(
         cameras=cameras,
         poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
         tools=robot.tool_poses(expected).transpose(1, 0, 2, 3),
-        gaps=finger_gaps(robot, positions),
+        gaps=robot.finger_gaps(positions),
         stamps_ns=stamps[0] + times * 1e9,
     )
     # the last second shows nothing new

@@ -129,9 +129,11 @@ def tips_of(robot, positions: np.ndarray) -> np.ndarray:
     return np.array([mechanics.fingertips(row) for row in positions])
 
 
-@pytest.mark.parametrize('name', ROBOTS)
+@pytest.mark.parametrize('name', [*ROBOTS, 'a base link that moves'])
 def test_fingertips_move_as_their_jacobians_say(name):
-    robot = robot_of(name)
+    robot = robot_of(name if name in ROBOTS else 'franka')
+    if name not in ROBOTS:
+        robot.base_link = 'panda_link2'
     positions = commands_of(robot)[100]
     mechanics = RobotMechanics(robot)
     points = mechanics.fingertips(positions)
@@ -157,8 +159,8 @@ def test_fingertips_stop_at_the_table_and_nothing_else_changes():
     assert tips_of(robot, met)[..., 2].min() > 0.006
     np.testing.assert_allclose(met[:40], free[:40], atol=1e-12)
     assert np.abs(tips_of(robot, met[-1:]) - tips_of(robot, free[-1:])).max() < 0.005
-    high, _ = replace(air, floor=-1.0).follow(robot, commands)
-    np.testing.assert_allclose(high, free, atol=1e-12)
+    deep, _ = replace(air, floor=-1.0).follow(robot, commands)
+    np.testing.assert_allclose(deep, free, atol=1e-12)
 
 
 def test_the_table_is_found_where_fingertips_were_to_sink_and_did_not():

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import PolicyError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.expert.faults import (
     draw_variant,
     FAULTS,
@@ -15,6 +18,7 @@ from mtv_world_ros.sim.expert.faults import (
     PolicyVariant,
     refuse_kinds,
     SPLITS,
+    with_faults,
 )
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
@@ -141,13 +145,16 @@ def test_every_chunk_is_off_its_time_by_as_much_as_it_says(expert):
     assert len(seams) == len(expert_plan) + 40
     np.testing.assert_allclose(seams[:40], expert_plan[:40], atol=1e-12)
     # the first tenth of a second of a chunk is the jump; the rest are commands of the expert
-    for chunk in (2, 4, 6):
+    found = []
+    for chunk in (2, 3, 4, 5, 6):
         rows = np.arange(chunk * 40 + 5, chunk * 40 + 40)
         errors = [
             np.abs(seams[rows] - expert_plan[np.clip(rows + by, 0, len(expert_plan) - 1)]).max()
             for by in range(-40, 41)
         ]
         assert min(errors) < 1e-12
+        found.append(int(np.argmin(errors)) - 40)
+    assert len(set(found)) > 2 and max(np.abs(found)) > 10
 
 
 def test_joints_are_late_each_by_its_own_time_and_swing_about_their_commands(expert):
@@ -183,6 +190,19 @@ def test_arms_that_swap_their_commands_do_so_once(expert):
     moves = np.ptp(expert_plan, axis=0) > 0
     np.testing.assert_allclose(swap[middle, moves], expert_plan[0, moves], atol=1e-9)
     assert np.abs(swap[middle, ~moves] - expert_plan[0, ~moves]).max() > 0.1
+
+
+def test_faults_of_two_arms_are_refused_of_one(expert):
+    given = plan(expert, 'expert')
+    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    one = JointTrajectory(
+        joint_names=franka.joint_names,
+        times=np.arange(len(given)) * 0.02,
+        positions=np.zeros((len(given), len(franka.joint_names))),
+    )
+    for kind in ('mirror', 'swap'):
+        with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
+            with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
 
 
 def test_it_circles_about_its_object_at_its_height():
