@@ -178,8 +178,8 @@ def _other_arm(commands: Commands, rng: np.random.Generator) -> FloatArray:
     there = (ways == 0) | resting
     error = rng.uniform(*_SHARE) * signs * crossed(positions, to_next)[late]
     num = max(round(_log_uniform(_ONSET_S, rng) / commands.period), 1)
-    weights = np.stack([np.convolve(column, np.ones(num) / num, 'same') for column in there.T], 1)
-    error = error * weights
+    sets_in = [np.convolve(column, np.ones(num) / num, 'same') for column in there.T]
+    error = error * np.stack(sets_in, axis=1, dtype=np.float64)
     error[:, commands.grippers] = 0.0
     return positions + error
 
