@@ -153,10 +153,14 @@ class TrackedObjects:
             np.where(known[:, None], self.reference, 0.0), self.features
         )
         points, rotations, thens = [], [], []
+        followed: dict[int, tuple[FloatArray, FloatArray, ArmState | None]] = {}
         for number, rows in enumerate(self.model.shares):
             member, robot = self.model.members[number], self.model.robot
             last = self.before[number] if self.before else None
-            tools, gaps, arms = _tools(member, robot, positions, last)
+            response = id(member.response)  # members share it
+            if response not in followed:
+                followed[response] = _tools(member, robot, positions, last)
+            tools, gaps, arms = followed[response]
             scene = Scene(
                 points=_tensor(places[rows]),
                 features=_tensor(features[rows]),
@@ -293,9 +297,13 @@ def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
         CheckpointError: see `load_network`, `load_response`.
     """
     folders = [folder, *sorted(folder.glob(f'{_MEMBER}*'))]
-    members = [
-        Member(network=load_network(each), response=load_response(each, robot)) for each in folders
-    ]
+    members: list[Member] = []
+    for each in folders:
+        response = load_response(each, robot)
+        for other in members:
+            if response and other.response and other.response.as_json() == response.as_json():
+                response = other.response
+        members.append(Member(network=load_network(each), response=response))
     return ObjectMotionPredictor(members, robot)
 
 
