@@ -542,7 +542,7 @@ def with_faults(
         both = np.stack([positions[:, grippers], jerks]) * opens
         positions[:, grippers] = both.max(axis=0) * opens
     if variant.size('stall'):
-        share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.6)
+        share = _own(rng).uniform(0.15, 0.6)
         positions = _stall(
             positions, grippers, float(share), round(variant.size('stall') / period)
         )
@@ -572,6 +572,11 @@ def with_faults(
     )
 
 
+def _own(rng: np.random.Generator) -> np.random.Generator:
+    """A fault's own generator: whatever it draws, those after it draw the same."""
+    return np.random.default_rng(rng.integers(2**32))
+
+
 def _controller_faults(
     positions: FloatArray,
     variant: PolicyVariant,
@@ -585,20 +590,20 @@ def _controller_faults(
     Each fault draws from a generator of its own, so that another size draws the same.
     """
     if variant.size('loop'):
-        share = np.random.default_rng(rng.integers(2**32)).uniform(0.35, 0.75)
+        share = _own(rng).uniform(0.35, 0.75)
         positions = _loop(positions, float(share), round(variant.size('loop') / period), period)
     if variant.size('skip'):
-        share = np.random.default_rng(rng.integers(2**32)).uniform(0.15, 0.65)
+        share = _own(rng).uniform(0.15, 0.65)
         positions = _skip(positions, float(share), round(variant.size('skip') / period), period)
     positions = _out_of_time(positions, variant, grippers, period, rng)
     positions = _choppy(positions, round(variant.size('choppy') / period), period)
     if variant.size('weak'):
-        own = np.random.default_rng(rng.integers(2**32))
+        own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
     positions = _off_course(positions, variant, robot, grippers, period, rng)
     if variant.size('freeze'):
-        own = np.random.default_rng(rng.integers(2**32))
+        own = _own(rng)
         positions = _freeze(positions, round(variant.size('freeze') / period), own)
     if variant.size('glitch'):
         tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
@@ -610,7 +615,7 @@ def _controller_faults(
             travel=np.array([tool.gripper_open - tool.gripper_closed for tool in tools]),
             num_arms=len(robot.tools),
         )
-        own = np.random.default_rng(rng.integers(2**32))
+        own = _own(rng)
         positions = with_glitches(commands, round(variant.size('glitch')), own)
         positions = np.clip(positions, robot.lower, robot.upper)
     error = _errors(positions, variant, len(robot.tools), period, rng)
@@ -627,10 +632,10 @@ def _out_of_time(
 ) -> FloatArray:
     """(T', J): chunks, or joints, each with a timing of its own."""
     if variant.size('seams'):
-        own = np.random.default_rng(rng.integers(2**32))
+        own = _own(rng)
         positions = _seams(positions, variant.size('seams') / period, period, own)
     if variant.size('ragged'):
-        own = np.random.default_rng(rng.integers(2**32))
+        own = _own(rng)
         positions = _ragged(positions, grippers, variant.size('ragged') / period, own)
     return positions
 
@@ -645,7 +650,7 @@ def _off_course(
 ) -> FloatArray:
     """(T, J): away from the commands for a while, within the joints' limits."""
     if variant.size('swap'):
-        share = np.random.default_rng(rng.integers(2**32)).uniform(0.1, 0.9)
+        share = _own(rng).uniform(0.1, 0.9)
         weights = variant.size('swap') * _swap_weights(len(positions), float(share), period)
         others = positions[0] + crossed(positions, positions.shape[1] // len(robot.tools))
         positions = positions + weights * (others - positions)
@@ -841,7 +846,7 @@ def _tremble(
     num: int, num_joints: int, amplitude: float, period: float, rng: np.random.Generator
 ) -> FloatArray:
     """(T, J) errors: waves, each joint's with a phase of its own, once they have set in."""
-    phases = np.random.default_rng(rng.integers(2**32)).uniform(0.0, 2 * np.pi, num_joints)
+    phases = _own(rng).uniform(0.0, 2 * np.pi, num_joints)
     times = np.arange(num)[:, None] * period
     waves = np.sin(2 * np.pi * _TREMBLE_HZ * times + phases)
     return amplitude * np.minimum(times / _SET_IN_S, 1.0) * waves
@@ -863,7 +868,7 @@ def _offset(
     num: int, num_joints: int, deviation: float, period: float, rng: np.random.Generator
 ) -> FloatArray:
     """(T, J) errors: the same from `_SET_IN_S` on; the plan begins where the arms are."""
-    drawn = np.random.default_rng(rng.integers(2**32)).normal(0.0, deviation, num_joints)
+    drawn = _own(rng).normal(0.0, deviation, num_joints)
     return np.minimum(np.arange(num) * period / _SET_IN_S, 1.0)[:, None] * drawn
 
 
@@ -871,7 +876,7 @@ def _spikes(
     num: int, num_joints: int, deviation: float, period: float, rng: np.random.Generator
 ) -> FloatArray:
     """(T, J) errors: a few short triangles, anywhere in the plan; none between them."""
-    rng = np.random.default_rng(rng.integers(2**32))
+    rng = _own(rng)
     middles = rng.uniform(0.1, 0.9, _NUM_SPIKES) * num
     away = np.abs(np.arange(num)[:, None] - middles) * period / (_SPIKE_S / 2)
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (_NUM_SPIKES, num_joints))

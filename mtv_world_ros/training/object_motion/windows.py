@@ -136,6 +136,7 @@ class TrackPool:
             order = rng.permuted(order, axis=1)
             noise = rng.normal(0.0, _PLACE_NOISE_M, noise.shape)
             scale = rng.normal(1.0, _SHAPE_NOISE, scale.shape)
+        chosen = torch.from_numpy(tracks).to(device)
         rows = torch.from_numpy(self.offsets[tracks, None] + steps).to(device)
         first = torch.from_numpy(self.offsets[tracks]).to(device)
         picked = torch.from_numpy(order.copy()).to(device)
@@ -151,7 +152,7 @@ class TrackPool:
             return torch.take_along_dim(values, index, at.ndim)
 
         points = of('points', rows)
-        features = self._features[torch.from_numpy(tracks).to(device)]
+        features = self._features[chosen]
         scene = Scene(
             points=of('points', first) + moved,
             features=torch.take_along_dim(features, picked[..., None, None], 1) * scaled,
@@ -164,7 +165,7 @@ class TrackPool:
             points=points + moved[:, None],
             rotations=of('rotations', rows),
             known=of('known', rows),
-            turns_known=self._turns_known[torch.from_numpy(tracks).to(device)],
+            turns_known=self._turns_known[chosen],
             parted=_parted(self._rows['points'][rows], groups, picked),
         )
 
