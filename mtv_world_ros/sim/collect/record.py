@@ -11,8 +11,10 @@ import numpy as np
 
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, SimulatorError
+from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import PolicyVariant
@@ -173,7 +175,7 @@ def carry_out(
     first: SimObservation,
     config: RecordConfig,
 ) -> Take:
-    """Runs commands open loop, one every control period.
+    """Runs commands open loop, as a controller would that is given the action chunks.
 
     Args:
         sim: has just been reset, or given a scene.
@@ -183,6 +185,7 @@ def carry_out(
         config: how it is sampled.
     """
     started, rendering = time.process_time(), 0.0
+    commands = as_published(commands, config)
     observations, measured = [first], [sim.positions()]
     last = len(commands.times) - 1
     least = last + round(config.hold_s / CONTROL_PERIOD_S)
@@ -209,6 +212,27 @@ def carry_out(
         physics_s=time.process_time() - started - rendering,
         rendering_s=rendering,
         object_poses=sim.seen_poses(),
+    )
+
+
+def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajectory:
+    """Returns commands of every control period as the action chunks tell them.
+
+    Chunks have fewer points, so that what is quicker than them is not in them. The arms do what
+    the recording says, or nobody could learn from it what follows from which command.
+    """
+    num = len(commands.times) - 1
+    starts = np.arange(0, num, round(config.chunk_s / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S
+    whole = stitch([(round(s * 1e9), chunk(commands, s, config)) for s in starts], 0)
+    until = 1 + int(np.searchsorted(whole.times, num * CONTROL_PERIOD_S - 1e-9))
+    times = np.arange(round(whole.times[:until][-1] / CONTROL_PERIOD_S) + 1) * CONTROL_PERIOD_S
+    at = np.minimum(np.arange(len(times)), num)
+    assert commands.velocities is not None
+    return replace(
+        commands,
+        times=times,
+        positions=resample(whole, commands.positions[0], times),
+        velocities=np.where((np.arange(len(times)) <= num)[:, None], commands.velocities[at], 0.0),
     )
 
 
