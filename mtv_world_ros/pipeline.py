@@ -429,7 +429,7 @@ class ImaginedEpisode:
                 tracked=found,
             )
         return objects.move(
-            plan.fine_positions(objects.tracked.step_s),
+            plan.fine_positions(objects.tracked.step_s, objects.tracked.commands_a_step),
             plan.times - plan.times[0],
             state.observation.cameras,
             poses,

@@ -108,10 +108,10 @@ class ChunkPlan:
     trajectory: JointTrajectory
     current: FloatArray
 
-    def fine_positions(self, step_s: float) -> FloatArray:
-        """Returns the joints (N, J) of the whole chunk, `step_s` apart; row 0 its start."""
-        count = round((self.times[-1] - self.times[0]) / step_s)
-        times = self.times[0] + step_s * np.arange(count + 1)
+    def fine_positions(self, step_s: float, each: int = 1) -> FloatArray:
+        """Returns the joints of the whole chunk, `each` in a step; row 0 its start."""
+        count = round((self.times[-1] - self.times[0]) / step_s) * each
+        times = self.times[0] + step_s / each * np.arange(count + 1)
         return resample(self.trajectory, self.current, times)
 
 

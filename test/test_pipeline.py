@@ -289,7 +289,7 @@ def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
 class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
-    step_s = 0.1
+    step_s, commands_a_step = 0.1, 1
     sizes = np.full((2, 3), 0.04)
 
     def __init__(self, log: list[int], num_steps: int = 0) -> None:
@@ -408,7 +408,7 @@ def test_positions_outside_the_limits_are_refused(
 class SlidingObjects:
     """Moves every object 1 cm along x in each step of 0.1 s; remembers how often it was asked."""
 
-    step_s = 0.1
+    step_s, commands_a_step = 0.1, 1
 
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps

@@ -62,7 +62,12 @@ class TrackedObjects(Protocol):
 
     @property
     def step_s(self) -> float:
-        """Time between the joint positions that `advance` takes [s]."""
+        """Time between the rows of a motion [s]."""
+        ...
+
+    @property
+    def commands_a_step(self) -> int:
+        """How many joint positions `advance` takes a step."""
         ...
 
     @property
@@ -71,10 +76,13 @@ class TrackedObjects(Protocol):
         ...
 
     def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
-        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
+        """Returns where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one; the others, if any, are of places and sizes within
         the error of what the masks tell. Row 0 is where they are now.
+
+        Args:
+            positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
         """
         ...
 
@@ -125,7 +133,8 @@ class FoundObjects:
         """Moves the objects as the robot moves.
 
         Args:
-            positions: (N, J), `tracked.step_s` apart [rad or m]; row 0 where the robot is now.
+            positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced; row 0
+                where the robot is now.
             times: (T,) at which they are shown, from row 0 on [s].
             cameras: V cameras at the masks' size.
             poses: (V, T, 4, 4) T_base_camera at these times.
@@ -134,6 +143,7 @@ class FoundObjects:
             Their pictures (V, T, H, W, 4), and the objects after the last row.
         """
         motions, tracked = self.tracked.advance(positions)
+        positions = positions[:: self.tracked.commands_a_step]
         rows = np.rint(times / self.tracked.step_s).astype(int)
         shown = motions[0][np.minimum(rows, len(positions) - 1)]
         pictures = moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)

@@ -21,13 +21,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 
-#: after which the inertia is computed again [s]
+#: between commands, after which the inertia is computed again [s]
 PERIOD_S = 0.02
 #: integration steps in it
 _SUBSTEPS = 2
@@ -109,34 +108,32 @@ class ArmResponse:
         self,
         robot: RobotModel,
         commands: FloatArray,
-        step_s: float = PERIOD_S,
         state: ArmState | None = None,
     ) -> tuple[FloatArray, ArmState]:
         """Returns where the joints are (T, J) at commands (T, J), and then.
 
         Args:
             robot: gives the inertia.
-            commands: in its joint order; the first row is where `state` is, or where the joints
-                rest.
-            step_s: between two rows, a multiple of `PERIOD_S`.
+            commands: in its joint order, `PERIOD_S` apart; the first row is where `state` is, or
+                where the joints rest.
             state: at the first row.
         """
         now = state or ArmState(
             positions=commands[0], velocities=np.zeros(commands.shape[1]), commands=commands[0]
         )
         positions, velocities, last = now.positions, now.velocities, now.commands
-        rows, every, h = [positions], round(step_s / PERIOD_S), PERIOD_S / _SUBSTEPS
+        rows, h = [positions], PERIOD_S / _SUBSTEPS
         mechanics = RobotMechanics(robot)
-        for number, command in enumerate(_between(commands, every)[1:], 1):
+        for command in commands[1:]:
             mass, bias = mechanics.inertia(positions, velocities)
             driven = self.compliance[:, None] * mass + np.diag(self.armature)
             system = driven + np.diag(h / 2 * self.damping + h * h / 4)
             drive = command + self.lead * (command - last) / PERIOD_S - self.compliance * bias
-            solve = np.linalg.inv(system)
+            free = np.linalg.inv(system)
             tips = self._tips_near(mechanics, positions)
             for _ in range(_SUBSTEPS):  # implicit midpoint
                 force = drive - positions - (h / 2 + self.damping) * velocities
-                table = tips and tips.forces(positions, velocities, h)
+                solve, table = free, tips and tips.forces(positions, velocities, h)
                 if table:  # scaled by the stiffness of the joints, as all of it
                     force = force + self.compliance * table[0]
                     solve = np.linalg.inv(system + self.compliance[:, None] * table[1])
@@ -144,8 +141,7 @@ class ArmResponse:
                 positions = positions + h * velocities + h * h / 2 * acceleration
                 velocities = velocities + h * acceleration
             last = command
-            if number % every == 0:
-                rows.append(positions)
+            rows.append(positions)
         then = ArmState(positions=positions, velocities=velocities, commands=last)
         return np.stack(rows), then
 
@@ -189,7 +185,7 @@ class _Tips:
         if not touching.any():
             return None
         up, depths, sinks = up[touching], depths[touching], sinks[touching]
-        push = _STIFFNESS * (depths + step_s / 2 * sinks) + _DAMPING * sinks
+        push = np.maximum(_STIFFNESS * (depths + step_s / 2 * sinks) + _DAMPING * sinks, 0.0)
         forces = up.T @ push
         resists = (_STIFFNESS * step_s**2 / 4 + _DAMPING * step_s / 2) * up.T @ up
         for along, depth in zip(self.jacobians[touching, :2], depths, strict=True):
@@ -198,12 +194,3 @@ class _Tips:
             forces = forces - rubs * along.T @ slip
             resists = resists + rubs * step_s / 2 * along.T @ along
         return forces, resists
-
-
-def _between(commands: FloatArray, every: int) -> FloatArray:
-    """Cubics through the rows, with `every` times as many steps."""
-    if every == 1 or len(commands) == 1:
-        return commands
-    rows = np.arange(len(commands), dtype=float)
-    cubic = CubicHermiteSpline(rows, commands, np.gradient(commands, axis=0))
-    return cubic(np.arange(every * (len(commands) - 1) + 1) / every)

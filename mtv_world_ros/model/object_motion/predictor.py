@@ -25,6 +25,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import (
     ArmResponse,
     ArmState,
+    PERIOD_S,
 )
 from mtv_world_ros.model.object_motion.network import (
     Memory,
@@ -131,8 +132,13 @@ class TrackedObjects:
 
     @property
     def step_s(self) -> float:
-        """Time between the joint positions that `advance` takes [s]."""
+        """Time between the rows of a motion [s]."""
         return STEP_S
+
+    @property
+    def commands_a_step(self) -> int:
+        """How many joint positions `advance` takes a step: what is quick counts as well."""
+        return round(STEP_S / PERIOD_S)
 
     @property
     def sizes(self) -> FloatArray:
@@ -143,10 +149,13 @@ class TrackedObjects:
         return np.stack([least, least, height], axis=-1)
 
     def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
-        """Returns where they are at each of (1 + T, J) positions, `step_s` apart, and then.
+        """Returns where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one, the others are of disturbed places and sizes. Row 0
         is where they are now.
+
+        Args:
+            positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
         """
         known = np.asarray(np.isfinite(self.reference).all(-1))
         places, features = self.model.disturbed(
@@ -159,7 +168,9 @@ class TrackedObjects:
             last = self.before[number] if self.before else None
             response = id(member.response)  # members share it
             if response not in followed:
-                followed[response] = _tools(member, robot, positions, last)
+                followed[response] = _tools(
+                    member, robot, positions, last, self.commands_a_step
+                )
             tools, gaps, arms = followed[response]
             scene = Scene(
                 points=_tensor(places[rows]),
@@ -199,7 +210,7 @@ class _Before:
 
 
 def _tools(
-    member: Member, robot: RobotModel, positions: FloatArray, last: _Before | None
+    member: Member, robot: RobotModel, positions: FloatArray, last: _Before | None, every: int
 ) -> tuple[FloatArray, FloatArray, ArmState | None]:
     """Tools (T + 2, A, 4, 4) and gaps (T + 2, A) as a member is given them; row 0 one step before.
 
@@ -207,9 +218,9 @@ def _tools(
     """
     followed, arms = positions, None
     if member.response is not None:
-        followed, arms = member.response.follow(robot, positions, STEP_S, last and last.arms)
-    tools = robot.tool_poses(followed).transpose(1, 0, 2, 3)
-    gaps = robot.finger_gaps(positions)
+        followed, arms = member.response.follow(robot, positions, last and last.arms)
+    tools = robot.tool_poses(followed[::every]).transpose(1, 0, 2, 3)
+    gaps = robot.finger_gaps(positions[::every])
     before = (tools[0], gaps[0]) if last is None else (last.tools, last.gaps)
     return np.concatenate([before[0][None], tools]), np.concatenate([before[1][None], gaps]), arms
 

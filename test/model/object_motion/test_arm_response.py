@@ -96,15 +96,6 @@ def test_chunks_go_on_where_the_last_one_ended():
     np.testing.assert_allclose(np.concatenate([first, second[1:]]), whole, atol=1e-12)
 
 
-def test_rows_further_apart_are_joined_by_cubics():
-    robot = robot_of('yam_bimanual')
-    response, commands = response_of(robot, 0.02), commands_of(robot, 301)
-    fine, _ = response.follow(robot, commands)
-    coarse, _ = response.follow(robot, commands[::5], 5 * PERIOD_S)
-    assert coarse.shape == (61, len(robot.joint_names))
-    assert np.abs(coarse - fine[::5]).max() < 0.01
-
-
 def dips(robot, floor: float, num: int = 200) -> np.ndarray:
     """(T, J) commands of the first arm to 5 cm below a height and up again, seen by a tip."""
     mechanics, rest = RobotMechanics(robot), commands_of(robot)[0]
