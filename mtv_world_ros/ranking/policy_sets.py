@@ -127,6 +127,19 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-ring-0.95',
         'expert-swap-0.4',
         'expert-swap-0.5',
+        # added last, by somebody who had seen no measurement by kind; sizes by simulating alone
+        'expert-herd-0.06',
+        'expert-herd-0.08',
+        'expert-rub-0.09',
+        'expert-rub-0.1',
+        'expert-crowd-0.8',
+        'expert-crowd-0.9',
+        'expert-couple-0.1',
+        'expert-couple-0.12',
+        'expert-coarse-0.12',
+        'expert-coarse-0.16',
+        'expert-juggle-0.07',
+        'expert-juggle-0.1',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

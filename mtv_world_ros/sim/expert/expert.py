@@ -19,6 +19,10 @@ from mtv_world_ros.sim.world.placement import side_of
 from mtv_world_ros.sim.world.scene import Place, Scene, SceneObject
 from mtv_world_ros.sim.world.workcell import Workcell, workcell_of
 
+#: how long an arm stays where it crowds another, before scaling [s]; by how much of the whole way
+#: its share is reduced until it reaches so far
+_STAYS_S, _LESS = 0.4, 0.05
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PickingConfig:
@@ -247,17 +251,28 @@ class Expert:
         missed = _missed_move(task, rng) if miss else None
         rate = self._config.rate_hz
         positions, busy, last_arm = self.home[None], 1, ''
+        free: dict[str, int] = {}
         for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
             pick = self._pick(now, move, rng, miss=number == missed)
-            stops = self._stops(pick, move, now, goal, rng)
+            stops = usual = self._stops(pick, move, now, goal, rng)
+            share = 0.0
             if faults is not None and number == faults.move_of(len(task.moves)):
                 objects = [np.asarray(item.position) for item in now.values()]
-                stops = faults.applied(stops, pick.yaw, objects)
-            rows = self._follow(pick.arm, stops, rng, alone=len(task.moves) == 1)
+                stops, share = faults.applied(stops, pick.yaw, objects), faults.crowds
+                usual = usual if faults.keeps_tempo else stops
+            pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
+            rows = self._follow(pick.arm, stops, pace)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
-            start = max(1, busy - overlap)
-            busy, last_arm = start + len(rows), pick.arm
+            start = max(1, busy - overlap, free.get(pick.arm, 1))
+            busy = free[pick.arm] = start + len(rows)
+            last_arm = pick.arm
             positions = self._lay(positions, rows, start, pick.arm)
+            other = next((arm for arm in self._tools if arm != pick.arm), None)
+            if share and other is not None:
+                rows, before = self._crowd(pick.arm, other, stops, share, pace)
+                first = max(start + before, free.get(other, 1))
+                free[other] = first + len(rows)
+                positions = self._lay(positions, rows, first, other)
             now[move.subject] = replace(now[move.subject], position=goal)
         return JointTrajectory(
             joint_names=self.robot.joint_names,
@@ -373,15 +388,47 @@ class Expert:
             before = point.position
         return seconds
 
-    def _follow(
-        self, arm: str, stops: list[WayPoint], rng: np.random.Generator, *, alone: bool
-    ) -> FloatArray:
-        """Minimum-jerk blends between way points, scaled to the drawn motion time."""
+    def _pace(
+        self, arm: str, usual: list[WayPoint], rng: np.random.Generator, *, alone: bool
+    ) -> tuple[float, float]:
+        """The drawn motion time, and what the usual way points take before scaling [s]."""
+        wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
+        return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
+
+    def _crowd(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that comes where this one lets go, and how much later they begin.
+
+        It goes a share of the way, or as much of it as it reaches, and is there just then.
+        """
+        opened, home = [s.phase for s in stops].index('open'), self.workcell.home_tools[other]
+        while True:
+            there = home + share * (stops[opened].position - home)
+            near = WayPoint('above', there, 0.0, 1.0)
+            ways = [near, replace(near, seconds=_STAYS_S), WayPoint('home', home, 0.0, 1.0)]
+            try:
+                rows = self._follow(other, ways, pace)
+            except SimulatorError:
+                if not share:
+                    raise
+                share = max(share - _LESS, 0.0)
+                continue
+            arrives = sum(self._timed(stops[:opened], self.workcell.home_tools[arm]))
+            begins = (arrives - self._timed(ways, home)[0]) * pace[0] / pace[1]
+            return rows, max(round(begins * self._config.rate_hz), 0)
+
+    def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
+        """Minimum-jerk blends between way points, at a pace."""
         config = self._config
         home = WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
-        seconds = self._timed(stops, home.position)
-        wanted = rng.uniform(*(config.motion_s if alone else config.motions_s))
-        ends = np.cumsum([0.0, *seconds]) * wanted / sum(seconds)
+        seconds, (wanted, unscaled) = self._timed(stops, home.position), pace
+        ends = np.cumsum([0.0, *seconds]) * wanted / unscaled
         points, solver = [home, *stops], self._solvers[arm]
         rows, joints = [], self.home[solver.indices]
         for time in np.arange(1, round(ends[-1] * config.rate_hz) + 1) / config.rate_hz:

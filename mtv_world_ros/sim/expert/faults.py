@@ -235,6 +235,30 @@ FAULTS: Mapping[str, FaultKind] = {
     'stir': _kind(
         'collision', 'test', 0.03, 0.08, 'm', 'it circles this wide before the fingers close'
     ),
+    'herd': _kind(
+        'collision',
+        'test',
+        0.06,
+        0.1,
+        'm',
+        'shut fingers push the object this far along, and it is grasped where it should be then',
+    ),
+    'rub': _kind(
+        'collision',
+        'test',
+        0.09,
+        0.12,
+        'm',
+        'once done, shut fingers come back down onto the object and drag it this far',
+    ),
+    'crowd': _kind(
+        'collision',
+        'test',
+        0.9,
+        1.0,
+        '',
+        'share of the way that the other arm comes to where the object is let go',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -303,6 +327,17 @@ FAULTS: Mapping[str, FaultKind] = {
     'swap': _kind(
         'joint', 'test', 0.4, 1.0, '', "share that the arms take of each other's commands, once"
     ),
+    'couple': _kind(
+        'joint',
+        'test',
+        0.1,
+        0.3,
+        'rad',
+        'standard deviation of how far each joint of an arm goes along as its gripper closes',
+    ),
+    'coarse': _kind(
+        'joint', 'test', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
+    ),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -317,6 +352,14 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'clutch': _kind(
         'regrasp', 'test', 0.8, 1.0, '', 'share by which the fingers close again while it retreats'
+    ),
+    'juggle': _kind(
+        'regrasp',
+        'test',
+        0.08,
+        0.15,
+        'm',
+        'half-way it lets the object fall from this height, and takes it again',
     ),
     'undo': _kind(
         'regrasp',
@@ -502,7 +545,7 @@ _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
-_OF_TWO_ARMS = ('mirror', 'swap')
+_OF_TWO_ARMS = ('mirror', 'swap', 'crowd')
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -597,6 +640,9 @@ def _controller_faults(
         positions = _skip(positions, float(share), round(variant.size('skip') / period), period)
     positions = _out_of_time(positions, variant, grippers, period, rng)
     positions = _choppy(positions, round(variant.size('choppy') / period), period)
+    if variant.size('coarse'):
+        positions = _coarse(positions, grippers, variant.size('coarse'), period)
+        positions = np.clip(positions, robot.lower, robot.upper)
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -618,7 +664,7 @@ def _controller_faults(
         own = _own(rng)
         positions = with_glitches(commands, round(variant.size('glitch')), own)
         positions = np.clip(positions, robot.lower, robot.upper)
-    error = _errors(positions, variant, len(robot.tools), period, rng)
+    error = _errors(positions, variant, robot, period, rng)
     error[:, grippers] = 0.0
     return np.clip(positions + error, robot.lower, robot.upper) if error.any() else positions
 
@@ -664,7 +710,7 @@ def _off_course(
 def _errors(
     positions: FloatArray,
     variant: PolicyVariant,
-    num_arms: int,
+    robot: RobotModel,
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
@@ -674,11 +720,15 @@ def _errors(
     if variant.size('zero'):
         error += _offset(rows, joints, variant.size('zero'), period, rng)
     if variant.size('mirror'):
-        error += variant.size('mirror') * _mirrored(positions, num_arms, period)
+        error += variant.size('mirror') * _mirrored(positions, len(robot.tools), period)
     if variant.size('tremble'):
         error += _tremble(rows, joints, variant.size('tremble'), period, rng)
     if variant.size('spike'):
         error += _spikes(rows, joints, variant.size('spike'), period, rng)
+    if variant.size('couple'):
+        shut = 1 - robot.gripper_openings(positions).T
+        drawn = _own(rng).normal(0.0, variant.size('couple'), joints)
+        error += np.repeat(shut, joints // len(robot.tools), axis=1) * drawn
     return error
 
 
@@ -777,6 +827,14 @@ def _choppy(positions: FloatArray, num: int, period: float) -> FloatArray:
     held = rows // num * num
     blend = np.minimum((rows - held + 1) * period / _JUMP_S, 1.0)[:, None]
     return (1 - blend) * positions[np.maximum(held - num, 0)] + blend * positions[held]
+
+
+def _coarse(positions: FloatArray, grippers: list[int], step: float, period: float) -> FloatArray:
+    """(T, J): the arms are at multiples of `step` from the first row on, and jump between them."""
+    away = positions - positions[0]
+    whole = _smooth(positions[0] + step * np.rint(away / step), [], round(_JUMP_S / period))
+    whole[:, grippers] = positions[:, grippers]
+    return whole
 
 
 def _seams(

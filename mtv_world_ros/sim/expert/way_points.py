@@ -25,6 +25,12 @@ _PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
 _ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
 #: way points of a circle, and time from one to the next [s]
 _NUM_CIRCLE, _CIRCLE_S = 8, 0.25
+#: how far off its middle shut fingers push an object along [m]
+_HERD_BESIDE_M = 0.02
+#: shut fingers press on what was put down: share of the way down to where they let go
+_RUB_DEPTH = 0.75
+#: kinds whose added way points leave the others their time
+_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle'))
 #: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
 #: high over it, how much it rises before and after [m]; standard deviations beside the centre [m],
 #: of yaw and lean [rad]
@@ -82,6 +88,16 @@ class WayPointFaults:
         self._draws = rng.normal(size=(_MOST_STOPS, 3))
         self._openings = rng.normal(size=_MOST_STOPS)
         self._play = np.random.default_rng(rng.integers(2**32))
+
+    @property
+    def keeps_tempo(self) -> bool:
+        """Whether added way points take time of their own; else they share the move's."""
+        return not _KEEP_TEMPO.isdisjoint(self._variant.kinds)
+
+    @property
+    def crowds(self) -> float:
+        """The share of the way that another arm comes to where this one lets go."""
+        return self._variant.size('crowd')
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -291,12 +307,37 @@ def _knock(stops: Stops, size: float, side: _Side) -> Stops:
     return [*_pushed(there, size, _up(0.09), side.anywhere), *stops]
 
 
-def _pushed(at: WayPoint, size: float, rise: FloatArray, to: FloatArray) -> Stops:
-    """Down beside a way point, shut, and through it until `size` behind it; up again."""
+def _pushed(
+    at: WayPoint, size: float, rise: FloatArray, to: FloatArray, before: float = 0.0
+) -> Stops:
+    """Down `before` and more beside a way point, shut, and on until `size` behind it; up again."""
     shut = replace(at, phase='above', opening=0.0)
     # half a finger and half a small object lie between the tool and the object's centre
-    away, end = -0.07 * to, (size - 0.03) * to
+    away, end = -(before + 0.07) * to, (size - 0.03) * to
     return [shut.moved(away + rise), shut.moved(away), shut.moved(end), shut.moved(end + rise)]
+
+
+def _herd(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers push the object along their travel; it is grasped where it should be then.
+
+    Drawn anew where the arm does not reach so far.
+    """
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    along, across = (float(side.play.choice((-1.0, 1.0))) * to for to in (side.along, side.across))
+    there = grasp.moved(size * along + _HERD_BESIDE_M * across)
+    push = _pushed(there, 0.0, above.position - grasp.position, along, size)
+    return [*push, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(size * along))]
+
+
+def _rub(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers come back down onto what they put there, and drag it to their side."""
+    end = _first(stops, 'retreat') + 1
+    opened, retreat = stops[end - 2 : end]
+    above = replace(retreat, opening=0.0)
+    down = above.moved(_RUB_DEPTH * (opened.position - retreat.position))
+    is_away = float((stops[-1].position - retreat.position) @ side.anywhere) < 0
+    way = (-size if is_away else size) * side.anywhere
+    return [*stops[:end], above, down, down.moved(way), above.moved(way), *stops[end:]]
 
 
 def _odd(stops: Stops, size: float, side: _Side) -> Stops:
@@ -436,6 +477,19 @@ def _regrasp(stops: Stops, size: float, side: _Side) -> Stops:
     return [*(replace(stop, phase='above') for stop in begin), *stops]
 
 
+def _juggle(stops: Stops, size: float, side: _Side) -> Stops:
+    """Half-way it lets the object fall, and takes it again from where it should lie then."""
+    lift = _first(stops, 'lift')
+    closed, lifted, lower = stops[lift - 1], stops[lift], stops[_first(stops, 'lower')]
+    x, y, _ = (lifted.position + lower.position) / 2
+    low = replace(closed, phase='carry', position=np.array([x, y, closed.position[2]]))
+    over = replace(lifted, phase='carry', position=np.array([x, y, lifted.position[2]]))
+    held = replace(low.moved(_up(size)), seconds=None)
+    let_go = replace(held, opening=1.0, seconds=0.3)
+    again = replace(low, opening=1.0, seconds=None)
+    return [*stops[: lift + 1], over, held, let_go, again, low, over, *stops[lift + 1 :]]
+
+
 def _undo(stops: Stops, size: float, side: _Side) -> Stops:
     """Once it has let go, it closes, carries what it holds back, and lets go again."""
     opened, rise = _first(stops, 'open'), _up(_TRY_LIFT_M)
@@ -492,9 +546,12 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'push': _push,
     'sweep': _sweep,
     'stir': _stir,
+    'herd': _herd,
+    'rub': _rub,
     'elsewhere': _elsewhere,
     'retry': _retry,
     'regrasp': _regrasp,
+    'juggle': _juggle,
     'undo': _undo,
     'wander': _wander,
 }

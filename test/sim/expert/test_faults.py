@@ -200,7 +200,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    for kind in ('mirror', 'swap'):
+    for kind in ('mirror', 'swap', 'crowd'):
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
             with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
 
@@ -235,6 +235,137 @@ def test_it_meddles_with_another_object_once_the_task_is_done(expert, task):
         int((np.diff((opening < 0.05).astype(int), axis=1) == 1).sum()) for opening in openings
     ]
     assert closed[1] == closed[0] + 1
+
+
+def changed_stops(name: str) -> tuple[list[WayPoint], list[WayPoint]]:
+    """A move's way points, and what a fault makes of them."""
+    own, goal, up = np.array([0.0, 0.3, 0.03]), np.array([-0.2, 0.3, 0.05]), np.array([0, 0, 0.1])
+    home = np.array([-0.2, 0.1, 0.1])
+    places = [
+        ('above', own + up, 1.0), ('grasp', own, 1.0), ('close', own, 0.0),
+        ('lift', own + up, 0.0), ('carry', goal + up, 0.0), ('lower', goal, 0.0),
+        ('open', goal, 0.7), ('retreat', goal + up, 1.0), ('home', home, 1.0),
+    ]  # fmt: skip
+    stops = [WayPoint(phase, place, 0.0, opening) for phase, place, opening in places]
+    faults = WayPointFaults(parse_variant(name), np.random.default_rng(0))
+    return stops, faults.applied(stops, 0.0, [own])
+
+
+def test_what_is_pushed_along_is_grasped_where_it_should_be():
+    stops, changed = changed_stops('expert-herd-0.06')
+    push, rest = changed[:4], changed[4:]
+    assert all(stop.opening == 0 for stop in push) and len(rest) == len(stops)
+    ways = np.array([b.position - a.position for a, b in zip(stops, rest, strict=True)])
+    assert abs(ways[0, 0]) == pytest.approx(0.06)
+    np.testing.assert_allclose(ways[:4], np.broadcast_to(ways[0], (4, 3)), atol=1e-12)
+    np.testing.assert_array_equal(ways[4:], 0.0)
+    # down beside the object at the height of its grasp, and on until shortly before it
+    begin, end = push[1].position - stops[1].position, push[2].position - stops[1].position
+    side = np.sign(ways[0, 0])
+    assert (side * begin[0], side * end[0]) == pytest.approx((-0.07, 0.03))
+    assert begin[2] == end[2] == 0 and abs(begin[1]) == abs(end[1]) == pytest.approx(0.02)
+
+
+def test_what_was_put_down_is_pressed_on_and_dragged_to_the_side_of_the_arm():
+    stops, changed = changed_stops('expert-rub-0.09')
+    assert changed[:8] == stops[:8] and changed[-1] == stops[-1] and len(changed) == 13
+    above, down, dragged, up = changed[8:12]
+    assert all(stop.opening == 0 for stop in (above, down, dragged, up))
+    np.testing.assert_array_equal(above.position, stops[7].position)
+    np.testing.assert_allclose(down.position - stops[6].position, [0, 0, 0.025], atol=1e-12)
+    way = dragged.position - down.position
+    assert np.linalg.norm(way) == pytest.approx(0.09) and way[2] == 0 and way[1] < 0
+    np.testing.assert_allclose(up.position - above.position, way)
+
+
+def test_half_way_it_lets_the_object_fall_and_takes_it_again():
+    stops, changed = changed_stops('expert-juggle-0.08')
+    assert changed[:4] == stops[:4] and changed[-5:] == stops[-5:] and len(changed) == 15
+    heights = [stop.position[2] for stop in changed[4:10]]
+    assert heights == pytest.approx([0.13, 0.11, 0.11, 0.03, 0.03, 0.13])
+    assert [stop.opening for stop in changed[4:10]] == [0, 0, 1, 1, 0, 0]
+    assert all(stop.position[0] == pytest.approx(-0.1) for stop in changed[4:10])
+
+
+@pytest.mark.parametrize(('kind', 'same'), [('rub', 0.8), ('juggle', 0.3)])
+def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same):
+    expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-0.08')
+    # four or six way points more take at least 0.4 s each
+    assert len(changed) > len(expert_plan) + 80
+    first = np.argmax(np.abs(changed[: len(expert_plan)] - expert_plan).max(axis=1) > 1e-12)
+    assert first > same * len(expert_plan)
+    if kind == 'juggle':
+        # from the lift's height on over the half of the way that is left
+        after = [row[-100:] for row in (expert_plan, changed)]
+        np.testing.assert_allclose(after[0], after[1], atol=0.02)
+
+
+def test_the_other_arm_comes_where_an_arm_lets_go(expert):
+    expert_plan, crowd = plan(expert, 'expert'), plan(expert, 'expert-crowd-0.5')
+    num, openings = len(expert_plan), expert.robot.gripper_openings(expert_plan)
+    used = int(np.argmax(np.ptp(openings, axis=1)))
+    own, other = (half if used == 0 else 1 - half for half in (0, 1))
+    halves = [np.split(positions, 2, axis=1) for positions in (expert_plan, crowd)]
+    # the arm that has a task carries it out as before
+    np.testing.assert_array_equal(halves[1][own][:num], halves[0][own])
+    lets_go = int(np.flatnonzero(openings[used] < 1e-9)[-1])
+    tools = [poses[:, :3, 3] for poses in expert.robot.tool_poses(crowd)]
+    home = tools[other][0]
+    np.testing.assert_allclose(
+        tools[other][lets_go], home + 0.5 * (tools[own][lets_go] - home), atol=2e-3
+    )
+    np.testing.assert_allclose(crowd[-1], expert_plan[-1], atol=1e-3)
+    assert expert.robot.gripper_openings(crowd)[other].min() == pytest.approx(1)
+
+
+def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert):
+    plans = []
+    for name in ('expert', 'expert-crowd-1'):
+        policy = scripted_policy(name, 'move_object_two', SEED, expert)
+        policy.reset(seed=SEED)
+        plans.append(policy.plan.positions)
+    assert len(plans[1]) >= len(plans[0])
+    closed = [expert.robot.gripper_openings(positions) < 0.05 for positions in plans]
+    lasts = [is_closed.sum(axis=1) for is_closed in closed]
+    assert (lasts[0] > 0).all()
+    np.testing.assert_array_equal(*lasts)
+
+
+def test_joints_go_along_as_their_gripper_closes(expert):
+    expert_plan, couple = plan(expert, 'expert'), plan(expert, 'expert-couple-0.05')
+    error, arms = couple - expert_plan, arm_columns(expert)
+    openings = expert.robot.gripper_openings(expert_plan)
+    used = int(np.argmax(np.ptp(openings, axis=1)))
+    is_open, is_shut = openings[used] > 1 - 1e-9, openings[used] < 1e-9
+    assert np.abs(error[is_open]).max() < 1e-9 and is_shut.sum() > 20
+    np.testing.assert_allclose(np.ptp(error[is_shut], axis=0), 0.0, atol=1e-9)
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0]
+    rests = [j for j in range(error.shape[1]) if j not in moves]
+    assert (np.abs(error[is_shut][0, moves]) > 1e-4).all()
+    np.testing.assert_array_equal(error[:, rests], 0.0)
+    twice = plan(expert, 'expert-couple-0.1') - expert_plan
+    np.testing.assert_allclose(twice, 2 * error, atol=1e-9)
+
+
+def test_coarse_joints_are_at_multiples_of_their_step(expert):
+    expert_plan, coarse = plan(expert, 'expert'), plan(expert, 'expert-coarse-0.1')
+    arms = arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    np.testing.assert_array_equal(coarse[:, grippers], expert_plan[:, grippers])
+    np.testing.assert_allclose(coarse[0], expert_plan[0], atol=1e-12)
+    steps = (coarse[:, arms] - coarse[0, arms]) / 0.1
+    # but for the tenth of a second that a jump takes
+    assert (np.abs(steps - np.rint(steps)) < 1e-6).mean() > 0.6
+    assert np.abs(coarse - expert_plan).max() < 0.11 and np.abs(coarse - expert_plan).max() > 0.04
+
+
+@pytest.mark.parametrize('kind', ['herd', 'rub', 'crowd', 'couple', 'coarse', 'juggle'])
+def test_sizes_out_of_range_are_refused(kind):
+    largest = FAULTS[kind].largest
+    assert parse_variant(f'expert-{kind}-{largest:g}').size(kind) == largest
+    assert parse_variant(f'expert-{kind}-0') == PolicyVariant()
+    with pytest.raises(PolicyError, match=f"'{kind}' is .*; it must be 0 to {largest:g}"):
+        parse_variant(f'expert-{kind}-{1.1 * largest:g}')
 
 
 def heights_where_it_lets_go(expert, name: str) -> list[float]:
