@@ -92,6 +92,12 @@ def _add_import_bag(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--robot', help="YAML, or a bundled robot; default: the mapping's, or /robot_description"
     )
+    parser.add_argument(
+        '--action',
+        metavar='TOPIC',
+        help="of the commands, or 'state': the measured positions that follow; default: the "
+        "mapping's, or joint_trajectory",
+    )
     parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
     parser.add_argument('--out', type=Path, required=True)
     _add_objects(parser)
@@ -108,6 +114,8 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.importing.bags import find_bags, import_bags, with_guessed_views
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
+    if arguments.action:
+        mapping = mapping.replace(action=arguments.action)
     bags = find_bags(arguments.bags)
     mapping = with_guessed_views(mapping, bags[0])
     robot = _robot_of_bags(arguments, mapping, bags[0])
