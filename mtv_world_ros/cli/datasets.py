@@ -92,6 +92,12 @@ def _add_import_bag(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--robot', help="YAML, or a bundled robot; default: the mapping's, or /robot_description"
     )
+    parser.add_argument(
+        '--action',
+        metavar='TOPIC',
+        help="of the commands, or 'state': the measured positions that follow; default: the "
+        "mapping's, or joint_trajectory",
+    )
     parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
     parser.add_argument('--out', type=Path, required=True)
     _add_objects(parser)
@@ -108,6 +114,8 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.importing.bags import find_bags, import_bags, with_guessed_views
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
+    if arguments.action:
+        mapping = mapping.replace(action=arguments.action)
     bags = find_bags(arguments.bags)
     mapping = with_guessed_views(mapping, bags[0])
     robot = _robot_of_bags(arguments, mapping, bags[0])
@@ -162,7 +170,16 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
         'continue: finished episodes are kept. Exit status: 1 if an episode failed.',
     )
     parser.add_argument('dataset', type=Path, help='folder with meta/, data/ and videos/')
-    parser.add_argument('--mapping', type=Path, required=True, help='which feature is what')
+    parser.add_argument(
+        '--mapping',
+        type=Path,
+        help='which feature is what; default: made of --robot and --calibration, for columns that '
+        "are named like the robot's joints [rad or m]",
+    )
+    parser.add_argument('--robot', help='without --mapping: YAML, or a bundled robot')
+    parser.add_argument(
+        '--calibration', type=Path, help="without --mapping: of the cameras, by the views' names"
+    )
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
     _add_objects(parser)
@@ -172,11 +189,12 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
 def _import_dataset(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    from mtv_world_ros.geometry.robot_file import ROBOT_YAML
     from mtv_world_ros.importing.convert import import_dataset
 
     summary = import_dataset(
         arguments.dataset,
-        arguments.mapping,
+        arguments.mapping or _guessed_mapping(arguments),
         arguments.out,
         episodes=_numbers(arguments.episodes),
         stage=_object_stage(arguments),
@@ -188,7 +206,31 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for number, reason in summary.failed.items():
         print(f'episode {number}: {reason}', file=sys.stderr)
+    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
     return 1 if summary.failed else 0
+
+
+def _guessed_mapping(arguments: argparse.Namespace) -> Path:
+    """Writes OUT/mapping.yaml for columns and views that are named like joints and cameras."""
+    import yaml
+
+    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.importing.mapping import guess_mapping
+
+    if arguments.robot is None or arguments.calibration is None:
+        raise ConfigError(
+            'give --mapping (config/datasets/example.yaml has all keys), or --robot and '
+            "--calibration where the columns are named like the robot's joints"
+        )
+    values = guess_mapping(
+        LeRobotDataset(arguments.dataset), arguments.robot, arguments.calibration
+    )
+    file = arguments.out / 'mapping.yaml'
+    write_whole(file, yaml.safe_dump(values, sort_keys=False))
+    print(f'mapping: {file}')
+    return file
 
 
 def _numbers(text: str | None) -> list[int] | None:

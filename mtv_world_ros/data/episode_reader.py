@@ -56,6 +56,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 
 Stamped = list[tuple[int, Any]]
+#: joints that a warning names at most
+_MOST_NAMES = 8
 #: keys of a topic map that are not views, and the topics they stand for
 STREAMS = {
     'joint_states': JOINT_STATES,
@@ -165,6 +167,7 @@ class _EpisodeReader:
         self.received: dict[str, Stamped] = {}
         self.refused: dict[str, list[str]] = {}
         self.tracks: dict[str, FloatArray] = {}
+        self.seen_ns = 0  # all views have an image from here on
 
     def read(
         self, calibration: Path | str | None, with_cameras: bool, unknown_mount: str
@@ -172,6 +175,7 @@ class _EpisodeReader:
         self._receive()
         topics = self.topics
         images = {view: self._images(view, names) for view, names in topics.views.items()}
+        self.seen_ns = max((int(track.stamps_ns[0]) for track in images.values()), default=0)
         masks = {view: self._masks(names) for view, names in topics.views.items()}
         instructions = [(s, m.data) for s, m in self._take(topics.instruction, messages.STRING)]
         states = self._states()
@@ -258,7 +262,7 @@ class _EpisodeReader:
 
     def _states(self) -> JointStates | None:
         topic = self.topics.joint_states
-        taken = self._take(topic, messages.JOINT_STATE)
+        taken = self._own_states(topic, self._take(topic, messages.JOINT_STATE))
         states = merge_joint_states(topic, taken, self.warnings)
         if states is None:
             others = self._topics_of(messages.JOINT_STATE)
@@ -269,6 +273,26 @@ class _EpisodeReader:
                 )
             return None
         return replace(states, joint_names=self._renamed(states.joint_names))
+
+    def _own_states(self, topic: str, taken: Stamped) -> Stamped:
+        """Messages that name a joint of the robot; all, where none does or it is not known."""
+        joints = set(() if self.robot is None else self.robot.joint_names)
+        own: Stamped = []
+        others: dict[str, None] = {}
+        for item in taken:
+            names = self._renamed(item[1].name)
+            if joints.isdisjoint(names):
+                others.update(dict.fromkeys(names))
+            else:
+                own.append(item)
+        if not own or len(own) == len(taken):
+            return taken
+        named = [*list(others)[:_MOST_NAMES], *(['...'] if len(others) > _MOST_NAMES else [])]
+        self._warn_once(
+            f"'{topic}': {len(taken) - len(own)} messages without a joint of the robot were left "
+            f'out; they name {_listed(named)}'
+        )
+        return own
 
     def _renamed(self, names: Sequence[str]) -> tuple[str, ...]:
         return tuple(self.mapping.joints.get(name, name) for name in names)
@@ -286,7 +310,7 @@ class _EpisodeReader:
         except ValueError as error:
             raise EpisodeError(f"'{self.path}': {error}") from error
         self.warnings += odd
-        return following(led, self.mapping.chunk_s)
+        return following(led, self.mapping.chunk_s, self.seen_ns)
 
     def _tool_poses(self, arm: str, tool: ToolTopic, robot: RobotModel) -> ToolTrack:
         topic = self.mapping.topic(tool.topic)
@@ -325,14 +349,14 @@ class _EpisodeReader:
     def _joint_commands(self, states: JointStates | None) -> Stamped:
         topic = self.topics.joint_trajectory
         if self.mapping.action == STATE:
-            return [] if states is None else following(states, self.mapping.chunk_s)
+            return [] if states is None else following(states, self.mapping.chunk_s, self.seen_ns)
         if self.types.get(topic) == messages.JOINT_STATE:
             taken = self._take(topic, messages.JOINT_STATE)
             leader = merge_joint_states(topic, taken, self.warnings)
             if leader is None:
                 return []
             named = replace(leader, joint_names=self._renamed(leader.joint_names))
-            return following(named, self.mapping.chunk_s)
+            return following(named, self.mapping.chunk_s, self.seen_ns)
         good: Stamped = []
         for stamp, message in self._take(topic, messages.JOINT_TRAJECTORY):
             try:
@@ -698,12 +722,13 @@ def in_order(
     return list(kept.items())
 
 
-def following(states: JointStates, chunk_s: float) -> Stamped:
+def following(states: JointStates, chunk_s: float, start_ns: int) -> Stamped:
     """Positions as commands: each is reached at its own stamp.
 
     Args:
         states: positions over time.
         chunk_s: length of a trajectory [s].
+        start_ns: where the first trajectory starts: none can be played before there are images.
 
     Returns:
         (start stamp [ns], trajectory), each of which ends where the next one starts.
@@ -711,7 +736,7 @@ def following(states: JointStates, chunk_s: float) -> Stamped:
     stamps = states.stamps_ns
     seconds = (stamps - stamps[0]) * 1e-9
     chunks: Stamped = []
-    first = 0
+    first = int(np.searchsorted(stamps, start_ns))
     while first < len(stamps) - 1:
         last = int(np.searchsorted(seconds, seconds[first] + chunk_s))
         last = min(max(last, first + 1), len(stamps) - 1)

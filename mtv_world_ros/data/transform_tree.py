@@ -91,7 +91,7 @@ class TransformTree:
     """Frames and the transforms between them, in bounded memory.
 
     What cannot be used (a frame's second parent, a transform that is no pose) is counted in
-    `problems`, and the rest is kept.
+    `problems`, and the rest is kept. Frames in a circle are named there, too.
 
     Args:
         prefix: of frame names, removed.
@@ -161,7 +161,29 @@ class TransformTree:
                     f"/tf: frame '{child}' has two parents; '{kept[child]}' is kept, "
                     f"{edge.count} transforms from '{parent}' were left out"
                 )
+        for circle in self._circles():
+            edges = list(zip(circle, circle[1:], strict=False))
+            count = sum(self._edges[names].count for names in edges)
+            lines.append(
+                f'/tf: frames {_quoted(circle)} go in a circle ({count} transforms); poses '
+                'across it are those of the shortest way'
+            )
         return lines
+
+    def _circles(self) -> list[list[str]]:
+        """Frames that are above themselves, from parent to child; the first ends each."""
+        parents, seen, found = self._parents(), set[str](), []
+        for frame in parents:
+            chain: list[str] = []
+            here: str | None = frame
+            while here is not None and here not in seen:
+                seen.add(here)
+                chain.append(here)
+                here = parents.get(here)
+            if here in chain:
+                circle = chain[chain.index(here) :]
+                found.append([*reversed(circle), circle[-1]])
+        return found
 
     def mount(self, frame: str, links: Collection[str]) -> Mount:
         """Returns the nearest of the robot's links that is fixed to a frame.
@@ -185,6 +207,12 @@ class TransformTree:
                 return mount
             fixed[mount.link] = mount
         if links:
+            circle = next((c for c in self._circles() if fixed.keys() & set(c)), None)
+            if circle is not None:
+                raise CalibrationError(
+                    f"no link of the robot is fixed to frame '{frame}': it hangs in a circle, "
+                    f'{_quoted(circle)}'
+                )
             raise CalibrationError(
                 f"no link of the robot is fixed to frame '{frame}': only {', '.join(fixed)} are. "
                 'Is it carried by joints that are not among the robot (a camera that pans and '
@@ -277,6 +305,10 @@ class TransformTree:
                     T = T_other_here @ here.T_link_frame
                     found.add(other)
                     queue.append(Mount(other, T, min(stamps, default=None)))
+
+
+def _quoted(circle: Sequence[str]) -> str:
+    return ' -> '.join(f"'{name}'" for name in circle)
 
 
 def _is_pose(numbers: _Numbers) -> bool:

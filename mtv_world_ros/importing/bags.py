@@ -78,30 +78,52 @@ def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path,
     Raises:
         RobotError: the bag has no description, or no robot can be made of it.
     """
-    text = robot_description(bag, mapping)
+    text, chosen = robot_description(bag, mapping)
     with tempfile.TemporaryDirectory(prefix='mtv_world_robot_') as place:
         urdf = Path(place) / 'robot.urdf'
         urdf.write_text(text, encoding='utf-8')
         guessed = guess_robot(urdf)
         file = Path(place) / ROBOT_YAML
         file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
-        return save_robot(file, folder), guessed.notes
+        return save_robot(file, folder), (*chosen, *guessed.notes)
 
 
-def robot_description(bag: Path, mapping: BagMapping) -> str:
-    """Returns the URDF that a bag holds.
+def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, tuple[str, ...]]:
+    """Returns the URDF that a bag holds; of several, the one whose joints are recorded most.
+
+    Returns:
+        The text, and how it was chosen, where there was a choice.
 
     Raises:
         RobotError: it holds none.
     """
     topics = {mapping.topic(mapping.robot_description), '/robot_description'}
-    for message in BagReader(bag).messages(topics):
-        if message.msgtype == messages.STRING:
-            return str(messages.deserialize(messages.STRING, message.data).data)
-    raise RobotError(
-        f"'{bag}' has no '{mapping.topic(mapping.robot_description)}'; name the robot's file with "
-        "--robot or as 'robot' in the mapping"
+    texts = dict.fromkeys(
+        str(messages.deserialize(messages.STRING, message.data).data)
+        for message in BagReader(bag).messages(topics)
+        if message.msgtype == messages.STRING
     )
+    if not texts:
+        raise RobotError(
+            f"'{bag}' has no '{mapping.topic(mapping.robot_description)}'; name the robot's file "
+            "with --robot or as 'robot' in the mapping"
+        )
+    if len(texts) == 1:
+        return next(iter(texts)), ()
+    topic = mapping.topic(mapping.joint_states)
+    named = [
+        {f'name="{mapping.joints.get(name, name)}"' for name in state.name}
+        for message in BagReader(bag).messages({topic})
+        if message.msgtype == messages.JOINT_STATE
+        for state in [messages.deserialize(messages.JOINT_STATE, message.data)]
+    ]
+    counts = {text: sum(any(name in text for name in names) for names in named) for text in texts}
+    best = max(counts, key=lambda text: counts[text])
+    note = (
+        f"the bag describes {len(texts)} robots: taken is the one whose joints '{topic}' names "
+        f'most ({counts[best]} of {len(named)} messages); --robot takes another'
+    )
+    return best, (note,)
 
 
 def import_bags(
@@ -224,7 +246,8 @@ def _commands(
     if not episode.trajectories:
         raise EpisodeError(
             f"'{episode.info.path}' has no commands at '{mapping.topic(mapping.action)}'; name "
-            "their topic in 'action', or set 'action: state' to take the measured positions"
+            "their topic with --action or in the mapping's 'action', or set 'action: state' "
+            '(--action state) to take the measured positions'
         )
     matched = [(stamp, match_joints(t, robot)) for stamp, t in episode.trajectories]
     for _, trajectory in matched:

@@ -17,6 +17,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, Traje
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.joint_columns import to_positions
 from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.geometry.robot_file import save_robot
 from mtv_world_ros.importing.camera_parameters import camera_track
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
@@ -84,7 +85,7 @@ def import_dataset(
     stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
 ) -> ImportSummary[int]:
-    """Converts a LeRobot dataset into episodes `out/episode_<number>`.
+    """Converts a LeRobot dataset into episodes `out/episode_<number>`, with `out/robot/` beside.
 
     Args:
         dataset: its folder.
@@ -108,6 +109,7 @@ def import_dataset(
             f'{known[0] if known else "-"} to {known[-1] if known else "-"}'
         )
 
+    save_robot(chosen.robot_file, out / 'robot')
     key = digest_of(start=stage.key + chosen.key.encode()) if stage.key else chosen.key
 
     def convert(number: int, path: Path) -> tuple[str, ...]:

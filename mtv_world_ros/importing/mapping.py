@@ -20,12 +20,14 @@ from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import nearest
+from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.files import bundled
+from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.joint_columns import JointEntries, JointTable, to_positions
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.importing.camera_parameters import CameraSource
+from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.tool_actions import ToolPoses
 
 
@@ -142,6 +144,12 @@ class DatasetMapping(Schema):
     )
     jpeg_quality: int = Field(default=90, ge=1, le=100)
     _key: str = PrivateAttr(default='')
+    _robot_file: Path = PrivateAttr(default=Path())
+
+    @property
+    def robot_file(self) -> Path:
+        """The robot's YAML."""
+        return self._robot_file
 
     @property
     def key(self) -> str:
@@ -160,8 +168,40 @@ def load_mapping(path: Path) -> DatasetMapping:
     context: dict[str, Any] = {'folder': path.parent}
     mapping = validated(DatasetMapping, values, str(path), context=context)
     calibrations = [source.calibration for source in mapping.views.values()]
+    mapping._robot_file = context['robot_file']
     mapping._key = digest_of(path, context['robot_file'], *calibrations)
     return mapping
+
+
+def guess_mapping(dataset: LeRobotDataset, robot: str, calibration: Path) -> dict[str, Any]:
+    """Returns the values of a mapping for columns that are named like the robot's joints.
+
+    Views are the image features that the calibration has, by the last part of their names.
+
+    Raises:
+        ConfigError: the calibration has none of the views.
+        CalibrationError: it cannot be used.
+    """
+    known = load_calibration(calibration)
+    features = [n for n, f in dataset.features.items() if f.get('dtype') in ('video', 'image')]
+    found = {name.rpartition('.')[2]: name for name in features}
+    if not found.keys() & known.keys():
+        raise ConfigError(
+            f"'{calibration}' has views {', '.join(known)}, and '{dataset.root}' has "
+            f'{", ".join(found) or "none"}; call them alike, or write a mapping (--mapping)'
+        )
+    file = str(calibration.resolve())
+    is_path = Path(robot).suffix in ('.yaml', '.yml')
+    return {
+        'robot': str(Path(robot).resolve()) if is_path else robot,
+        'views': {
+            view: {'feature': name, 'calibration': file}
+            for view, name in found.items()
+            if view in known
+        },
+        'state': {'feature': 'observation.state'},
+        'action': {'feature': 'action'} if 'action' in dataset.features else 'state',
+    }
 
 
 def digest_of(*files: Path | None, start: bytes = b'') -> str:

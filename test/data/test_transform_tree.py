@@ -110,3 +110,15 @@ def test_poses_between_two_transforms_are_interpolated_over_another_branch():
     np.testing.assert_allclose(track.T_link_frame[:, 0, 3], np.array([0, 0.3, 1.0]) + 0.1 - 1.0)
     with pytest.raises(CalibrationError, match='within 0.5 s before and after 1 of 2 images'):
         pose_track(sent, 'optical', LINKS, np.array([0, 2 * 10**9]))
+
+
+def test_frames_in_a_circle_are_named_and_counted_and_the_rest_is_kept():
+    tree = TransformTree()
+    tree.add(message(edge('base', 'stand', 0.2), edge('stand', 'good')), latched=True)
+    tree.add(message(edge('a', 'b'), edge('b', 'c'), edge('c', 'a'), edge('c', 'optical')))
+    (problem,) = tree.problems
+    assert all(f"'{first}' -> '{then}'" in problem for first, then in ('ab', 'bc', 'ca')), problem
+    assert 'circle (3 transforms)' in problem
+    assert tree.mount('good', LINKS).link == 'base'
+    with pytest.raises(CalibrationError, match="'optical': it hangs in a circle, 'c' -> 'a'"):
+        tree.mount('optical', LINKS)

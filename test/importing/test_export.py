@@ -29,7 +29,7 @@ def test_what_was_exported_is_imported_again(exported, tmp_path):
     assert (
         main(['import-dataset', str(exported), '--mapping', mapping, '--out', str(tmp_path)]) == 0
     )
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob('episode_*')
     before, after = read_episode(DEMO), read_episode(path)
     assert after.views == before.views
     assert after.info.outcome == before.info.outcome
@@ -87,7 +87,7 @@ def test_small_png_images_are_imported_again_without_loss(tmp_path):
     mapping = str(out / 'meta/mapping.yaml')
     again = tmp_path / 'again'
     assert main(['import-dataset', str(out), '--mapping', mapping, '--out', str(again)]) == 0
-    (path,) = again.iterdir()
+    (path,) = again.glob('episode_*')
     before, after = read_episode(DEMO), read_episode(path)
     for view in before.views:
         camera = scaled(before.cameras[view], 95, 72)

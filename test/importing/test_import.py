@@ -141,7 +141,8 @@ def test_a_failed_episode_is_named_and_the_rest_goes_on(
     said = capsys.readouterr()
     assert '1 made, 0 kept, 1 failed' in said.out
     assert 'episode 0:' in said.err and 'episode_000000.mp4' in said.err
-    assert [path.name for path in out.iterdir()] == ['episode_000001']  # no half folder
+    names = {path.name for path in out.iterdir()}
+    assert names == {'episode_000001', 'robot'}  # no half folder
     video.write_bytes(data)
     assert main(arguments) == 0
     assert '1 made, 1 kept, 0 failed' in capsys.readouterr().out
@@ -236,3 +237,32 @@ def test_without_pyarrow_the_error_says_how_to_get_it(
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     with pytest.raises(ConfigError, match=r"pip install 'mtv_world_ros\[import\]'"):
         import_dataset(root, make_mapping(), tmp_path / 'out')
+
+
+def test_columns_that_are_named_like_the_joints_need_no_mapping(
+    datasets, make_mapping, tmp_path, capsys
+):
+    folder = make_mapping().parent
+    robot = (folder / 'robot.yaml').read_text()
+    for old, new in (('shoulder', 'shoulder.pos'), ('elbow', 'elbow.pos')):
+        robot = robot.replace(f'joint: {old}', f'joint: {new}').replace(
+            f'{old}_link', f'{new}_link'
+        )
+    robot = robot.replace('joint: gripper', 'joint: gripper.pos').replace('2}', '200}')
+    robot = robot.replace('upper: 0.04', 'upper: 200').replace('lower: -2', 'lower: -200')
+    (folder / 'robot.yaml').write_text(robot)
+    command = ['import-dataset', str(datasets('v3.0')), '--out', str(tmp_path / 'out')]
+    assert main(command) == 1
+    assert 'give --mapping' in capsys.readouterr().err
+    files = ['--robot', str(folder / 'robot.yaml')]
+    files += ['--calibration', str(folder / 'calibration.yaml')]
+    assert main([*command, *files]) == 0, capsys.readouterr().err
+    episode = read_episode(tmp_path / 'out' / 'episode_000000')
+    assert list(episode.views) == ['front'] and episode.trajectories
+    states = episode.joint_states
+    assert states.joint_names == ('shoulder.pos', 'elbow.pos', 'gripper.pos')
+    assert states.positions[3] == pytest.approx([9.0, 0.1, 85.0], abs=1e-5)
+    assert (tmp_path / 'out' / 'robot' / 'robot.yaml').is_file()
+    again = ['--mapping', str(tmp_path / 'out' / 'mapping.yaml')]
+    assert main([*command, *again]) == 0
+    assert '0 made, 2 kept' in capsys.readouterr().out

@@ -1,15 +1,17 @@
 """`mtv-world import-bag`: a robot's own bags, with TF, its description and no commands."""
 
 from dataclasses import replace
+import re
 import shlex
 
 from bags import record
-from crane import FPS, load, make_cameras, make_positions, render
+from crane import FPS, load, make_cameras, make_positions, render, START_NS, URDF
 import numpy as np
 import pytest
 import yaml
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import guess_views, load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.robot_file import load_robot
@@ -117,6 +119,71 @@ def test_a_bag_without_commands_says_how_to_take_the_measured_ones(robot, scene,
     bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
     assert run(tmp_path, bag, mapping={**MAPPING, 'action': 'joint_trajectory'}) == 1
     assert "set 'action: state'" in capsys.readouterr().err
+
+
+def test_without_commands_the_measured_ones_are_taken_if_the_command_line_says_so(
+    robot, scene, tmp_path, capsys
+):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    mapping = {**MAPPING, 'action': 'joint_trajectory'}
+    assert run(tmp_path, bag, mapping=mapping, more=['--action', 'state']) == 0
+    episode = read_episode(tmp_path / 'out' / 'wave')
+    assert episode.trajectories
+    assert load_bag_mapping(tmp_path / 'out' / 'mapping.yaml').action == 'state'
+
+
+def test_commands_made_of_states_start_when_every_view_has_an_image(robot, scene, tmp_path):
+    cameras, positions, frames = scene
+
+    def before(bag):
+        names = ['lab_' + name for name in robot.joint_names]
+        for k in range(1, 4):
+            stamp = START_NS - k * 10_000_000
+            state = messages.make_joint_state(stamp, names, positions[0])
+            bag.write('/cell/joint_states', messages.JOINT_STATE, stamp, state)
+
+    bag = record(tmp_path / 'early', robot, cameras, positions, frames=frames, more=before)
+    assert run(tmp_path, bag) == 0
+    episode = read_episode(tmp_path / 'out' / 'early')
+    assert len(episode.joint_states.positions) == NUM + 3
+    assert episode.trajectories[0][0] == START_NS
+
+
+def test_of_an_sqlite_bag_that_was_cut_off_what_comes_before_is_kept(
+    robot, scene, tmp_path, capsys
+):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'cut', robot, cameras, positions, frames=frames)
+    file = next(bag.glob('*.db3'))
+    size = file.stat().st_size
+    file.write_bytes(file.read_bytes()[: size * 2 // 3 + 100])
+    assert run(tmp_path, bag) == 0
+    assert f'{size * 2 // 3 + 100} of {size} bytes are there' in capsys.readouterr().err
+    kept = len(read_episode(tmp_path / 'out' / 'cut').images['door'].frames)
+    assert NUM // 2 < kept < NUM
+
+
+def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+
+    def other(bag):
+        urdf = re.sub(' name="|link="', r'\g<0>ur_', URDF)
+        text = messages.make(messages.STRING, data=urdf)
+        bag.write('/cell/robot_description', messages.STRING, START_NS - 1, text)
+        for k in range(5):
+            state = messages.make_joint_state(START_NS + k, ['ur_yaw', 'ur_elbow'], np.zeros(2))
+            bag.write('/cell/joint_states', messages.JOINT_STATE, START_NS + k, state)
+
+    bag = record(tmp_path / 'two', robot, cameras, positions, frames=frames, more=other)
+    assert run(tmp_path, bag) == 0, capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert 'the bag describes 2 robots' in printed.out and f'({NUM} of {NUM + 5}' in printed.out
+    assert '5 messages without a joint of the robot were left out' in printed.err
+    assert 'ur_yaw, ur_elbow' in printed.err
+    episode = read_episode(tmp_path / 'out' / 'two')
+    assert episode.joint_states.joint_names == robot.joint_names
+    assert len(episode.joint_states.positions) == NUM
 
 
 def test_bags_are_read_as_they_are_with_the_mapping(robot, scene, tmp_path, capsys):

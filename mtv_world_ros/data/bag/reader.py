@@ -26,6 +26,8 @@ from mtv_world_ros.errors import EpisodeError
 MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _SQLITE_MAGIC = b'SQLite format 3\0'
+#: page size, count of changes, number of pages, count of changes when that number was written
+_SQLITE_HEAD = struct.Struct('>16xH6xII60xI4x')
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<QQQII')
@@ -168,20 +170,28 @@ class BagReader:
         with plain.open('rb') as stream:
             if stream.read(len(_SQLITE_MAGIC)) != _SQLITE_MAGIC:
                 raise EpisodeError(f"'{file}' is not an SQLite file")
+        lost = _lost_pages(plain)
         try:
-            with closing(_open_sqlite(plain, self._most_bytes)) as database:
+            with closing(_open_sqlite(plain, self._most_bytes, is_cut=bool(lost))) as database:
                 known = self._sqlite_topics(database, topics)
                 wanted = ', '.join(str(number) for number in known)
-                rows = database.execute(
+                query = (
                     'SELECT topic_id, timestamp, data FROM messages '
                     f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
                 )
-                for row in rows:
+                if lost:  # sorting needs what is not there; so does looking for the next row
+                    query = (
+                        'SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id'
+                    )
+                for row in database.execute(query):
                     number, stamp, data = _typed(row, int, int, bytes)
-                    name, msgtype = known[number]
-                    yield BagMessage(name, msgtype, stamp, data)
+                    if number in known:
+                        name, msgtype = known[number]
+                        yield BagMessage(name, msgtype, stamp, data)
+            if lost:
+                raise _Cut(lost)
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-            raise _Cut(str(error)) from error
+            raise _Cut(lost or str(error)) from error
 
     def _sqlite_topics(
         self, database: sqlite3.Connection, topics: Collection[str] | None
@@ -314,12 +324,31 @@ def _is_storage(file: Path) -> bool:
     return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
 
 
-def _open_sqlite(file: Path, most_bytes: int) -> sqlite3.Connection:
-    """Opens it without writing beside it, unless a recorder that was killed left its journal."""
+def _lost_pages(file: Path) -> str:
+    """How much of an SQLite file is not there, by its header; empty = nothing."""
+    with file.open('rb') as stream:
+        head = stream.read(_SQLITE_HEAD.size)
+    if len(head) < _SQLITE_HEAD.size or _journal(file):
+        return ''
+    page_size, changes, num_pages, valid_for = _SQLITE_HEAD.unpack(head)
+    there, all_ = file.stat().st_size, (65536 if page_size == 1 else page_size) * num_pages
+    is_cut = changes == valid_for and there < all_
+    return f'{there} of {all_} bytes are there' if is_cut else ''
+
+
+def _journal(file: Path) -> bool:
+    """Whether a recorder that was killed left its journal beside an SQLite file."""
     journal = file.with_name(f'{file.name}-wal')
-    mode = 'ro' if journal.is_file() and journal.stat().st_size else 'ro&immutable=1'
+    return journal.is_file() and journal.stat().st_size > 0
+
+
+def _open_sqlite(file: Path, most_bytes: int, *, is_cut: bool) -> sqlite3.Connection:
+    """Opens it without writing beside it, unless a recorder that was killed left its journal."""
+    mode = 'ro' if _journal(file) else 'ro&immutable=1'
     database = sqlite3.connect(f'{file.resolve().as_uri()}?mode={mode}', uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
+    if is_cut:  # else SQLite refuses a file that is shorter than its header says
+        database.execute('PRAGMA writable_schema=ON')
     # a view in their place could compute without end
     for name, kind in database.execute(
         "SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"
