@@ -36,8 +36,8 @@ _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
 _NUM_FINGERTIP_HEIGHTS = 2 * 4
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
-#: of what stops a tool: width, numbers that the tool remembers, and that it hears of what an object
-#: hears of others
+#: of what stops a tool: width, numbers that the tool remembers, and that it hears of what objects
+#: hear of each other
 _STOP_WIDTH, _STOP_HIDDEN, _STOP_TOLD = 96, 32, 16
 
 

@@ -168,9 +168,7 @@ class TrackedObjects:
             last = self.before[number] if self.before else None
             response = id(member.response)  # members share it
             if response not in followed:
-                followed[response] = _tools(
-                    member, robot, positions, last, self.commands_a_step
-                )
+                followed[response] = _tools(member, robot, positions, last, self.commands_a_step)
             tools, gaps, arms = followed[response]
             scene = Scene(
                 points=_tensor(places[rows]),

@@ -78,20 +78,27 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     # timing
     'late': _kind('timing', 'train', 0.6, 3.0, 's', 'the grippers follow this much later'),
-    'early': _kind('timing', 'test', 0.5, 2.0, 's', 'the grippers go this much ahead'),
-    'hasty': _kind('timing', 'test', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
-    'soft': _kind('timing', 'test', 0.6, 1.5, 's', 'time constant with which the grippers follow'),
+    'early': _kind('timing', 'train', 0.5, 2.0, 's', 'the grippers go this much ahead'),
+    'hasty': _kind('timing', 'train', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
+    'soft': _kind(
+        'timing', 'train', 0.6, 1.5, 's', 'time constant with which the grippers follow'
+    ),
     'hang': _kind('timing', 'calibrate', 0.8, 2.0, 's', 'the gripper opens this much later'),
-    'loop': _kind('timing', 'test', 2.0, 4.0, 's', 'commands of this length are repeated once'),
-    'skip': _kind('timing', 'test', 1.4, 3.0, 's', 'commands of this length are left out'),
-    'ragged': _kind('timing', 'test', 0.3, 2.0, 's', 'each arm joint is late, by up to this'),
+    'loop': _kind('timing', 'train', 2.0, 4.0, 's', 'commands of this length are repeated once'),
+    'skip': _kind('timing', 'train', 1.4, 3.0, 's', 'commands of this length are left out'),
+    'ragged': _kind('timing', 'calibrate', 0.3, 2.0, 's', 'each arm joint is late, by up to this'),
     'seams': _kind(
-        'timing', 'test', 0.8, 2.0, 's', 'every chunk of commands is up to this long off its time'
+        'timing',
+        'calibrate',
+        0.8,
+        2.0,
+        's',
+        'every chunk of commands is up to this long off its time',
     ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
-        'height', 'test', 1.0, 1.0, '', 'share that lacks of its height before it goes down'
+        'height', 'train', 1.0, 1.0, '', 'share that lacks of its height before it goes down'
     ),
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
     # lateral
@@ -109,7 +116,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'slide': _kind(
         'lateral',
-        'test',
+        'train',
         0.02,
         0.08,
         'm',
@@ -120,7 +127,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
-    'lean': _kind('wrist', 'test', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
+    'lean': _kind('wrist', 'train', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
     # opening
     'loose': _kind(
         'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
@@ -142,10 +149,20 @@ FAULTS: Mapping[str, FaultKind] = {
         'standard deviation of how far the gripper is open at every way point, as a share',
     ),
     'narrow': _kind(
-        'opening', 'test', 0.5, 1.0, '', 'share of its opening that lacks before a grasp; 1 = shut'
+        'opening',
+        'train',
+        0.5,
+        1.0,
+        '',
+        'share of its opening that lacks before a grasp; 1 = shut',
     ),
     'twitch': _kind(
-        'opening', 'test', 0.3, 1.0, '', 'again and again the gripper jerks open, to this share'
+        'opening',
+        'calibrate',
+        0.3,
+        1.0,
+        '',
+        'again and again the gripper jerks open, to this share',
     ),
     # release
     'drops': _kind(
@@ -159,12 +176,12 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of its range that the gripper opens on the way',
     ),
-    'snag': _kind('release', 'test', 0.8, 1.0, '', 'share that lacks of how far it lets go'),
+    'snag': _kind('release', 'train', 0.8, 1.0, '', 'share that lacks of how far it lets go'),
     'flick': _kind(
-        'release', 'test', 0.08, 0.15, 'm', 'it goes this far sideways while the fingers open'
+        'release', 'train', 0.08, 0.15, 'm', 'it goes this far sideways while the fingers open'
     ),
     'blink': _kind(
-        'release', 'test', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
+        'release', 'calibrate', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
     ),
     # collision
     'push': _kind(
@@ -215,25 +232,25 @@ FAULTS: Mapping[str, FaultKind] = {
         'past it, drawn at random: when, which, from where, how low',
     ),
     'knock': _kind(
-        'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push what is at the goal before it'
+        'collision', 'train', 0.02, 0.1, 'm', 'shut fingers push what is at the goal before it'
     ),
     'brush': _kind(
-        'collision', 'test', 0.04, 0.1, 'm', 'it goes this far sideways before it rises again'
+        'collision', 'train', 0.04, 0.1, 'm', 'it goes this far sideways before it rises again'
     ),
     'low_carry': _kind('collision', 'calibrate', 0.04, 0.15, 'm', 'it carries this much lower'),
     'sweep': _kind(
-        'collision', 'test', 0.02, 0.1, 'm', 'shut fingers push the object before the grasp'
+        'collision', 'train', 0.02, 0.1, 'm', 'shut fingers push the object before the grasp'
     ),
     'mirror': _kind(
         'collision',
-        'test',
+        'calibrate',
         1.0,
         1.2,
         '',
         "an arm at rest mirrors this share of the other's motion",
     ),
     'stir': _kind(
-        'collision', 'test', 0.03, 0.08, 'm', 'it circles this wide before the fingers close'
+        'collision', 'calibrate', 0.03, 0.08, 'm', 'it circles this wide before the fingers close'
     ),
     'herd': _kind(
         'collision',
@@ -265,7 +282,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'meddle': _kind(
         'object',
-        'test',
+        'calibrate',
         0.04,
         0.12,
         'm',
@@ -281,7 +298,7 @@ FAULTS: Mapping[str, FaultKind] = {
         contact=False,
     ),
     'elsewhere': _kind(
-        'place', 'test', 0.05, 0.15, 'm', 'it is put down this far off', contact=False
+        'place', 'train', 0.05, 0.15, 'm', 'it is put down this far off', contact=False
     ),
     # speed
     'slow': _kind(
@@ -302,30 +319,52 @@ FAULTS: Mapping[str, FaultKind] = {
         'speed', 'calibrate', 0.9, 3.0, 's', 'commands of this length are lost, three times'
     ),
     'stall': _kind(
-        'speed', 'test', 0.8, 3.0, 's', 'the arms stand still for a while, the grippers do not'
+        'speed', 'train', 0.8, 3.0, 's', 'the arms stand still for a while, the grippers do not'
     ),
     'smooth': _kind(
-        'speed', 'test', 1.5, 3.0, 's', 'the commands of the arms are averaged over this long'
+        'speed', 'calibrate', 1.5, 3.0, 's', 'the commands of the arms are averaged over this long'
     ),
     'spike': _kind(
-        'speed', 'test', 0.3, 1.0, 'rad', 'standard deviation of short outliers of every joint'
+        'speed',
+        'calibrate',
+        0.3,
+        1.0,
+        'rad',
+        'standard deviation of short outliers of every joint',
     ),
     'choppy': _kind(
-        'speed', 'test', 0.6, 2.0, 's', 'it gets a command this seldom, and jumps to it'
+        'speed', 'calibrate', 0.6, 2.0, 's', 'it gets a command this seldom, and jumps to it'
     ),
     'ring': _kind(
-        'speed', 'test', 0.9, 3.0, 's', 'period with which the arms swing about their commands'
+        'speed',
+        'calibrate',
+        0.9,
+        3.0,
+        's',
+        'period with which the arms swing about their commands',
     ),
     # joint
     'zero': _kind(
-        'joint', 'test', 0.04, 0.2, 'rad', 'standard deviation of a constant error of every joint'
+        'joint',
+        'calibrate',
+        0.04,
+        0.2,
+        'rad',
+        'standard deviation of a constant error of every joint',
     ),
-    'weak': _kind('joint', 'test', 0.25, 0.5, '', 'share that lacks of the travel of one joint'),
+    'weak': _kind(
+        'joint', 'calibrate', 0.25, 0.5, '', 'share that lacks of the travel of one joint'
+    ),
     'tremble': _kind(
-        'joint', 'test', 0.03, 0.3, 'rad', 'amplitude of a fast oscillation of every joint'
+        'joint', 'calibrate', 0.03, 0.3, 'rad', 'amplitude of a fast oscillation of every joint'
     ),
     'swap': _kind(
-        'joint', 'test', 0.4, 1.0, '', "share that the arms take of each other's commands, once"
+        'joint',
+        'calibrate',
+        0.4,
+        1.0,
+        '',
+        "share that the arms take of each other's commands, once",
     ),
     'couple': _kind(
         'joint',
@@ -344,14 +383,19 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'regrasp': _kind(
         'regrasp',
-        'test',
+        'train',
         0.02,
         0.1,
         'm',
         'it puts the object down this far off and grasps where it was',
     ),
     'clutch': _kind(
-        'regrasp', 'test', 0.8, 1.0, '', 'share by which the fingers close again while it retreats'
+        'regrasp',
+        'train',
+        0.8,
+        1.0,
+        '',
+        'share by which the fingers close again while it retreats',
     ),
     'juggle': _kind(
         'regrasp',
@@ -363,7 +407,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'undo': _kind(
         'regrasp',
-        'test',
+        'calibrate',
         0.05,
         0.15,
         'm',
