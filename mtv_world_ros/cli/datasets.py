@@ -224,12 +224,14 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
             'give --mapping (config/datasets/example.yaml has all keys), or --robot and '
             "--calibration where the columns are named like the robot's joints"
         )
-    values = guess_mapping(
+    values, left_out = guess_mapping(
         LeRobotDataset(arguments.dataset), arguments.robot, arguments.calibration
     )
     file = arguments.out / 'mapping.yaml'
     write_whole(file, yaml.safe_dump(values, sort_keys=False))
     print(f'mapping: {file}')
+    if left_out:
+        print(f"left out, not in '{arguments.calibration}': {', '.join(left_out)}")
     return file
 
 

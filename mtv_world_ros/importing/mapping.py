@@ -173,8 +173,12 @@ def load_mapping(path: Path) -> DatasetMapping:
     return mapping
 
 
-def guess_mapping(dataset: LeRobotDataset, robot: str, calibration: Path) -> dict[str, Any]:
+def guess_mapping(
+    dataset: LeRobotDataset, robot: str, calibration: Path
+) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Returns the values of a mapping for columns that are named like the robot's joints.
+
+    And the image features that are left out, since the calibration has no such view.
 
     Views are the image features that the calibration has, by the last part of their names.
 
@@ -192,7 +196,7 @@ def guess_mapping(dataset: LeRobotDataset, robot: str, calibration: Path) -> dic
         )
     file = str(calibration.resolve())
     is_path = Path(robot).suffix in ('.yaml', '.yml')
-    return {
+    values = {
         'robot': str(Path(robot).resolve()) if is_path else robot,
         'views': {
             view: {'feature': name, 'calibration': file}
@@ -202,6 +206,7 @@ def guess_mapping(dataset: LeRobotDataset, robot: str, calibration: Path) -> dic
         'state': {'feature': 'observation.state'},
         'action': {'feature': 'action'} if 'action' in dataset.features else 'state',
     }
+    return values, tuple(name for view, name in found.items() if view not in known)
 
 
 def digest_of(*files: Path | None, start: bytes = b'') -> str:
