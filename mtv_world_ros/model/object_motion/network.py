@@ -6,9 +6,6 @@ and decides how far it goes along with which tool. It is translation-invariant i
 construction. Overlaps are computed from the widths and heights of the masks, not learned: so a
 grasp that fails for a reason that training never showed is still a matter of the same few numbers.
 
-Tools are given as expected of their commands. What they run into stops them: a tool hears of every
-object as well, and decides how far it is from where it was expected.
-
 Interaction networks: Battaglia et al. 2016; their use as simulators: Sanchez-Gonzalez et al. 2020.
 
 Shape letters: B batch, O objects, A tools, T steps, D width.
@@ -36,9 +33,6 @@ _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
 _NUM_FINGERTIP_HEIGHTS = 2 * 4
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
-#: of what stops a tool: width, numbers that the tool remembers, and that it hears of what objects
-#: hear of each other
-_STOP_WIDTH, _STOP_HIDDEN, _STOP_TOLD = 96, 32, 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,14 +67,12 @@ class Motion:
         rotations: (B, T + 1, O, 3, 3) from the start.
         held: (B, T + 1, O, A) share of the motion that each tool gives.
         spread: (B, T + 1, O) expected error of `points` [m], as learned.
-        stops: (B, T + 1, A, 3) how far tools are from where they were expected [m].
     """
 
     points: Tensor
     rotations: Tensor
     held: Tensor
     spread: Tensor
-    stops: Tensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,9 +86,6 @@ class Memory:
         hidden: (B, O, H).
         held: (B, O, A), see `Motion`.
         spread: (B, O), see `Motion`.
-        stops: (B, A, 3), see `Motion`.
-        last_stops: (B, A, 3) one step before.
-        arms: (B, A, H) what the tools remember.
     """
 
     points: Tensor
@@ -105,9 +94,6 @@ class Memory:
     hidden: Tensor
     held: Tensor
     spread: Tensor
-    stops: Tensor
-    last_stops: Tensor
-    arms: Tensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +150,6 @@ class ObjectMotionNetwork(nn.Module):
         hidden: numbers that an object remembers from step to step.
         fingertips: it is told how high either fingertip is over an object's bottom and top;
             differs where a tool leans.
-        stops: objects stop tools; else tools are where they are expected.
     """
 
     def __init__(
@@ -174,7 +159,6 @@ class ObjectMotionNetwork(nn.Module):
         hidden: int = 48,
         *,
         fingertips: bool = False,
-        stops: bool = False,
     ) -> None:
         super().__init__()
         self.config = {
@@ -182,7 +166,6 @@ class ObjectMotionNetwork(nn.Module):
             'width': width,
             'hidden': hidden,
             'fingertips': fingertips,
-            'stops': stops,
         }
         self.width, self.hidden, self.fingertips = width, hidden, fingertips
         self.shape = _mlp(num_features + 1, width, _SHAPE)
@@ -207,12 +190,9 @@ class ObjectMotionNetwork(nn.Module):
             nn.init.zeros_(layer.bias)
         nn.init.constant_(self.stay.bias, 2.0)
         nn.init.constant_(self.scale.bias, -6.0)
-        self.stops = _Stops(width) if stops else None
 
     def widened(self, width: int, hidden: int) -> ObjectMotionNetwork:
-        """Returns a wider network with fingertips and stops that computes the same.
-
-        It can learn more.
+        """Returns a wider network with fingertips that computes the same, and can learn more.
 
         What is new hears everything and is not listened to at first (Net2Net: Chen et al. 2016).
 
@@ -224,9 +204,7 @@ class ObjectMotionNetwork(nn.Module):
                 f'the network is {self.width} wide and remembers {self.hidden} numbers; it cannot '
                 f'shrink to {width} and {hidden}'
             )
-        wider = ObjectMotionNetwork(
-            self.config['num_features'], width, hidden, fingertips=True, stops=True
-        )
+        wider = ObjectMotionNetwork(self.config['num_features'], width, hidden, fingertips=True)
         w, h = (self.width, width), (self.hidden, hidden)
         tips = (_NUM_FINGERTIP_HEIGHTS if self.fingertips else 0, _NUM_FINGERTIP_HEIGHTS)
         old, new = self.state_dict(), wider.state_dict()
@@ -236,8 +214,6 @@ class ObjectMotionNetwork(nn.Module):
             'node.0.weight': [(14 + _SHAPE, 14 + _SHAPE), h, w, w],
         }
         for name, value in new.items():
-            if name not in old:  # stops nothing at first
-                continue
             same = [(n, m) for n, m in zip(old[name].shape, value.shape, strict=True)]
             rows = [h] * 3 if name.startswith('memory') else same[:1]
             columns = blocks.get(name, same[-1:])
@@ -252,15 +228,14 @@ class ObjectMotionNetwork(nn.Module):
     def forward(
         self,
         scene: Scene,
-        truth: tuple[Tensor, Tensor, Tensor] | None = None,
+        truth: tuple[Tensor, Tensor] | None = None,
         forced: Tensor | None = None,
     ) -> Motion:
         """Returns the motion over T steps.
 
         Args:
             scene: what is given.
-            truth: (B, T + 1, O, 3) points, (B, T + 1, O, 3, 3) rotations and (B, T + 1, A, 3)
-                stops, for training.
+            truth: (B, T + 1, O, 3) points and (B, T + 1, O, 3, 3) rotations, for training.
             forced: (B, T) bool, steps that start from the truth; needs `truth`.
         """
         return self.roll(scene, truth=truth, forced=forced)[0]
@@ -271,7 +246,7 @@ class ObjectMotionNetwork(nn.Module):
         memory: Memory | None = None,
         *,
         skip: int = 0,
-        truth: tuple[Tensor, Tensor, Tensor] | None = None,
+        truth: tuple[Tensor, Tensor] | None = None,
         forced: Tensor | None = None,
     ) -> tuple[Motion, Memory]:
         """Returns the motion and what the next call is given.
@@ -295,16 +270,8 @@ class ObjectMotionNetwork(nn.Module):
                     points=torch.where(known, truth[0][:, step], now.points),
                     rotations=torch.where(known[..., None], truth[1][:, step], now.rotations),
                 )
-                if self.stops is not None:
-                    now = replace(
-                        now,
-                        stops=torch.where(known, truth[2][:, step], now.stops),
-                        last_stops=torch.where(
-                            known, truth[2][:, max(step - 1, 0)], now.last_stops
-                        ),
-                    )
             rows = slice(step, step + 3)  # the step before, this one, the next
-            moved, turned, held, hidden, more, stops, arms = self.step(
+            moved, turned, held, hidden, more = self.step(
                 tools[:, rows],
                 gaps[:, rows],
                 scene.present,
@@ -320,12 +287,9 @@ class ObjectMotionNetwork(nn.Module):
                 hidden=hidden,
                 held=held,
                 spread=now.spread + more,
-                stops=stops,
-                last_stops=now.stops,
-                arms=arms,
             )
             track.append(now)
-        names = ('points', 'rotations', 'held', 'spread', 'stops')
+        names = ('points', 'rotations', 'held', 'spread')
         rows_of = {name: torch.stack([getattr(m, name) for m in track], 1) for name in names}
         return Motion(**rows_of), now
 
@@ -348,7 +312,6 @@ class ObjectMotionNetwork(nn.Module):
     def _begin(self, scene: Scene) -> Memory:
         points = scene.points
         batch, objects = scene.present.shape
-        still = points.new_zeros(batch, scene.tools.shape[2], 3)
         return Memory(
             points=points,
             rotations=torch.eye(3, device=points.device).expand(batch, objects, 3, 3),
@@ -356,31 +319,20 @@ class ObjectMotionNetwork(nn.Module):
             hidden=points.new_zeros(batch, objects, self.hidden),
             held=points.new_zeros(batch, objects, scene.tools.shape[2]),
             spread=points.new_zeros(batch, objects),
-            stops=still,
-            last_stops=still,
-            arms=points.new_zeros(batch, scene.tools.shape[2], _STOP_HIDDEN),
         )
 
     def step(
         self, tools: Tensor, gaps: Tensor, present: Tensor, extents: _Extents, now: Memory
-    ) -> tuple[Tensor, ...]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """One step, from the tools (B, 3, A, 4, 4) and gaps (B, 3, A) before, now and after.
 
         `extents` are turned as the objects are now.
 
-        Returns points, rotations, shares of the tools, memory, what is added to the spread, how
-        far tools are then from where they were expected, and what they remember.
+        Returns points, rotations, shares of the tools, memory, and what is added to the spread.
         """
         before, here, after = tools.unbind(1)
-        told = self._from_objects(present, extents, now)
-        stops, arms = now.stops, now.arms
-        if self.stops is not None:
-            here = _shifted(here, now.stops)
-            stops, arms = self.stops(
-                (here, _shifted(after, now.stops)), gaps, present, extents, now, told
-            )
-            before, after = _shifted(before, now.last_stops), _shifted(after, stops)
         heard, gates, pushed = self._from_tools(gaps, extents, now, (before, here, after))
+        told = self._from_objects(present, extents, now)
         height = now.points[..., 2]
         node = self.node(
             torch.cat(
@@ -417,7 +369,7 @@ class ObjectMotionNetwork(nn.Module):
         turn = (held[..., None] * spin[:, None]).sum(2) + pushed[..., 3:] + free[..., 3:]
         turned = _rotation(turn) @ now.rotations
         more = F.softplus(self.scale(node.detach())[..., 0]) / _SCALE
-        return moved, turned, held, hidden, more, stops, arms
+        return moved, turned, held, hidden, more
 
     def _from_tools(
         self,
@@ -480,92 +432,6 @@ class ObjectMotionNetwork(nn.Module):
         edge = self.object_edge(torch.cat(inputs, dim=-1))
         pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=offset.device)
         return (edge * pairs[..., None]).sum(2)
-
-
-class _Stops(nn.Module):
-    """How far objects keep tools from where they are expected.
-
-    Args:
-        width: D of what objects hear of each other.
-    """
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.told = nn.Linear(width, _STOP_TOLD)
-        # places now, next (6) | gaps (3) | held, height (2) | clearances now and next
-        given = 11 + 2 * _NUM_TOOL_CLEARANCES + _NUM_FINGERTIP_HEIGHTS
-        self.edge = _mlp(given + _SHAPE + _STOP_TOLD, _STOP_WIDTH, _STOP_WIDTH)
-        # stop now, way (6) | height, gap (2)
-        self.node = _mlp(8 + _STOP_HIDDEN + _STOP_WIDTH, _STOP_WIDTH, _STOP_WIDTH)
-        self.memory = nn.GRUCell(_STOP_WIDTH, _STOP_HIDDEN)
-        self.keep = nn.Linear(_STOP_WIDTH, 1)
-        self.push = nn.Linear(_STOP_WIDTH, 3)
-        nn.init.zeros_(self.push.weight)
-        nn.init.zeros_(self.push.bias)
-
-    def forward(
-        self,
-        tools: tuple[Tensor, Tensor],
-        gaps: Tensor,
-        present: Tensor,
-        extents: _Extents,
-        now: Memory,
-        told: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the stops (B, A, 3) of the next step, and what tools remember (B, A, H).
-
-        Args:
-            tools: (B, A, 4, 4) now, and as they would go on if nothing else stopped them.
-            gaps: (B, 3, A) before, now and after.
-            present: (B, O).
-            extents: turned as the objects are now.
-            now: objects and tools.
-            told: (B, O, D) what objects hear of each other.
-        """
-        here, after = tools
-        count, num_tools = now.points.shape[1], here.shape[1]
-        apart = gaps.transpose(1, 2) * _SCALE
-        own = torch.cat([extents.shape, self.told(told)], -1)
-        low = _near(now.points[..., 2] + extents.low)
-        inputs = [
-            *((_local(tool, now.points) * _SCALE).clamp(-4, 4) for tool in tools),
-            apart[:, None].expand(-1, count, -1, -1),
-            now.held[..., None],
-            low[..., None, None].expand(-1, -1, num_tools, -1),
-            _tool_clearances(here, gaps[:, 1], extents, now),
-            _tool_clearances(after, gaps[:, 2], extents, now),
-            _fingertip_heights(here, gaps[:, 1], extents, now),
-            _fingertip_heights(after, gaps[:, 2], extents, now),
-            own[:, :, None].expand(-1, -1, num_tools, -1),
-        ]
-        edge = self.edge(torch.cat(inputs, -1)) * present[..., None, None]
-        frame = here[..., :3, :3]
-        ways = torch.stack([now.stops, (after - here)[..., :3, 3]], 2)  # (B, A, 2, 3)
-        ways = torch.einsum('baji,bakj->baki', frame, ways).flatten(2)
-        node = self.node(
-            torch.cat(
-                [
-                    ways * _SCALE,
-                    here[..., 2:3, 3] * _SCALE,
-                    apart[..., 1:2],
-                    now.arms,
-                    edge.sum(1),
-                ],
-                -1,
-            )
-        )
-        arms = self.memory(node.flatten(0, 1), now.arms.flatten(0, 1)).unflatten(
-            0, now.arms.shape[:2]
-        )
-        pushed = (frame @ self.push(node)[..., None])[..., 0] / _SCALE
-        return torch.sigmoid(self.keep(node)) * now.stops + pushed, arms
-
-
-def _shifted(tools: Tensor, ways: Tensor) -> Tensor:
-    """Tools (B, A, 4, 4) moved by (B, A, 3)."""
-    places = tools[..., :3, 3] + ways
-    top = torch.cat([tools[..., :3, :3], places[..., None]], -1)
-    return torch.cat([top, tools[..., 3:, :]], -2)
 
 
 def _kept(blocks: Sequence[tuple[int, int]]) -> list[int]:

@@ -45,8 +45,8 @@ _WAY_M, _NEAR_M, _SLIP = 0.005, 0.15, 0.35
 _STANDS_M, _GOES_M, _RIGHT_M = 0.001, 0.004, 0.015
 #: what a turn of a tool counts as a way [m / rad]
 _LEVER_M = 0.05
-#: an object has moved if it went further than this, and a tool was stopped [m]
-_MOVED_M, _STOPPED_M = 0.01, 0.004
+#: an object has moved if it went further than this [m]
+_MOVED_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +172,7 @@ def _network(
 ) -> ObjectMotionNetwork:
     if init is None:
         width, hidden = config.width or _WIDTH, config.hidden or _HIDDEN
-        return ObjectMotionNetwork(count, width, hidden, fingertips=True, stops=True)
+        return ObjectMotionNetwork(count, width, hidden, fingertips=True)
     try:
         return init.widened(config.width or init.width, config.hidden or init.hidden)
     except ValueError as error:
@@ -245,8 +245,7 @@ class _Passes:
         return captured.loss
 
     def _run(self, batch: Batch, forced: Tensor) -> Tensor:
-        truth = (batch.points, batch.rotations, batch.stops)
-        loss = _loss(self._network(batch.scene, truth, forced), batch)
+        loss = _loss(self._network(batch.scene, (batch.points, batch.rotations), forced), batch)
         gradients = torch.autograd.grad(loss, self._parameters)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -363,8 +362,7 @@ def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
 
 def _carried(batch: Batch) -> tuple[Tensor, Tensor]:
     """(B, T, O, A) whether a tool carries an object in a step, and whether that is known."""
-    rotations = batch.scene.tools[..., :3, :3]
-    places = batch.scene.tools[..., :3, 3] + batch.stops
+    rotations, places = batch.scene.tools[..., :3, :3], batch.scene.tools[..., :3, 3]
     offset = batch.points[:, :, :, None] - places[:, :, None]
     local = torch.einsum('btaji,btoaj->btoai', rotations, offset)
     turn = _squared_angle(rotations[:, 1:], rotations[:, :-1]).clamp(min=0).sqrt()
@@ -392,10 +390,6 @@ def _loss(motion: Motion, batch: Batch) -> Tensor:
         1.0 + 3.0 * moved + 4.0 * batch.parted
     )
     loss = ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()
-    # arms mostly go where they are expected
-    stopped = torch.stack([batch.stops, motion.stops.detach()]).norm(dim=-1) > _STOPPED_M
-    stops = F.huber_loss(motion.stops, batch.stops, reduction='none', delta=0.01).sum(-1) * 1e4
-    loss = loss + (stops * (0.1 + stopped.any(0))).mean()
     # else it would move what is held by pushing it, which does not turn it
     carried, asked = _carried(batch)
     asked &= ((error < _RIGHT_M) & batch.known & batch.scene.present[:, None])[:, 1:, :, None]

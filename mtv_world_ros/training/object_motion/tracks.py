@@ -13,7 +13,7 @@ import numpy as np
 
 from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import measured_positions, stitched_commands
+from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.camera import camera_poses
@@ -32,7 +32,6 @@ class ObjectTracks:
     Attributes:
         features: (O, V, F) of `object_shapes`.
         tools: (T + 1, A, 4, 4) T_base_tool as expected of the commands.
-        stops: (T + 1, A, 3) how far from there the joint states have them, by what they touch [m].
         gaps: (T + 1, A) from a tool to its fingers, as commanded [m].
         points: (T + 1, O, 3) [m], from where the first frame's masks have the objects.
         rotations: (T + 1, O, 3, 3) from the start.
@@ -43,7 +42,6 @@ class ObjectTracks:
 
     features: FloatArray
     tools: FloatArray
-    stops: FloatArray
     gaps: FloatArray
     points: FloatArray
     rotations: FloatArray
@@ -89,14 +87,12 @@ def object_tracks(
     expected = positions if response is None else response.follow(robot, positions)[0]
     times, positions, expected = (rows[::every] for rows in (times, positions, expected))
     cameras = [episode.cameras[view] for view in views]
-    tools = robot.tool_poses(expected).transpose(1, 0, 2, 3)
     recording = _Recording(
         episode=episode,
         masks=masks,
         cameras=cameras,
         poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
-        tools=tools,
-        stops=_true_tools(episode, robot, stamps[0], times) - tools[..., :3, 3],
+        tools=robot.tool_poses(expected).transpose(1, 0, 2, 3),
         gaps=robot.finger_gaps(positions),
         stamps_ns=stamps[0] + times * 1e9,
     )
@@ -119,7 +115,6 @@ class _Recording:
         cameras: V.
         poses: (V, T + 1, 4, 4) T_base_camera.
         tools: see `ObjectTracks`.
-        stops: see `ObjectTracks`.
         gaps: see `ObjectTracks`.
         stamps_ns: (T + 1,).
     """
@@ -129,7 +124,6 @@ class _Recording:
     cameras: Sequence[CameraModel]
     poses: FloatArray
     tools: FloatArray
-    stops: FloatArray
     gaps: FloatArray
     stamps_ns: FloatArray
 
@@ -143,7 +137,6 @@ class _Recording:
         return ObjectTracks(
             features=object_shapes(seen, start, self.cameras, list(self.poses[:, row])),
             tools=self.tools[row:],
-            stops=self.stops[row:],
             gaps=self.gaps[row:],
             points=np.nan_to_num(points),
             rotations=rotations,
@@ -183,15 +176,6 @@ class _Recording:
         )
         numbers = range(1, len(self.episode.info.objects) + 1)
         return np.stack([ids == number for number in numbers], axis=1)
-
-
-def _true_tools(
-    episode: Episode, robot: RobotModel, start_ns: int, times: FloatArray
-) -> FloatArray:
-    """(N, A, 3) where the joint states have the tools at times (N,) [s]."""
-    stamps = int(start_ns) + np.rint(times * 1e9).astype(np.int64)
-    poses = robot.tool_poses(measured_positions(episode, robot, stamps))
-    return poses.transpose(1, 0, 2, 3)[..., :3, 3]
 
 
 def _last_ns(episode: Episode, masks: dict[str, Track]) -> float:

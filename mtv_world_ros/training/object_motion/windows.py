@@ -39,7 +39,6 @@ class Batch:
         scene: that the network is given.
         points: (B, T + 1, O, 3) [m].
         rotations: (B, T + 1, O, 3, 3) from the episode's start.
-        stops: (B, T + 1, A, 3) see `ObjectTracks`.
         known: (B, T + 1, O) bool.
         turns_known: (B,) bool, see `ObjectTracks`.
         parted: (B, T + 1, O) bool, where a sibling of the batch has the object elsewhere.
@@ -48,7 +47,6 @@ class Batch:
     scene: Scene
     points: Tensor
     rotations: Tensor
-    stops: Tensor
     known: Tensor
     turns_known: Tensor
     parted: Tensor
@@ -69,7 +67,7 @@ class TrackPool:
             name: torch.from_numpy(
                 np.concatenate([_single(getattr(track, name)) for track in tracks])
             ).to(device)
-            for name in ('tools', 'gaps', 'stops', 'points', 'rotations', 'known')
+            for name in ('tools', 'gaps', 'points', 'rotations', 'known')
         }
         self._features = torch.from_numpy(
             np.stack([_single(track.features) for track in tracks])
@@ -147,7 +145,7 @@ class TrackPool:
 
         def of(name: str, at: Tensor) -> Tensor:
             values = self._rows[name][at]
-            if name in ('tools', 'gaps', 'stops'):
+            if name in ('tools', 'gaps'):
                 return values
             extra = values.ndim - at.ndim - 1
             index = picked.view(len(tracks), *[1] * (at.ndim - 1), -1, *[1] * extra)
@@ -166,7 +164,6 @@ class TrackPool:
             scene=scene,
             points=points + moved[:, None],
             rotations=of('rotations', rows),
-            stops=of('stops', rows),
             known=of('known', rows),
             turns_known=self._turns_known[chosen],
             parted=_parted(self._rows['points'][rows], groups, picked),
@@ -248,6 +245,5 @@ def _turned(batch: Batch, rng: np.random.Generator) -> Batch:
         batch,
         scene=replace(scene, points=scene.points @ both.T, features=features, tools=tools),
         points=batch.points @ both.T,
-        stops=batch.stops @ both.T,
         rotations=both @ batch.rotations @ both.T,
     )

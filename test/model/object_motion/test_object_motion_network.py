@@ -26,10 +26,10 @@ from mtv_world_ros.model.object_motion.predictor import (
 STEPS = 12
 
 
-@pytest.fixture(params=[False, True], ids=['tools go on', 'tools are stopped'])
-def network(request) -> ObjectMotionNetwork:
+@pytest.fixture
+def network() -> ObjectMotionNetwork:
     torch.manual_seed(0)
-    network = ObjectMotionNetwork(width=32, hidden=16, stops=request.param)
+    network = ObjectMotionNetwork(width=32, hidden=16)
     with torch.no_grad():  # an untrained one would hold everything still
         for parameter in network.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
@@ -65,8 +65,6 @@ def test_two_calls_one_after_the_other_are_one_call(network):
     torch.testing.assert_close(first.points, whole.points[:, :6])
     torch.testing.assert_close(second.points, whole.points[:, 5:])
     torch.testing.assert_close(second.rotations, whole.rotations[:, 5:])
-    torch.testing.assert_close(second.stops, whole.stops[:, 5:])
-    assert (whole.stops[:, 1:].abs().max() > 1e-3) == (network.stops is not None)
 
 
 @pytest.mark.parametrize(('width', 'hidden'), [(32, 16), (48, 20)])
@@ -77,7 +75,7 @@ def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
     wider = network.widened(width, hidden).widened(width + 8, hidden).eval()
     with torch.inference_mode():
         before, after = network(given), wider(given)
-    for name in ('points', 'rotations', 'held', 'spread', 'stops'):
+    for name in ('points', 'rotations', 'held', 'spread'):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     leaning = given.tools.clone()
     leaning[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
@@ -113,7 +111,6 @@ def test_padding_changes_nothing_and_rotations_stay_rotations(network):
     with torch.inference_mode():
         alone, among = network(given), network(padded)
     torch.testing.assert_close(among.points[:, :, :2], alone.points)
-    torch.testing.assert_close(among.stops, alone.stops)
     assert (alone.points[:, -1] - alone.points[:, 0]).abs().max() > 1e-3
     product = alone.rotations @ alone.rotations.mT
     torch.testing.assert_close(product, torch.eye(3).expand_as(product), atol=1e-4, rtol=0)
@@ -128,7 +125,6 @@ def test_a_shift_of_the_whole_scene_in_the_plane_shifts_the_answer(network):
         here = network(given)
         there = network(replace(given, points=given.points + way, tools=tools))
     torch.testing.assert_close(there.points, here.points + way, atol=1e-5, rtol=0)
-    torch.testing.assert_close(there.stops, here.stops, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize('kind', ['alone', 'response', 'two'])
@@ -149,23 +145,24 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network,
         'two': [member, Member(network=network, response=response)],
     }[kind]
     rng = np.random.default_rng(0)
-    positions = np.cumsum(rng.normal(0, 0.005, (41, len(robot.joint_names))), axis=0)
+    positions = np.cumsum(rng.normal(0, 0.02, (9, len(robot.joint_names))), axis=0)
     tracked = TrackedObjects(
         model=ObjectMotionPredictor(members, robot),
         reference=np.array([[0.1, 0.2, 0.02], [np.nan] * 3]),
         features=np.full((2, 2, 9), 0.04),
     )
     (whole, *disturbed), _ = tracked.advance(positions)
-    assert tracked.commands_a_step == 5 and len(whole.points) == 9
-    (first, *_), later = tracked.advance(positions[:21])
-    (second, *_), _ = later.advance(positions[20:])
+    (first, *_), later = tracked.advance(positions[:5])
+    (second, *_), _ = later.advance(positions[4:])
     assert len(disturbed) > 5
     for motion in disturbed:  # of other places, told from where the object was found
         np.testing.assert_allclose(motion.points[0, 0], tracked.reference[0])
         assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
     np.testing.assert_allclose(tracked.sizes[0], [0.04, 0.04, 0.04])
-    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=1e-6)
-    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=1e-6)
+    # between commands .1 s apart a response knows less at the end of a chunk
+    close = 1e-6 if kind != 'response' else 1e-3
+    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=close)
+    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=close)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()
 
 

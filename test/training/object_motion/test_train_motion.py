@@ -83,8 +83,7 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
         batch = TrackPool([track]).whole(0)
         forced = torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1]
         with torch.inference_mode():
-            truth = (batch.points, batch.rotations, batch.stops)
-            motion = network(batch.scene, truth, forced)
+            motion = network(batch.scene, (batch.points, batch.rotations), forced)
         moves = batch.points.diff(dim=1).norm(dim=-1) > 1e-3
         errors.append((motion.points - batch.points).norm(dim=-1)[:, 1:][moves].mean())
     return float(torch.stack(errors).nanmean())
@@ -182,7 +181,7 @@ def test_objects_that_are_not_there_change_nothing(episodes, robot):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
     count = len(track.features)
     torch.manual_seed(0)
-    network = ObjectMotionNetwork(width=24, hidden=8, stops=True)
+    network = ObjectMotionNetwork(width=24, hidden=8)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     losses, motions = [], []
@@ -201,7 +200,7 @@ def test_objects_that_are_not_there_change_nothing(episodes, robot):
 def test_captured_passes_give_the_loss_and_gradients_of_plain_ones(episodes, robot):
     tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
     torch.manual_seed(0)
-    plain = ObjectMotionNetwork(width=24, hidden=8, stops=True)
+    plain = ObjectMotionNetwork(width=24, hidden=8)
     for parameter in plain.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     quick = copy.deepcopy(plain).to('cuda')
@@ -260,9 +259,7 @@ def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, ro
     def cost(imagined, real):
         spread = torch.full(real.shape[:3], 0.01)
         held = torch.zeros(*real.shape[:3], 2)
-        motion = Motion(
-            points=imagined, rotations=turns, held=held, spread=spread, stops=stays.stops
-        )
+        motion = Motion(points=imagined, rotations=turns, held=held, spread=spread)
         return motion_training._loss(motion, replace(stays, points=real, rotations=turns)).item()
 
     assert cost(carried, still) == pytest.approx(cost(still, carried), rel=1e-5)
@@ -282,7 +279,6 @@ def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
             rotations=real.rotations @ turn,
             held=held,
             spread=torch.full(real.points.shape[:3], 0.01),
-            stops=real.stops,
         )
         return motion_training._loss(motion, real).item()
 
@@ -299,8 +295,7 @@ def test_what_follows_a_tool_is_carried_and_what_stays_is_not(episodes, robot):
     points[0, :, 0, 2] = 0.01 * torch.arange(9)
     points[0, :, 2, 0] = 0.5
     scene = replace(real.scene, tools=tools)
-    moved = replace(real, scene=scene, points=points, stops=torch.zeros(1, 9, 2, 3))
-    carried, asked = motion_training._carried(moved)
+    carried, asked = motion_training._carried(replace(real, scene=scene, points=points))
     assert carried[0, :, 0, 0].all() and not carried[0, :, 1:].any()
     assert asked[0, :, :2, 0].all()  # the third object is far away
     assert not asked[0, :, 2].any() and not asked[..., 1].any()
