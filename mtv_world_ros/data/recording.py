@@ -416,6 +416,27 @@ def commands_from(recording: Recording, start: int) -> JointTrajectory:
     )
 
 
+def commands_until(recording: Recording, start: int, seconds: float) -> JointTrajectory:
+    """The commands that are due after frame `start`, counted from it, up to a time.
+
+    All of them, as they were sent: what is quicker than the frames decides about contact. They
+    end at that time; past their own end the arms hold still.
+    """
+    due = commands_from(recording, start)
+    kept = due.times < seconds - 1e-6
+    end = resample(due, recording.positions[start], np.array([seconds]))
+    velocities = due.velocities
+    if velocities is not None:
+        last = [np.interp(seconds, due.times, column, right=0.0) for column in velocities.T]
+        velocities = np.vstack([velocities[kept], last])
+    return JointTrajectory(
+        joint_names=due.joint_names,
+        times=np.append(due.times[kept], seconds),
+        positions=np.vstack([due.positions[kept], end]),
+        velocities=velocities,
+    )
+
+
 #: to be increased when the stored data or their computation change
 _VERSION = 2
 

@@ -7,10 +7,9 @@ from math import floor
 
 import numpy as np
 
-from mtv_world_ros.data.recording import commanded, frame_indices, Recording
+from mtv_world_ros.data.recording import commands_until, frame_indices, Recording
 from mtv_world_ros.data_types import (
     ByteArray,
-    JointTrajectory,
     Observation,
     WorldModelSpec,
 )
@@ -117,12 +116,8 @@ def imagine_stretch(
         num_seeds: rollouts whose mean the success estimate is.
     """
     spec = pipeline.spec
-    times = np.arange(stretch.num_frames + 1) / spec.fps
     start = min(stretch.start, len(actions.times) - 1)
-    positions = commanded(actions, start, times)
-    trajectory = JointTrajectory(
-        joint_names=pipeline.robot.joint_names, times=times[1:], positions=positions[1:]
-    )
+    trajectory = commands_until(actions, start, stretch.num_frames / spec.fps)
     observation = Observation(
         cameras=recording.cameras_at(stretch.start),
         frames=stretch.frames[:, 0],

@@ -145,24 +145,23 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network,
         'two': [member, Member(network=network, response=response)],
     }[kind]
     rng = np.random.default_rng(0)
-    positions = np.cumsum(rng.normal(0, 0.02, (9, len(robot.joint_names))), axis=0)
+    positions = np.cumsum(rng.normal(0, 0.005, (41, len(robot.joint_names))), axis=0)
     tracked = TrackedObjects(
         model=ObjectMotionPredictor(members, robot),
         reference=np.array([[0.1, 0.2, 0.02], [np.nan] * 3]),
         features=np.full((2, 2, 9), 0.04),
     )
     (whole, *disturbed), _ = tracked.advance(positions)
-    (first, *_), later = tracked.advance(positions[:5])
-    (second, *_), _ = later.advance(positions[4:])
+    assert tracked.commands_a_step == 5 and len(whole.points) == 9
+    (first, *_), later = tracked.advance(positions[:21])
+    (second, *_), _ = later.advance(positions[20:])
     assert len(disturbed) > 5
     for motion in disturbed:  # of other places, told from where the object was found
         np.testing.assert_allclose(motion.points[0, 0], tracked.reference[0])
         assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
     np.testing.assert_allclose(tracked.sizes[0], [0.04, 0.04, 0.04])
-    # between commands .1 s apart a response knows less at the end of a chunk
-    close = 1e-6 if kind != 'response' else 1e-3
-    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=close)
-    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=close)
+    np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=1e-6)
+    np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=1e-6)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()
 
 

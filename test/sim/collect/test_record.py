@@ -20,7 +20,7 @@ TASK, SEED = 'stack_blocks_two', 3
 
 
 @pytest.mark.skipif(bool(missing_opengl()), reason=missing_opengl() or '')
-@pytest.mark.parametrize('name', ['expert', 'expert-fast-1.5'])
+@pytest.mark.parametrize('name', ['expert', 'expert-fast-1.5', 'expert-choppy-0.6'])
 def test_recorded_episodes_and_ranked_policies_are_carried_out_alike(name):
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
     expert = Expert(robot)
@@ -43,6 +43,7 @@ def test_recorded_episodes_and_ranked_policies_are_carried_out_alike(name):
     ranked = np.concatenate(world.commands)
     both = min(len(ranked), len(take.commands.positions) - 1)
     assert both > 200
-    # cubics through the published points: they leave the plan by little
-    np.testing.assert_allclose(ranked[:both], take.commands.positions[1 : both + 1], atol=0.015)
+    # where an answer begins, a controller does not know how fast the last one ended
+    error = np.abs(ranked[:both] - take.commands.positions[1 : both + 1]).max(1)
+    assert np.median(error) < 1e-9 and error.max() < 0.015
     assert world.outcome()[1] == (take.ever and take.final)
