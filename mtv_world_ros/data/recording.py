@@ -17,7 +17,7 @@ import numpy as np
 
 from mtv_world_ros.bounded_input import parse_json, read_arrays
 from mtv_world_ros.data.bag_mapping import EpisodeSource
-from mtv_world_ros.data.episode import Episode, MASKS_BY
+from mtv_world_ros.data.episode import Episode, MASKS_BY, Track
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import (
     ByteArray,
@@ -62,6 +62,7 @@ class Recording:
         stamp_ns: stamp of the first frame.
         object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
         warnings: problems found and how the reader handled them.
+        recorded: V views as they were recorded, and their cameras; empty = from a cache.
     """
 
     path: Path
@@ -81,6 +82,24 @@ class Recording:
     masks_by: str = ''
     camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    recorded: tuple[tuple[Track, CameraModel], ...] = ()
+
+    def seen_at(self, frame: int) -> tuple[ByteArray, tuple[CameraModel, ...]]:
+        """Returns a frame (V, H, W, 3) and its V cameras, as the robot saw it.
+
+        At the recorded size, which shows better where objects are; at the model's where the views
+        differ in size, or are not known any more.
+        """
+        cameras = self.cameras_at(frame)
+        stamp = np.array([self.stamp_ns + round(float(self.times[frame]) * 1e9)])
+        shown = [t.frames[int(nearest_rows(t.stamps_ns, stamp)[0])] for t, _ in self.recorded]
+        sizes = {image.shape[:2] for image in shown}
+        if len(sizes) != 1 or sizes != {(c.height, c.width) for _, c in self.recorded}:
+            return self.frames[:, frame], cameras
+        posed = zip(self.recorded, cameras, strict=True)
+        return np.stack(shown), tuple(
+            replace(own, T_mount_camera=now.T_mount_camera) for (_, own), now in posed
+        )
 
     def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:
         """Returns the V cameras as they are at a frame.
@@ -221,6 +240,7 @@ def load_recording(
             for view, track in episode.camera_tracks.items()
         },
         warnings=episode.warnings,
+        recorded=tuple((episode.images[view], episode.cameras[view]) for view in spec.views),
     )
 
 
@@ -461,7 +481,7 @@ def cached_recording(
     archive = BytesIO()
     _save(archive, recording)
     write_whole(stored, archive.getvalue())
-    return recording
+    return replace(recording, recorded=())
 
 
 def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSource) -> str:

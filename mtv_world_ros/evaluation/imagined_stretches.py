@@ -118,9 +118,10 @@ def imagine_stretch(
     spec = pipeline.spec
     start = min(stretch.start, len(actions.times) - 1)
     trajectory = commands_until(actions, start, stretch.num_frames / spec.fps)
+    frames, cameras = recording.seen_at(stretch.start)
     observation = Observation(
-        cameras=recording.cameras_at(stretch.start),
-        frames=stretch.frames[:, 0],
+        cameras=cameras,
+        frames=frames,
         positions=recording.positions[stretch.start],
         stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
     )
