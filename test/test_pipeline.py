@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.assembly import assemble
-from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.data.recording import cached_recording, load_recording, Recording
 from mtv_world_ros.data_types import History, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.errors import (
     CalibrationError,
@@ -27,6 +27,7 @@ from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import Member, ObjectMotionPredictor
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.vision.describers.scene_objects import SceneObject
 
 SPEC = WorldModelSpec(
@@ -284,6 +285,19 @@ def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
     assert np.array_equal(chunk.start.frames, real[:, 8])
     assert np.array_equal(model.histories[0].frames, real[:, 3:8])
     assert chunk.imagined_seconds == pytest.approx(1.6)  # since the last real frame
+
+
+def test_a_recorded_frame_is_seen_at_its_own_size(recording: Recording, tmp_path) -> None:
+    frames, cameras = recording.seen_at(3)
+    assert frames.shape[1] > SPEC.height
+    assert {(c.height, c.width) for c in cameras} == {frames.shape[1:3]}
+    small = resize_frames(frames, SPEC.width, SPEC.height)
+    assert np.array_equal(small, recording.frames[:, 3])
+    for kept in range(2):  # made, and read again
+        cached = cached_recording(recording.path, SPEC, YAM, tmp_path)
+        assert not cached.recorded and len(list(tmp_path.iterdir())) == 1, kept
+        frames, cameras = cached.seen_at(3)
+        assert np.array_equal(frames, recording.frames[:, 3]) and cameras == cached.cameras
 
 
 class DriftingObjects:
