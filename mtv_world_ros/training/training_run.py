@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import json
 import math
@@ -17,7 +18,7 @@ from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.bag_mapping import EpisodeSource
-from mtv_world_ros.data.episode_reader import list_episodes
+from mtv_world_ros.data.episode_reader import list_episodes, read_info
 from mtv_world_ros.data.recording import (
     cached_recording,
     clip_starts,
@@ -114,8 +115,21 @@ def load_recordings(
         else:
             recordings.append(recording)
     if not recordings:
-        raise TrainingError(f'no usable episode: {"; ".join(counted(skipped) or ["none given"])}')
+        reasons = '; '.join(counted(skipped) or ['none given'])
+        raise TrainingError(f'no usable episode: {_other_robot(paths, robot)}{reasons}')
     return recordings, skipped
+
+
+def _other_robot(paths: Sequence[Path], robot: RobotModel) -> str:
+    """What to set where the first episode is of a robot of another name; else empty."""
+    with suppress(MtvWorldError, IndexError):
+        name = read_info(paths[0]).robot
+        if name not in ('', robot.name):
+            return (
+                f"they are of robot '{name}', and video.robot is '{robot.name}'; give --set "
+                'video.robot=FILE (of imported episodes: robot/robot.yaml beside them): '
+            )
+    return ''
 
 
 def train(

@@ -20,13 +20,15 @@ from mtv_world_ros.data.bag.reader import BagMessage, iter_messages
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
-from mtv_world_ros.training.training_run import train
+from mtv_world_ros.training.training_run import load_recordings, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 Change = Callable[[BagMessage], list[bytes]]
@@ -94,6 +96,10 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     rewrite(episode, tmp_path / 'only' / 'bad', without('/joint_states'))
     with pytest.raises(TrainingError, match='no usable episode: 1 x .*joint_states'):
         train(run.replace(dataset=tmp_path / 'only'), robot=robot, segmenter=ColourSegmenter())
+    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
+    with pytest.raises(TrainingError, match=said):
+        load_recordings([tmp_path / 'good'], tiny.spec, franka, tmp_path / 'cache')
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
