@@ -99,7 +99,7 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
     said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
     with pytest.raises(TrainingError, match=said):
-        load_recordings([data / 'good'], tiny.spec, franka, tmp_path / 'cache')
+        load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
