@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from math import prod, sqrt
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 
 from mtv_world_ros.data.transform_tree import Mount
-from mtv_world_ros.data_types import CameraModel, FloatArray, Observation
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
@@ -26,6 +27,8 @@ from mtv_world_ros.ros.parameters import NodeSettings
 _NUM_IMAGES = 3
 #: joint samples kept a joint; at 1 kHz this reaches back a quarter of a second
 _NUM_SAMPLES = 256
+#: more pixels tell no more about where objects are, and take time
+_MOST_PIXELS = 640 * 480
 #: no joint moves faster than this [rad/s or m/s]; encoders may jump by a little
 _FASTEST = 1000.0
 _LEAST_JUMP = 0.3
@@ -63,6 +66,8 @@ class ObservationBuffer:
         joint_names: J names, in the robot's order.
         width: width of the model's frames [px].
         height: height of the model's frames [px].
+        own_size: observations are of the images' own size, which shows better where objects are,
+            but for very large ones; else of the model's.
         limits: asked at every observation, so that they may change.
         on_image: also gets every image that is stored.
         pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
@@ -76,13 +81,14 @@ class ObservationBuffer:
         joint_names: Sequence[str],
         width: int,
         height: int,
+        own_size: bool = False,
         limits: Callable[[], NodeSettings],
         on_image: Callable[[str, Image | CompressedImage], None] | None = None,
         pose: Callable[[str, str, int], Mount | None] | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras)
         self._pose = pose
-        self._size = (width, height)
+        self._size, self._own_size = (width, height), own_size
         self._limits, self._on_image = limits, on_image
         self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
             camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
@@ -199,12 +205,13 @@ class ObservationBuffer:
         limits = self._limits()
         images = self._pick_images(now_ns, limits)
         stamp_ns = min(stamp for stamp, _ in images)
+        shown = [image_messages.to_rgb(message) for _, message in images]
+        size = _common_size(shown, self._size) if self._own_size else self._size
         cameras, frames = [], []
-        for view, (_, message) in zip(self.views, images, strict=True):
-            frame = image_messages.to_rgb(message)
+        for view, (_, message), frame in zip(self.views, images, shown, strict=True):
             camera = self._intrinsics.camera(view, width=frame.shape[1], height=frame.shape[0])
-            cameras.append(scaled(self._posed(camera, message), *self._size))
-            frames.append(resize_frames(frame[None], *self._size)[0])
+            cameras.append(scaled(self._posed(camera, message), *size))
+            frames.append(resize_frames(frame[None], *size)[0])
         observation = Observation(
             cameras=tuple(cameras),
             frames=np.stack(frames),
@@ -274,6 +281,13 @@ class ObservationBuffer:
                 for samples in self._joints.values()
             ]
         )
+
+
+def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the largest frame; smaller where it has vastly many pixels."""
+    height, width = max((frame.shape[:2] for frame in frames), key=prod)
+    shrink = min(1.0, sqrt(max(_MOST_PIXELS, prod(least)) / (width * height)))
+    return round(shrink * width), round(shrink * height)
 
 
 class Intrinsics:

@@ -18,17 +18,23 @@ MS = 1_000_000
 def make_buffer(ros, tmp_path):
     cameras = load_calibration(ros.make_calibration(tmp_path / 'calibration.yaml'))
 
-    def make(skew=0.05, joint_names=('a', 'b'), size=(96, 72)):
+    def make(skew=0.05, joint_names=('a', 'b'), size=(96, 72), own_size=False, seen=None):
         limits = NodeSettings(max_view_skew_s=skew)
         buffer = ObservationBuffer(
             cameras=[cameras[view] for view in ('low', 'high')],
             joint_names=joint_names,
             width=size[0],
             height=size[1],
+            own_size=own_size,
             limits=lambda: limits,
         )
-        for view in ('low', 'high'):
-            buffer.add_camera_info(view, ros.make_info(view))
+        for number, view in enumerate(('low', 'high')):
+            info = ros.make_info(view)
+            if seen is not None:
+                info.width, info.height = seen[number]
+                focal, x, y = info.width, (info.width - 1) / 2, (info.height - 1) / 2
+                info.k = [focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0]
+            buffer.add_camera_info(view, info)
         return buffer
 
     return make
@@ -44,6 +50,31 @@ def shade(ros, view, stamp_ns, value):
     image = ros.make_image(view, stamp_ns)
     image.data = bytes([value]) * len(image.data)
     return image
+
+
+@pytest.mark.parametrize(
+    ('seen', 'wanted'),
+    [
+        ([(384, 288), (384, 288)], (384, 288)),
+        ([(384, 288), (320, 240)], (384, 288)),
+        ([(1920, 1080), (640, 480)], (739, 416)),
+        ([(64, 48), (64, 48)], (64, 48)),
+    ],
+)
+def test_objects_are_looked_for_at_the_size_of_the_images(make_buffer, ros, seen, wanted):
+    buffer = make_buffer(own_size=True, seen=seen)
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view, (width, height) in zip(('low', 'high'), seen, strict=True):
+        image = ros.make_image(view, NOW)
+        image.width, image.height, image.step = width, height, 3 * width
+        image.encoding, image.data = 'rgb8', bytes(3 * width * height)
+        buffer.add_image(view, image)
+    found = buffer.observe(NOW).observation
+    assert found.frames.shape == (2, wanted[1], wanted[0], 3)
+    for camera in found.cameras:
+        assert (camera.width, camera.height) == wanted
+        assert camera.K[0, 2] == pytest.approx((wanted[0] - 1) / 2)
+        assert camera.K[1, 2] == pytest.approx((wanted[1] - 1) / 2)
 
 
 def test_views_that_arrive_one_after_the_other_are_paired_by_stamp(make_buffer, ros):
