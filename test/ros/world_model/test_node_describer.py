@@ -10,7 +10,6 @@ import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages.image_messages import to_rgb
 
 pytest.importorskip('openai')
@@ -51,7 +50,9 @@ def test_objects_that_the_model_names_are_found_and_reported(start, ros, tmp_pat
     client.close()
     text, picture = asked(server.requests[0])
     assert 'tidy up' in text
-    np.testing.assert_array_equal(picture, resize_frames(ros.make_pixels('low')[None], 48, 36)[0])
+    np.testing.assert_array_equal(
+        picture, ros.make_pixels('low')
+    )  # not shrunk to the model's size
     assert chunk['mask_status.low.blue_block'] == 'ok'
     assert 'mask_status.low.red_block' not in chunk
     assert np.unique(labels).tolist() == [0, 1]
