@@ -50,9 +50,7 @@ def test_objects_that_the_model_names_are_found_and_reported(start, ros, tmp_pat
     client.close()
     text, picture = asked(server.requests[0])
     assert 'tidy up' in text
-    np.testing.assert_array_equal(
-        picture, ros.make_pixels('low')
-    )  # not shrunk to the model's size
+    np.testing.assert_array_equal(picture, ros.make_pixels('low'))  # as it was seen
     assert chunk['mask_status.low.blue_block'] == 'ok'
     assert 'mask_status.low.red_block' not in chunk
     assert np.unique(labels).tolist() == [0, 1]
