@@ -206,7 +206,8 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for number, reason in summary.failed.items():
         print(f'episode {number}: {reason}', file=sys.stderr)
-    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    if summary.made or summary.kept:
+        print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
     return 1 if summary.failed else 0
 
 

@@ -109,15 +109,17 @@ def import_dataset(
             f'{known[0] if known else "-"} to {known[-1] if known else "-"}'
         )
 
-    save_robot(chosen.robot_file, out / 'robot')
     key = digest_of(start=stage.key + chosen.key.encode()) if stage.key else chosen.key
 
     def convert(number: int, path: Path) -> tuple[str, ...]:
         return convert_episode(source, source.episodes[number], chosen, path, stage, key)
 
-    return import_each(
+    summary = import_each(
         progress(wanted), key, lambda number: out / f'episode_{number:06d}', convert
     )
+    if summary.made or summary.kept:
+        save_robot(chosen.robot_file, out / 'robot')
+    return summary
 
 
 def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
