@@ -254,7 +254,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'herd': _kind(
         'collision',
-        'test',
+        'train',
         0.06,
         0.1,
         'm',
@@ -262,7 +262,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'rub': _kind(
         'collision',
-        'test',
+        'train',
         0.09,
         0.12,
         'm',
@@ -270,7 +270,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'crowd': _kind(
         'collision',
-        'test',
+        'train',
         0.9,
         1.0,
         '',
@@ -368,14 +368,14 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'couple': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.1,
         0.3,
         'rad',
         'standard deviation of how far each joint of an arm goes along as its gripper closes',
     ),
     'coarse': _kind(
-        'joint', 'test', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
+        'joint', 'calibrate', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
     ),
     # regrasp
     'retry': _kind(
@@ -399,7 +399,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'juggle': _kind(
         'regrasp',
-        'test',
+        'train',
         0.08,
         0.15,
         'm',
