@@ -31,6 +31,9 @@ _FAR = 1e3
 _NUM_TOOL_CLEARANCES, _NUM_OBJECT_CLEARANCES = 7, 3
 #: heights of two fingertips over bottom and top, now and next
 _NUM_FINGERTIP_HEIGHTS = 2 * 4
+#: standard deviation along x and y of an error in the plane whose mean length is 1; the largest of
+#: a step [m]. A yaw errs by as much of a turn as the place of 5 cm
+_EXPECTED, _LARGEST_ERROR_M = 0.8, 0.05
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
 
@@ -248,6 +251,7 @@ class ObjectMotionNetwork(nn.Module):
         skip: int = 0,
         truth: tuple[Tensor, Tensor] | None = None,
         forced: Tensor | None = None,
+        errors: Tensor | None = None,
     ) -> tuple[Motion, Memory]:
         """Returns the motion and what the next call is given.
 
@@ -257,6 +261,9 @@ class ObjectMotionNetwork(nn.Module):
             skip: rows of the tools that only show what was before: 1 where `memory` is given.
             truth: see `forward`.
             forced: see `forward`.
+            errors: (B, T, O, 3) standard normal numbers: by how many of the errors that the
+                network expects of each step it errs along x, along y and in the yaw; None = a
+                motion without them. What falls or is pushed may then end anywhere that it might.
         """
         extents = self._extents(scene)
         now = memory or self._begin(scene)
@@ -278,6 +285,8 @@ class ObjectMotionNetwork(nn.Module):
                 extents.turned(now.rotations),
                 now,
             )
+            if errors is not None:
+                moved, turned = _erring(moved, turned, more, errors[:, step - skip])
             now = Memory(
                 points=moved,
                 rotations=turned,
@@ -432,6 +441,14 @@ class ObjectMotionNetwork(nn.Module):
         edge = self.object_edge(torch.cat(inputs, dim=-1))
         pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=offset.device)
         return (edge * pairs[..., None]).sum(2)
+
+
+def _erring(moved: Tensor, turned: Tensor, more: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (B, O, 3) and rotations (B, O, 3, 3) with errors (B, O, 3), see `roll`."""
+    size = (_EXPECTED * more).clamp(max=_LARGEST_ERROR_M)[..., None]
+    plane = F.pad(size * errors[..., :2], (0, 1))
+    yaw = F.pad(size * errors[..., 2:] * _SCALE, (2, 0))
+    return moved + plane, _rotation(yaw) @ turned
 
 
 def _kept(blocks: Sequence[tuple[int, int]]) -> list[int]:

@@ -69,7 +69,7 @@ class ObjectMotionPredictor:
         members: the first says what is expected.
         robot: gives tools and grippers.
         num_disturbed: motions beside the expected one, from places and sizes within the error of
-            what masks tell.
+            what masks tell, and with the errors that the networks expect of themselves.
     """
 
     def __init__(
@@ -98,6 +98,31 @@ class ObjectMotionPredictor:
         """Returns (K, O, 3) places and (K, O, V, F) features; row 0 as they are."""
         item = np.arange(len(points)) % _MAX_OBJECTS
         return points + self._places[:, item], features * self._scales[:, item]
+
+    def errors(
+        self, motions: Sequence[int] | np.ndarray, first: int, count: int, num_objects: int
+    ) -> FloatArray:
+        """Returns (K, T, O, 3) errors of some motions, see `ObjectMotionNetwork.roll`.
+
+        They depend on the step since the objects were found alone, not on how a plan is cut into
+        chunks; those of the expected motion are none.
+
+        Args:
+            motions: K numbers.
+            first: step since the objects were found.
+            count: T steps.
+            num_objects: O.
+        """
+        shape = (len(self._places), _MAX_OBJECTS, 3)
+        drawn = np.stack(
+            [
+                np.random.default_rng((1, step)).normal(size=shape)
+                for step in range(first, first + count)
+            ],
+            axis=1,
+        )
+        drawn[0] = 0.0
+        return drawn[np.asarray(motions)][:, :, np.arange(num_objects) % _MAX_OBJECTS]
 
     def find(
         self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
@@ -177,12 +202,18 @@ class TrackedObjects:
                 tools=_tensor(tools).expand(len(rows), -1, -1, -1, -1),
                 gaps=_tensor(gaps).expand(len(rows), -1, -1),
             )
+            errors = self.model.errors(rows, last.steps if last else 0, len(tools) - 2, known.size)
             with torch.inference_mode():
-                motion, memory = member.network.roll(scene, last and last.memory, skip=1)
+                motion, memory = member.network.roll(
+                    scene, last and last.memory, skip=1, errors=_tensor(errors)
+                )
             ways = motion.points.double().numpy() - places[rows, None]
             points += list(np.where(known[:, None], self.reference + ways, np.nan))
             rotations += list(motion.rotations.double().numpy())
-            thens.append(_Before(memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms))
+            steps = (last.steps if last else 0) + len(tools) - 2
+            thens.append(
+                _Before(memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms, steps=steps)
+            )
         moved = tuple(
             ObjectMotion(reference=self.reference, points=way, rotations=turns)
             for way, turns in zip(points, rotations, strict=True)
@@ -199,12 +230,14 @@ class _Before:
         tools: (A, 4, 4) T_base_tool one step before.
         gaps: (A,) one step before [m].
         arms: where the arms really are by now, with a response.
+        steps: since the objects were found.
     """
 
     memory: Memory
     tools: FloatArray
     gaps: FloatArray
     arms: ArmState | None
+    steps: int
 
 
 def _tools(

@@ -117,6 +117,25 @@ def test_padding_changes_nothing_and_rotations_stay_rotations(network):
     assert (alone.held.sum(-1) <= 1 + 1e-5).all() and (alone.spread.diff(dim=1) >= 0).all()
 
 
+def test_a_motion_errs_by_what_the_network_expects(network):
+    with torch.no_grad():
+        network.scale.bias.fill_(-2.0)  # some 6 mm a step
+    given, steps, count = scene(3, 3), STEPS, 400
+    many = Scene(**{name: getattr(given, name).expand(count, *getattr(given, name).shape[1:])
+                    for name in given.__slots__})  # fmt: skip
+    errors = torch.zeros(count, steps, 3, 3)
+    errors[1:, 0] = torch.randn(count - 1, 3, 3, generator=torch.Generator().manual_seed(2))
+    with torch.inference_mode():
+        motion, _ = network.roll(many, errors=errors)
+        plain = network(given)
+    torch.testing.assert_close(motion.points[:1], plain.points)
+    apart = motion.points[1:, 1] - plain.points[:, 1]
+    assert apart[..., 2].abs().max() < 1e-6  # nothing sinks into the table
+    expected = plain.spread[0, 1] - plain.spread[0, 0]
+    torch.testing.assert_close(apart.norm(dim=-1).mean(0), expected, rtol=0.1, atol=0.0)
+    assert (motion.rotations[1:, 1] - plain.rotations[:, 1]).abs().amax() > 0.05
+
+
 def test_a_shift_of_the_whole_scene_in_the_plane_shifts_the_answer(network):
     given, way = scene(2, 2), torch.tensor([0.3, -0.2, 0.0])
     tools = given.tools.clone()
@@ -153,9 +172,12 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network,
     )
     (whole, *disturbed), _ = tracked.advance(positions)
     assert tracked.commands_a_step == 5 and len(whole.points) == 9
-    (first, *_), later = tracked.advance(positions[:21])
-    (second, *_), _ = later.advance(positions[20:])
+    (first, *parts), later = tracked.advance(positions[:21])
+    (second, *more), _ = later.advance(positions[20:])
     assert len(disturbed) > 5
+    for motion, part, rest in zip(disturbed, parts, more, strict=True):
+        points = np.concatenate([part.points[:, 0], rest.points[1:, 0]])
+        np.testing.assert_allclose(points, motion.points[:, 0], atol=1e-5)
     for motion in disturbed:  # of other places, told from where the object was found
         np.testing.assert_allclose(motion.points[0, 0], tracked.reference[0])
         assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
