@@ -135,6 +135,18 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
     ),
     'test': (
         'expert',
+        'expert-snap-0.04',
+        'expert-snap-0.045',
+        'expert-cut-0.07',
+        'expert-cut-0.1',
+        'expert-rival-0.85',
+        'expert-rival-1',
+        'expert-torn-0.08',
+        'expert-torn-0.1',
+        'expert-lash-0.07',
+        'expert-lash-0.1',
+        'expert-tidy-0.04',
+        'expert-tidy-0.06',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

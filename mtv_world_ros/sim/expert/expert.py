@@ -255,10 +255,10 @@ class Expert:
         for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = usual = self._stops(pick, move, now, goal, rng)
-            share = 0.0
+            crowds: dict[str, float] = {}
             if faults is not None and number == faults.move_of(len(task.moves)):
                 objects = [np.asarray(item.position) for item in now.values()]
-                stops, share = faults.applied(stops, pick.yaw, objects), faults.crowds
+                stops, crowds = faults.applied(stops, pick.yaw, objects), faults.crowds
                 usual = usual if faults.keeps_tempo else stops
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
             rows = self._follow(pick.arm, stops, pace)
@@ -267,12 +267,12 @@ class Expert:
             busy = free[pick.arm] = start + len(rows)
             last_arm = pick.arm
             positions = self._lay(positions, rows, start, pick.arm)
-            other = next((arm for arm in self._tools if arm != pick.arm), None)
-            if share and other is not None:
-                rows, before = self._crowd(pick.arm, other, stops, share, pace)
-                first = max(start + before, free.get(other, 1))
-                free[other] = first + len(rows)
-                positions = self._lay(positions, rows, first, other)
+            others = [arm for arm in self._tools if arm != pick.arm]
+            for phase, share in crowds.items() if others else ():
+                rows, before = self._crowd(pick.arm, others[0], stops, phase, share, pace)
+                first = max(start + before, free.get(others[0], 1))
+                free[others[0]] = first + len(rows)
+                positions = self._lay(positions, rows, first, others[0])
             now[move.subject] = replace(now[move.subject], position=goal)
         return JointTrajectory(
             joint_names=self.robot.joint_names,
@@ -400,16 +400,17 @@ class Expert:
         arm: str,
         other: str,
         stops: list[WayPoint],
+        phase: str,
         share: float,
         pace: tuple[float, float],
     ) -> tuple[FloatArray, int]:
-        """Rows of another arm that comes where this one lets go, and how much later they begin.
+        """Rows of another arm that comes where this one is in a phase, and how late they begin.
 
         It goes a share of the way, or as much of it as it reaches, and is there just then.
         """
-        opened, home = [s.phase for s in stops].index('open'), self.workcell.home_tools[other]
+        met, home = [s.phase for s in stops].index(phase), self.workcell.home_tools[other]
         while True:
-            there = home + share * (stops[opened].position - home)
+            there = home + share * (stops[met].position - home)
             near = WayPoint('above', there, 0.0, 1.0)
             ways = [near, replace(near, seconds=_STAYS_S), WayPoint('home', home, 0.0, 1.0)]
             try:
@@ -419,7 +420,7 @@ class Expert:
                     raise
                 share = max(share - _LESS, 0.0)
                 continue
-            arrives = sum(self._timed(stops[:opened], self.workcell.home_tools[arm]))
+            arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
             begins = (arrives - self._timed(ways, home)[0]) * pace[0] / pace[1]
             return rows, max(round(begins * self._config.rate_hz), 0)
 

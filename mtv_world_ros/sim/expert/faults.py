@@ -80,6 +80,9 @@ FAULTS: Mapping[str, FaultKind] = {
     'late': _kind('timing', 'train', 0.6, 3.0, 's', 'the grippers follow this much later'),
     'early': _kind('timing', 'train', 0.5, 2.0, 's', 'the grippers go this much ahead'),
     'hasty': _kind('timing', 'train', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
+    'snap': _kind(
+        'timing', 'test', 0.045, 0.09, 'm', 'the fingers close over the last part of the way down'
+    ),
     'soft': _kind(
         'timing', 'train', 0.6, 1.5, 's', 'time constant with which the grippers follow'
     ),
@@ -241,6 +244,14 @@ FAULTS: Mapping[str, FaultKind] = {
     'sweep': _kind(
         'collision', 'train', 0.02, 0.1, 'm', 'shut fingers push the object before the grasp'
     ),
+    'cut': _kind(
+        'collision',
+        'test',
+        0.1,
+        0.2,
+        'm',
+        'it comes down this far before its goal, and slides in from there',
+    ),
     'mirror': _kind(
         'collision',
         'calibrate',
@@ -276,9 +287,20 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of the way that the other arm comes to where the object is let go',
     ),
+    'rival': _kind(
+        'collision',
+        'test',
+        0.9,
+        1.0,
+        '',
+        'share of the way that the other arm comes to where an object is grasped',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
+    ),
+    'torn': _kind(
+        'object', 'test', 0.1, 0.5, '', 'share of the way to the next object that a grasp is off'
     ),
     'meddle': _kind(
         'object',
@@ -377,6 +399,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'coarse': _kind(
         'joint', 'calibrate', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
     ),
+    'lash': _kind('joint', 'test', 0.09, 0.4, 'rad', 'play of every arm joint'),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -412,6 +435,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.15,
         'm',
         'it takes the object again and carries it back this far',
+    ),
+    'tidy': _kind(
+        'regrasp',
+        'test',
+        0.05,
+        0.1,
+        'm',
+        'once done, shut fingers push the object this far, off its middle',
     ),
 }
 
@@ -589,7 +620,7 @@ _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
-_OF_TWO_ARMS = ('mirror', 'swap', 'crowd')
+_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival')
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -687,6 +718,7 @@ def _controller_faults(
     if variant.size('coarse'):
         positions = _coarse(positions, grippers, variant.size('coarse'), period)
         positions = np.clip(positions, robot.lower, robot.upper)
+    positions = _lash(positions, grippers, variant.size('lash') / 2)
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -877,6 +909,17 @@ def _coarse(positions: FloatArray, grippers: list[int], step: float, period: flo
     """(T, J): the arms are at multiples of `step` from the first row on, and jump between them."""
     away = positions - positions[0]
     whole = _smooth(positions[0] + step * np.rint(away / step), [], round(_JUMP_S / period))
+    whole[:, grippers] = positions[:, grippers]
+    return whole
+
+
+def _lash(positions: FloatArray, grippers: list[int], slack: float) -> FloatArray:
+    """(T, J): an arm joint stays where it is until its command is more than `slack` off."""
+    if not slack:
+        return positions
+    whole = positions.copy()
+    for row in range(1, len(whole)):
+        whole[row] = np.clip(whole[row - 1], positions[row] - slack, positions[row] + slack)
     whole[:, grippers] = positions[:, grippers]
     return whole
 

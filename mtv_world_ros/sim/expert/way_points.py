@@ -29,8 +29,12 @@ _NUM_CIRCLE, _CIRCLE_S = 8, 0.25
 _HERD_BESIDE_M = 0.02
 #: shut fingers press on what was put down: share of the way down to where they let go
 _RUB_DEPTH = 0.75
+#: standard deviation of how far off its middle shut fingers push what was put down [m]
+_TIDY_BESIDE_M = 0.02
 #: kinds whose added way points leave the others their time
-_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle'))
+_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle', 'cut', 'tidy'))
+#: phases in which another arm comes where this one is, and the kind of fault that it is
+_CROWDED = {'close': 'rival', 'open': 'crowd'}
 #: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
 #: high over it, how much it rises before and after [m]; standard deviations beside the centre [m],
 #: of yaw and lean [rad]
@@ -95,9 +99,10 @@ class WayPointFaults:
         return not _KEEP_TEMPO.isdisjoint(self._variant.kinds)
 
     @property
-    def crowds(self) -> float:
-        """The share of the way that another arm comes to where this one lets go."""
-        return self._variant.size('crowd')
+    def crowds(self) -> dict[str, float]:
+        """Phases in which another arm comes where this one is, by which share of its way."""
+        sizes = {phase: self._variant.size(kind) for phase, kind in _CROWDED.items()}
+        return {phase: size for phase, size in sizes.items() if size}
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -187,6 +192,15 @@ def _slide(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('above', 'grasp'), lambda stop: stop.moved(size * side.along))
 
 
+def _torn(stops: Stops, size: float, side: _Side) -> Stops:
+    """It grasps between its object and the nearest other one."""
+    grasp = stops[_first(stops, 'close')].position
+    ways = [(place - grasp) * (1, 1, 0) for place in side.objects]
+    others = [way for way in ways if np.linalg.norm(way) > _VISIT_TO_M[1]]
+    way = size * min(others, key=np.linalg.norm, default=np.zeros(3))
+    return _changed(stops, _GRASP, lambda stop: stop.moved(way))
+
+
 def _turn(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, _GRASP, lambda s: replace(s, yaw=s.yaw + side.sign * size))
 
@@ -219,6 +233,10 @@ def _narrow(stops: Stops, size: float, side: _Side) -> Stops:
 
 def _hasty(stops: Stops, size: float, side: _Side) -> Stops:
     return _changed(stops, ('close',), lambda stop: stop.moved(_up(size)))
+
+
+def _snap(stops: Stops, size: float, side: _Side) -> Stops:
+    return _changed(stops, ('grasp',), lambda stop: stop.moved(_up(size)))
 
 
 def _flick(stops: Stops, size: float, side: _Side) -> Stops:
@@ -270,6 +288,15 @@ def _low_carry(stops: Stops, size: float, side: _Side) -> Stops:
         return replace(stop, position=np.array([x, y, max(z - size, min(z, floor))]))
 
     return _changed(stops, ('lift', 'carry'), lowered)
+
+
+def _cut(stops: Stops, size: float, side: _Side) -> Stops:
+    """It is as low as its goal before it is there, and slides in from where it comes from."""
+    lower = _first(stops, 'lower')
+    back = (stops[_first(stops, 'grasp')].position - stops[lower].position) * (1, 1, 0)
+    way = size * back / max(float(np.linalg.norm(back)), size)
+    low = replace(stops[lower], phase='carry').moved(way)
+    return [*stops[: lower - 1], stops[lower - 1].moved(way), low, *stops[lower:]]
 
 
 def _push(stops: Stops, size: float, side: _Side) -> Stops:
@@ -510,6 +537,20 @@ def _undo(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[: opened + 1], *(replace(stop, phase='retreat') for stop in again), *rest]
 
 
+def _tidy(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers come back down beside what they put there, and push it off its middle.
+
+    From another side, drawn anew, where the arm does not reach so far.
+    """
+    end, angle = _first(stops, 'retreat') + 1, side.play.uniform(0.0, 2 * np.pi)
+    opened, retreat = stops[end - 2 : end]
+    cos, sin = np.cos(angle), np.sin(angle)
+    beside = side.play.normal(0.0, _TIDY_BESIDE_M) * np.array([-sin, cos, 0.0])
+    rise = retreat.position - opened.position
+    push = _pushed(opened.moved(beside), size, rise, np.array([cos, sin, 0.0]))
+    return [*stops[:end], *push, *stops[end:]]
+
+
 def _wander(stops: Stops, size: float, side: _Side) -> Stops:
     floor = min(stop.position[2] for stop in stops)
 
@@ -525,6 +566,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'aside': _aside,
     'along': _along,
     'slide': _slide,
+    'torn': _torn,
     'turn': _turn,
     'lean': _lean,
     'loose': _loose,
@@ -534,6 +576,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'drops': _drops,
     'snag': _snag,
     'clutch': _clutch,
+    'snap': _snap,
     'flick': _flick,
     'blink': _blink,
     'play': _play,
@@ -543,6 +586,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'knock': _knock,
     'brush': _brush,
     'low_carry': _low_carry,
+    'cut': _cut,
     'push': _push,
     'sweep': _sweep,
     'stir': _stir,
@@ -553,5 +597,6 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'regrasp': _regrasp,
     'juggle': _juggle,
     'undo': _undo,
+    'tidy': _tidy,
     'wander': _wander,
 }

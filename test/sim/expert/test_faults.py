@@ -200,7 +200,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    for kind in ('mirror', 'swap', 'crowd'):
+    for kind in ('mirror', 'swap', 'crowd', 'rival'):
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
             with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
 
@@ -287,17 +287,90 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
     assert all(stop.position[0] == pytest.approx(-0.1) for stop in changed[4:10])
 
 
-@pytest.mark.parametrize(('kind', 'same'), [('rub', 0.8), ('juggle', 0.3)])
+@pytest.mark.parametrize(('kind', 'same'), [('rub', 0.8), ('juggle', 0.3), ('tidy', 0.8)])
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-0.08')
-    # four or six way points more take at least 0.4 s each
-    assert len(changed) > len(expert_plan) + 80
+    # four or six way points more take at least 0.4 s each, before scaling
+    assert len(changed) > len(expert_plan) + 60
     first = np.argmax(np.abs(changed[: len(expert_plan)] - expert_plan).max(axis=1) > 1e-12)
     assert first > same * len(expert_plan)
     if kind == 'juggle':
         # from the lift's height on over the half of the way that is left
         after = [row[-100:] for row in (expert_plan, changed)]
         np.testing.assert_allclose(after[0], after[1], atol=0.02)
+
+
+def test_fingers_snap_shut_over_the_last_part_of_the_way_down():
+    stops, changed = changed_stops('expert-snap-0.04')
+    assert changed[0] == stops[0] and changed[2:] == stops[2:]
+    grasp, close = changed[1:3]
+    np.testing.assert_allclose(grasp.position - close.position, [0, 0, 0.04], atol=1e-12)
+    assert (grasp.opening, close.opening) == (1, 0)
+
+
+def test_a_grasp_is_torn_between_its_object_and_the_nearest_other_one():
+    stops, _ = changed_stops('expert')
+    own, near, far = stops[1].position, np.array([0.1, 0.2, 0.05]), np.array([-0.2, 0.3, 0.03])
+    faults = WayPointFaults(parse_variant('expert-torn-0.2'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [far, near, own + [0.03, 0, 0]])
+    ways = [b.position - a.position for a, b in zip(stops[:3], changed[:3], strict=True)]
+    np.testing.assert_allclose(ways, np.broadcast_to([0.02, -0.02, 0], (3, 3)), atol=1e-12)
+    assert changed[3:] == stops[3:]
+    assert [stop.phase for stop in faults.applied(stops, 0.0, [own])] == [s.phase for s in stops]
+
+
+@pytest.mark.parametrize('away', [0.06, 0.2])
+def test_it_cuts_the_corner_and_slides_in_from_where_it_comes_from(away):
+    stops, changed = changed_stops(f'expert-cut-{away}')
+    assert changed[:4] == stops[:4] and changed[-4:] == stops[-4:] and len(changed) == 10
+    over, low, lower = changed[4:7]
+    np.testing.assert_allclose(over.position - stops[4].position, [away, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(low.position - lower.position, [away, 0, 0], atol=1e-12)
+    assert over.opening == low.opening == 0 and low.phase == 'carry'
+
+
+def test_what_was_put_down_is_pushed_by_shut_fingers():
+    stops, changed = changed_stops('expert-tidy-0.05')
+    assert changed[:8] == stops[:8] and changed[-1] == stops[-1] and len(changed) == 13
+    push = changed[8:12]
+    assert all(stop.opening == 0 for stop in push)
+    ways = np.array([stop.position - stops[6].position for stop in push])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.1], atol=1e-12)
+    # from 7 cm before to 2 cm behind, by a way beside the middle
+    np.testing.assert_allclose(ways[[0, 2], :2], ways[[1, 3], :2], atol=1e-12)
+    way = (ways[2] - ways[1]) / 0.09
+    assert np.linalg.norm(way) == pytest.approx(1)
+    assert (ways[1] @ way, ways[2] @ way) == pytest.approx((-0.07, 0.02))
+    assert 1e-3 < np.linalg.norm(ways[1] + 0.07 * way) < 0.08
+
+
+def test_the_other_arm_comes_where_an_arm_grasps(expert):
+    expert_plan, rival = plan(expert, 'expert'), plan(expert, 'expert-rival-0.5')
+    openings = expert.robot.gripper_openings(expert_plan)
+    used = int(np.argmax(np.ptp(openings, axis=1)))
+    own, other = (half if used == 0 else 1 - half for half in (0, 1))
+    halves = [np.split(positions, 2, axis=1) for positions in (expert_plan, rival)]
+    np.testing.assert_array_equal(halves[1][own][: len(expert_plan)], halves[0][own])
+    grasps = int(np.argmax(openings[used] < openings[used][0] - 1e-3))
+    tools = [poses[:, :3, 3] for poses in expert.robot.tool_poses(rival)]
+    home = tools[other][0]
+    np.testing.assert_allclose(
+        tools[other][grasps], home + 0.5 * (tools[own][grasps] - home), atol=2e-3
+    )
+
+
+def test_joints_with_play_stay_until_their_command_is_off_by_half_of_it(expert):
+    expert_plan, lash = plan(expert, 'expert'), plan(expert, 'expert-lash-0.1')
+    arms = arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    np.testing.assert_array_equal(lash[:, grippers], expert_plan[:, grippers])
+    off = np.abs(lash - expert_plan)
+    assert off.max() == pytest.approx(0.05)
+    stays = np.abs(np.diff(lash[:, arms], axis=0)) < 1e-12
+    # whatever moves is dragged along at the end of its play
+    np.testing.assert_allclose(off[1:, arms][~stays], 0.05, atol=1e-9)
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0.2]
+    assert (off[-1, moves] > 1e-3).all()
 
 
 def test_the_other_arm_comes_where_an_arm_lets_go(expert):
@@ -318,9 +391,10 @@ def test_the_other_arm_comes_where_an_arm_lets_go(expert):
     assert expert.robot.gripper_openings(crowd)[other].min() == pytest.approx(1)
 
 
-def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert):
+@pytest.mark.parametrize('kind', ['crowd', 'rival'])
+def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert, kind):
     plans = []
-    for name in ('expert', 'expert-crowd-1'):
+    for name in ('expert', f'expert-{kind}-1'):
         policy = scripted_policy(name, 'move_object_two', SEED, expert)
         policy.reset(seed=SEED)
         plans.append(policy.plan.positions)
@@ -359,7 +433,23 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
     assert np.abs(coarse - expert_plan).max() < 0.11 and np.abs(coarse - expert_plan).max() > 0.04
 
 
-@pytest.mark.parametrize('kind', ['herd', 'rub', 'crowd', 'couple', 'coarse', 'juggle'])
+@pytest.mark.parametrize(
+    'kind',
+    [
+        'herd',
+        'rub',
+        'crowd',
+        'couple',
+        'coarse',
+        'juggle',
+        'snap',
+        'cut',
+        'rival',
+        'torn',
+        'lash',
+        'tidy',
+    ],
+)
 def test_sizes_out_of_range_are_refused(kind):
     largest = FAULTS[kind].largest
     assert parse_variant(f'expert-{kind}-{largest:g}').size(kind) == largest
@@ -417,9 +507,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-couple-0.1-high-0.1' has couple"
+    said = r"split test are not for training: 'expert-high-0.1-torn-0.1' has torn"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-couple-0.1-high-0.1'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-torn-0.1'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
