@@ -29,7 +29,7 @@ from mtv_world_ros.data_types import (
 from mtv_world_ros.errors import DescriptionError, EpisodeError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.resample import match_joints, nearest_rows, resample
+from mtv_world_ros.geometry.resample import cut_off, match_joints, nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.rendering.images import resize_frames, resize_labels
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
@@ -442,19 +442,7 @@ def commands_until(recording: Recording, start: int, seconds: float) -> JointTra
     All of them, as they were sent: what is quicker than the frames decides about contact. They
     end at that time; past their own end the arms hold still.
     """
-    due = commands_from(recording, start)
-    kept = due.times < seconds - 1e-6
-    end = resample(due, recording.positions[start], np.array([seconds]))
-    velocities = due.velocities
-    if velocities is not None:
-        last = [np.interp(seconds, due.times, column, right=0.0) for column in velocities.T]
-        velocities = np.vstack([velocities[kept], last])
-    return JointTrajectory(
-        joint_names=due.joint_names,
-        times=np.append(due.times[kept], seconds),
-        positions=np.vstack([due.positions[kept], end]),
-        velocities=velocities,
-    )
+    return cut_off(commands_from(recording, start), recording.positions[start], seconds)
 
 
 #: to be increased when the stored data or their computation change

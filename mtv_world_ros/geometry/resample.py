@@ -11,6 +11,8 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, TrajectoryError
 from mtv_world_ros.geometry.robot import RobotModel
 
+#: points nearer to a time than this are at that time [s]
+SAME_S = 1e-6
 #: a first point this early stands for the start itself [s]
 _NOW = 1e-9
 
@@ -121,6 +123,31 @@ def resample(
         (1 + 2 * s) * (1 - s) ** 2 * values[left]
         + s**2 * (3 - 2 * s) * values[right]
         + s * (1 - s) * ((1 - s) * slopes[left] - s * slopes[right]) * width
+    )
+
+
+def cut_off(
+    trajectory: JointTrajectory, start_positions: FloatArray, seconds: float
+) -> JointTrajectory:
+    """Returns the points before a time, and one at that time; past its end it holds still.
+
+    Args:
+        trajectory: joints in the order of `start_positions`.
+        start_positions: (J,) positions at time 0.
+        seconds: where it is cut [s].
+    """
+    kept = trajectory.times < seconds - SAME_S
+    end = resample(trajectory, start_positions, np.array([seconds]))
+    velocities = trajectory.velocities
+    if velocities is not None:
+        columns = velocities.T
+        last = [np.interp(seconds, trajectory.times, column, right=0.0) for column in columns]
+        velocities = np.vstack([velocities[kept], last])
+    return JointTrajectory(
+        joint_names=trajectory.joint_names,
+        times=np.append(trajectory.times[kept], seconds),
+        positions=np.vstack([trajectory.positions[kept], end]),
+        velocities=velocities,
     )
 
 

@@ -261,10 +261,15 @@ def check_plausible(request: Any, robot: Any) -> None:
     assert 0 <= trajectory.times[-1] < 3600, 'duration'
     measured = observation.positions
     assert np.isfinite(measured).all() and (np.abs(measured) < 10).all(), 'measured joints'
-    assert observation.frames.shape == (2, 36, 48, 3) and observation.frames.dtype == np.uint8
+    views, height, width, channels = observation.frames.shape
+    assert (views, channels) == (2, 3) and observation.frames.dtype == np.uint8
+    assert min(width, height) > 0 and width * height < 1.01 * 640 * 480, 'size of the frames'
     for camera in observation.cameras:
         focal = camera.K[[0, 1], [0, 1]]
         assert np.isfinite(camera.K).all(), 'intrinsics'
         assert (focal > 2).all() and (focal < 5000).all(), 'focal lengths'
-        assert -1 < camera.K[0, 2] < 49 and -1 < camera.K[1, 2] < 37, 'principal point'
+        assert (camera.width, camera.height) == (width, height), 'size of the cameras'
+        assert -1 < camera.K[0, 2] < width + 1 and -1 < camera.K[1, 2] < height + 1, (
+            'principal point'
+        )
         assert np.isfinite(camera.distortion).all(), 'distortion'

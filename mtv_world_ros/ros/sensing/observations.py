@@ -64,10 +64,9 @@ class ObservationBuffer:
     Args:
         cameras: calibrated cameras of the V views, in the model's order.
         joint_names: J names, in the robot's order.
-        width: width of the model's frames [px].
+        width: width of the model's frames [px]. Observations are of the images' own size, which
+            shows better where objects are, but for very large ones that are larger than these.
         height: height of the model's frames [px].
-        own_size: observations are of the images' own size, which shows better where objects are,
-            but for very large ones; else of the model's.
         limits: asked at every observation, so that they may change.
         on_image: also gets every image that is stored.
         pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
@@ -81,14 +80,13 @@ class ObservationBuffer:
         joint_names: Sequence[str],
         width: int,
         height: int,
-        own_size: bool = False,
         limits: Callable[[], NodeSettings],
         on_image: Callable[[str, Image | CompressedImage], None] | None = None,
         pose: Callable[[str, str, int], Mount | None] | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras)
         self._pose = pose
-        self._size, self._own_size = (width, height), own_size
+        self._size = (width, height)
         self._limits, self._on_image = limits, on_image
         self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
             camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
@@ -206,7 +204,7 @@ class ObservationBuffer:
         images = self._pick_images(now_ns, limits)
         stamp_ns = min(stamp for stamp, _ in images)
         shown = [image_messages.to_rgb(message) for _, message in images]
-        size = _common_size(shown, self._size) if self._own_size else self._size
+        size = _common_size(shown, self._size)
         cameras, frames = [], []
         for view, (_, message), frame in zip(self.views, images, shown, strict=True):
             camera = self._intrinsics.camera(view, width=frame.shape[1], height=frame.shape[0])
@@ -287,7 +285,7 @@ def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[i
     """Width and height of the largest frame; smaller where it has vastly many pixels."""
     height, width = max((frame.shape[:2] for frame in frames), key=prod)
     shrink = min(1.0, sqrt(max(_MOST_PIXELS, prod(least)) / (width * height)))
-    return round(shrink * width), round(shrink * height)
+    return max(round(shrink * width), 1), max(round(shrink * height), 1)
 
 
 class Intrinsics:

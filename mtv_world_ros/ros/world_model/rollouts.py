@@ -97,7 +97,6 @@ class Rollouts:
             joint_names=self._robot.joint_names,
             width=self._spec.width,
             height=self._spec.height,
-            own_size=True,
             limits=settings,
             on_image=self._on_image,
             pose=self._live.pose,

@@ -18,14 +18,13 @@ MS = 1_000_000
 def make_buffer(ros, tmp_path):
     cameras = load_calibration(ros.make_calibration(tmp_path / 'calibration.yaml'))
 
-    def make(skew=0.05, joint_names=('a', 'b'), size=(96, 72), own_size=False, seen=None):
+    def make(skew=0.05, joint_names=('a', 'b'), seen=None):
         limits = NodeSettings(max_view_skew_s=skew)
         buffer = ObservationBuffer(
             cameras=[cameras[view] for view in ('low', 'high')],
             joint_names=joint_names,
-            width=size[0],
-            height=size[1],
-            own_size=own_size,
+            width=96,
+            height=72,
             limits=lambda: limits,
         )
         for number, view in enumerate(('low', 'high')):
@@ -62,7 +61,7 @@ def shade(ros, view, stamp_ns, value):
     ],
 )
 def test_objects_are_looked_for_at_the_size_of_the_images(make_buffer, ros, seen, wanted):
-    buffer = make_buffer(own_size=True, seen=seen)
+    buffer = make_buffer(seen=seen)
     buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
     for view, (width, height) in zip(('low', 'high'), seen, strict=True):
         image = ros.make_image(view, NOW)
@@ -133,21 +132,6 @@ def test_an_image_from_the_future_is_forgotten_with_the_next(make_buffer, ros):
     for view in ('low', 'high'):
         buffer.add_image(view, ros.make_image(view, NOW))
     assert buffer.observe(NOW).observation.stamp_ns == NOW
-
-
-def test_frames_and_cameras_come_at_the_models_size(make_buffer, ros):
-    buffer = make_buffer(size=(48, 36))
-    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
-    for view in ('low', 'high'):
-        buffer.add_image(view, ros.make_image(view, NOW))
-    observation = buffer.observe(NOW).observation
-    assert observation.frames.shape == (2, 36, 48, 3)
-    assert [(c.view, c.width, c.height) for c in observation.cameras] == [
-        ('low', 48, 36),
-        ('high', 48, 36),
-    ]
-    blocks = ros.make_pixels('low')[42:50:2, 26:36:2]
-    np.testing.assert_allclose(observation.frames[0, 21:25, 13:18], blocks, atol=1)
 
 
 def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros):
