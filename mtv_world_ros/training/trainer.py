@@ -173,9 +173,15 @@ class Trainer:
         try:
             self.weights.worker.load_state_dict(given)
         except RuntimeError as error:
+            there, here = dict(loaded.transformer.config), dict(self.weights.worker.config)
+            differ = [
+                f'{name} is {there.get(name)} there and {value} here'
+                for name, value in here.items()
+                if not name.startswith('_') and there.get(name) != value
+            ]
             raise TrainingError(
-                f"'{folder}' does not fit the preset's transformer: {error}; give --preset the "
-                'one it was trained with, or leave --init out'
+                f"'{folder}' does not fit the preset's transformer: {'; '.join(differ) or error}. "
+                'Give --preset the one it was trained with, or leave --init out'
             ) from error
         self.weights.load(given)
         self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
