@@ -42,9 +42,13 @@ _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
-#: distances of two colours (root mean square of their channels) from which a pixel may have
-#: changed, and from which it surely has; grey levels do not tell a grey arm from a brown table
-_CHANGED = (4.0, 16.0)
+#: how changes are read: the share of a colour's brightness that counts, the distance of two
+#: colours (root mean square of their channels) from which a pixel may have changed, and that from
+#: which it surely has. Grey levels do not tell a grey arm from a brown table; but an arm's shadow
+#: on a table is all brightness. The reading is kept in which drawn and seen changes fit better
+_READINGS = ((1.0, 4.0, 16.0), (0.3, 6.0, 20.0))
+#: parts that move less are left out: an arm that rests says nothing [m]
+_STILL_M = 0.02
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
 _NUM_TRIED, _NUM_KEPT = 1500, 6
 #: measurements that the pixels of all frames are worth
@@ -101,7 +105,13 @@ class FixedCamera:
         self._camera = camera
         poses = robot.forward_kinematics(self._positions)
         moving = moving_links(robot)
-        self._parts = [part for part in shapes if part.link in moving]
+        self._parts = [
+            part
+            for part in shapes
+            if part.link in moving and _way(part, poses[part.link]) > _STILL_M
+        ]
+        if not self._parts:
+            raise _hardly_moves(camera.view)
         self._poses = {part.link: poses[part.link] for part in self._parts}
         self._points = np.concatenate(
             [_sample(part.points) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
@@ -122,11 +132,14 @@ class FixedCamera:
             CalibrationError: no pose explains the pictures.
         """
         T = self._camera.T_mount_camera
-        starts = [T] if guess else self._search(seed)
-        wide, middle = self._changes(*_WIDE), self._changes(*_MIDDLE)
-        found = [self._aligned(self._aligned(start, wide), middle) for start in starts]
-        T = max(found, key=lambda pose: self._fit(pose, middle))
-        near, fine = self._changes(*_NEAR), self._changes(*_FINE)
+        found = []
+        for reading in _READINGS:
+            wide, middle = self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading)
+            for start in [T] if guess else self._search(seed, reading):
+                pose = self._aligned(self._aligned(start, wide), middle)
+                found.append((self._fit(pose, middle), pose, reading))
+        _, T, reading = max(found, key=lambda one: one[0])
+        near, fine = self._changes(*_NEAR, reading), self._changes(*_FINE, reading)
         for sign in (1.0, -1.0):
             T = self._refined(T, near, sign * self._alike_steps(T, near))
         T = self._aligned(T, fine)
@@ -162,13 +175,11 @@ class FixedCamera:
                 used[list(pair)] += 1
                 pairs.append(pair)
         if len(pairs) < 8:
-            raise CalibrationError(
-                f"view '{self._camera.view}': the arm hardly moves in this recording; record one "
-                'in which all joints move'
-            )
+            raise _hardly_moves(self._camera.view)
         return np.array(pairs)
 
-    def _changes(self, width: int, blur: float) -> _Changes:
+    def _changes(self, width: int, blur: float, reading: tuple[float, float, float]) -> _Changes:
+        brightness, may, surely = reading
         small = shrunk(self._camera, width)
         size = small.width, small.height
         colours = [
@@ -177,8 +188,8 @@ class FixedCamera:
         ]
         seen = []
         for i, j in self._pairs:
-            apart = np.sqrt(((colours[i] - colours[j]) ** 2).mean(axis=-1))
-            changed = np.interp(apart, _CHANGED, (0.0, 1.0)).astype(np.float32)
+            apart = _colour_distance(colours[i], colours[j], brightness)
+            changed = np.interp(apart, (may, surely), (0.0, 1.0)).astype(np.float32)
             changed = cv2.medianBlur(changed, 3)  # noise is single pixels
             seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
         return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
@@ -301,10 +312,10 @@ class FixedCamera:
         )
         return moved(T, np.asarray(result.x) @ steps, self.centre)
 
-    def _search(self, seed: int) -> list[FloatArray]:
+    def _search(self, seed: int, reading: tuple[float, float, float]) -> list[FloatArray]:
         """The best of many upright cameras around the robot."""
         generator = np.random.default_rng(seed)
-        changes = self._changes(*_COARSE)
+        changes = self._changes(*_COARSE, reading)
         reach = float(np.linalg.norm(self._points.reshape(-1, 3) - self.centre, axis=1).max())
         narrowest = min(self._camera.width / self._camera.K[0, 0],
                         self._camera.height / self._camera.K[1, 1])  # fmt: skip
@@ -355,6 +366,29 @@ def _looking(
     aside = generator.normal(0, 0.25 * reach, 2)
     T[:3, 3] = centre - away * ahead + T[:3, :2] @ aside
     return T
+
+
+def _hardly_moves(view: str) -> CalibrationError:
+    return CalibrationError(
+        f"view '{view}': the arm hardly moves in this recording; record one in which all joints "
+        'move'
+    )
+
+
+def _colour_distance(
+    a: NDArray[np.float32], b: NDArray[np.float32], brightness: float
+) -> NDArray[np.floating]:
+    """(H, W) root mean square of the channels' differences, with a share of the brightness's."""
+    apart, both = a - b, a + b
+    along = (apart * both).sum(axis=-1) / np.maximum(np.linalg.norm(both, axis=-1), 1.0)
+    total = (apart**2).sum(axis=-1) - (1 - brightness**2) * along**2
+    return np.sqrt(np.maximum(total, 0.0) / apart.shape[-1])
+
+
+def _way(part: LinkShape, poses: FloatArray) -> float:
+    """How far a part's points get from where they are at first, at most [m]."""
+    points = _sample(part.points) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    return float(np.linalg.norm(points - points[0], axis=-1).max())
 
 
 def _sample(points: FloatArray, count: int = 12) -> FloatArray:
