@@ -15,7 +15,7 @@ from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import EpisodeSource
-    from mtv_world_ros.data.episode import Episode, Track
+    from mtv_world_ros.data.episode import Episode, JointStates, Track
     from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot import RobotModel
     from mtv_world_ros.inspection.camera_pose import CameraEstimate
@@ -245,11 +245,24 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     add_source(parser)
+    parser.add_argument(
+        '--between',
+        type=_interval,
+        metavar='FROM,TO',
+        help='only that part of the recording [s], e.g. before the hand takes something: 0,4',
+    )
     parser.add_argument('--seed', type=int, default=0, help='of the search')
     parser.add_argument(
         '--out', type=Path, help='calibration file to write; default: out/camera/<view>.yaml'
     )
     parser.set_defaults(handler=_calibrate_camera)
+
+
+def _interval(text: str) -> tuple[float, float]:
+    start, end = (float(word) for word in text.split(','))
+    if not 0 <= start < end:
+        raise argparse.ArgumentTypeError(f"'{text}'; it must be FROM,TO with 0 <= FROM < TO")
+    return start, end
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
@@ -324,7 +337,11 @@ def estimate_camera(
             f"'{episode.info.path}': the camera of view '{arguments.view}' moves by itself, with "
             'the poses of /tf; one that stands still or is on the arm can be estimated'
         )
-    joints = JointTrack(episode.joint_states, robot)
+    states = episode.joint_states
+    if arguments.between is not None:
+        start, end = arguments.between
+        states = _part(states, start, end, str(episode.info.path))
+    joints = JointTrack(states, robot)
     track, camera = episode.images[arguments.view], episode.cameras[arguments.view]
     link = arguments.mount_link or camera.mount_link
     on_arm = link in (*moving_links(robot), 'find')
@@ -340,6 +357,22 @@ def estimate_camera(
         on_link = replace(camera, mount_link=link)
         return WristCamera(tracks, on_link, robot).estimate(guess=arguments.guess)
     return _estimate_fixed(track, camera, link, robot, joints, arguments)
+
+
+def _part(states: JointStates, start: float, end: float, path: str) -> JointStates:
+    """Joint states between two times of the recording; frames outside are not used then."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    times = (states.stamps_ns - states.stamps_ns[0]) * 1e-9
+    chosen = np.flatnonzero((times >= start) & (times <= end))
+    if len(chosen) < 2:
+        raise ConfigError(
+            f"'{path}' has no joint states between {start:g} and {end:g} s: it is "
+            f'{times[-1]:.1f} s long'
+        )
+    return replace(states, stamps_ns=states.stamps_ns[chosen], positions=states.positions[chosen])
 
 
 def _estimate_fixed(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -42,9 +43,10 @@ _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
-#: distances of two colours (root mean square of their channels) from which a pixel may have
-#: changed, and from which it surely has; grey levels do not tell a grey arm from a brown table
-_CHANGED = (4.0, 16.0)
+#: parts that move less are left out: an arm that rests says nothing [m]
+_STILL_M = 0.02
+#: of the first search's sizes, the part that it looks at
+_ROUGH = 4
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
 _NUM_TRIED, _NUM_KEPT = 1500, 6
 #: measurements that the pixels of all frames are worth
@@ -53,6 +55,26 @@ _NUM_INDEPENDENT = 12
 _STEP = 5.0
 #: correlation below which a found pose explains the pictures no better than chance
 _LEAST_FIT = 0.45
+
+
+class _Reading(NamedTuple):
+    """How colours that change are read.
+
+    Attributes:
+        brightness: the share of a colour's brightness that counts.
+        may: distance of two colours (root mean square of their channels) from which a pixel may
+            have changed.
+        surely: that from which it surely has.
+    """
+
+    brightness: float
+    may: float
+    surely: float
+
+
+#: grey levels do not tell a grey arm from a brown table; but an arm's shadow on a table is all
+#: brightness. The reading is kept in which drawn and seen changes fit better
+_READINGS = (_Reading(1.0, 4.0, 16.0), _Reading(0.3, 6.0, 20.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +123,13 @@ class FixedCamera:
         self._camera = camera
         poses = robot.forward_kinematics(self._positions)
         moving = moving_links(robot)
-        self._parts = [part for part in shapes if part.link in moving]
+        self._parts = [
+            part
+            for part in shapes
+            if part.link in moving and _way(part, poses[part.link]) > _STILL_M
+        ]
+        if not self._parts:
+            raise _hardly_moves(camera.view)
         self._poses = {part.link: poses[part.link] for part in self._parts}
         self._points = np.concatenate(
             [_sample(part.points) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
@@ -122,11 +150,14 @@ class FixedCamera:
             CalibrationError: no pose explains the pictures.
         """
         T = self._camera.T_mount_camera
-        starts = [T] if guess else self._search(seed)
-        wide, middle = self._changes(*_WIDE), self._changes(*_MIDDLE)
-        found = [self._aligned(self._aligned(start, wide), middle) for start in starts]
-        T = max(found, key=lambda pose: self._fit(pose, middle))
-        near, fine = self._changes(*_NEAR), self._changes(*_FINE)
+        starts = [(T, reading) for reading in _READINGS] if guess else self._search(seed)
+        found = []
+        for start, reading in starts:
+            wide, middle = self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading)
+            pose = self._aligned(self._aligned(start, wide), middle)
+            found.append((self._fit(pose, middle), pose, reading))
+        _, T, reading = max(found, key=lambda one: one[0])
+        near, fine = self._changes(*_NEAR, reading), self._changes(*_FINE, reading)
         for sign in (1.0, -1.0):
             T = self._refined(T, near, sign * self._alike_steps(T, near))
         T = self._aligned(T, fine)
@@ -162,13 +193,10 @@ class FixedCamera:
                 used[list(pair)] += 1
                 pairs.append(pair)
         if len(pairs) < 8:
-            raise CalibrationError(
-                f"view '{self._camera.view}': the arm hardly moves in this recording; record one "
-                'in which all joints move'
-            )
+            raise _hardly_moves(self._camera.view)
         return np.array(pairs)
 
-    def _changes(self, width: int, blur: float) -> _Changes:
+    def _changes(self, width: int, blur: float, reading: _Reading) -> _Changes:
         small = shrunk(self._camera, width)
         size = small.width, small.height
         colours = [
@@ -177,9 +205,9 @@ class FixedCamera:
         ]
         seen = []
         for i, j in self._pairs:
-            apart = np.sqrt(((colours[i] - colours[j]) ** 2).mean(axis=-1))
-            changed = np.interp(apart, _CHANGED, (0.0, 1.0)).astype(np.float32)
-            changed = cv2.medianBlur(changed, 3)  # noise is single pixels
+            apart = _colour_distance(colours[i], colours[j], reading.brightness)
+            changed = np.interp(apart, (reading.may, reading.surely), (0.0, 1.0))
+            changed = cv2.medianBlur(changed.astype(np.float32), 3)  # noise is single pixels
             seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
         return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
 
@@ -301,47 +329,61 @@ class FixedCamera:
         )
         return moved(T, np.asarray(result.x) @ steps, self.centre)
 
-    def _search(self, seed: int) -> list[FloatArray]:
-        """The best of many upright cameras around the robot."""
+    def _search(self, seed: int) -> list[tuple[FloatArray, _Reading]]:
+        """The best of many upright cameras around the robot, and how each reads changes best."""
         generator = np.random.default_rng(seed)
-        changes = self._changes(*_COARSE)
+        changes = {reading: self._changes(*_COARSE, reading) for reading in _READINGS}
         reach = float(np.linalg.norm(self._points.reshape(-1, 3) - self.centre, axis=1).max())
         narrowest = min(self._camera.width / self._camera.K[0, 0],
                         self._camera.height / self._camera.K[1, 1])  # fmt: skip
+        rough = [_rough(one) for one in changes.values()]
         tried = []
         for _ in range(_NUM_TRIED):
             away = reach / narrowest * generator.uniform(0.7, 3.5)
             T = _looking(self.centre, away, reach, generator)
-            tried.append((self._rough_fit(T, changes), len(tried), T))
+            fits = self._rough_fits(T, changes[_READINGS[0]], rough)
+            tried.append((max(fits), len(tried), T, _READINGS[int(np.argmax(fits))]))
         tried.sort(reverse=True)
-        best: list[FloatArray] = []
-        for _, _, T in tried:
-            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other in best):
-                best.append(T)
+        best: list[tuple[FloatArray, _Reading]] = []
+        for _, _, T, reading in tried:
+            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
+                best.append((T, reading))
             if len(best) == _NUM_KEPT:
                 break
         steps = np.diag([0.25] * 3 + [0.1] * 3)
-        improved = [self._refined(T, changes, steps, evaluations=70) for T in best]
-        improved.sort(key=lambda T: -self._fit(T, changes))
+        improved = [
+            (self._refined(T, changes[reading], steps, evaluations=70), reading)
+            for T, reading in best
+        ]
+        improved.sort(key=lambda one: -self._fit(one[0], changes[one[1]]))
         return improved[:3]
 
-    def _rough_fit(self, T: FloatArray, changes: _Changes) -> float:
-        """As `_fit`, with points in place of silhouettes on a quarter of the size."""
-        width, height = changes.camera.width // 4, changes.camera.height // 4
-        pixels, _ = project(with_pose(changes.camera, T), T, self._points)
-        cells = np.floor(np.nan_to_num(pixels, nan=-99.0) / 4).astype(int)
+    def _rough_fits(
+        self, T: FloatArray, like: _Changes, rough: Sequence[NDArray[np.float32]]
+    ) -> list[float]:
+        """As `_fit`, with points in place of silhouettes, on each of `_rough`."""
+        width, height = like.camera.width // _ROUGH, like.camera.height // _ROUGH
+        pixels, _ = project(with_pose(like.camera, T), T, self._points)
+        cells = np.floor(np.nan_to_num(pixels, nan=-99.0) / _ROUGH).astype(int)
         inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
         flat = np.where(inside, cells[..., 1] * width + cells[..., 0], width * height)
         there = np.zeros((len(flat), width * height + 1), np.float32)
         there[np.arange(len(flat))[:, None], flat] = 1
-        differs = np.abs(np.diff(there[changes.pairs, :-1], axis=1)[:, 0])
+        differs = np.abs(np.diff(there[like.pairs, :-1], axis=1)[:, 0])
         differs -= differs.mean(axis=1, keepdims=True)
-        cropped = changes.seen[:, : height * 4, : width * 4]
-        blocks = cropped.reshape(len(cropped), height, 4, width, 4).mean(axis=(2, 4))
-        seen = blocks.reshape(len(blocks), -1)
-        seen = seen - seen.mean(axis=1, keepdims=True)
-        norm = np.linalg.norm(differs) * np.linalg.norm(seen)
-        return float((differs * seen).sum() / (norm + 1e-9))
+        norm = np.linalg.norm(differs) + 1e-9
+        return [float((differs * seen).sum() / norm) for seen in rough]
+
+
+def _rough(changes: _Changes) -> NDArray[np.float32]:
+    """(P, cells) seen changes of a part of the size, without their means, of length 1."""
+    pairs, height, width = changes.seen.shape
+    height, width = height // _ROUGH, width // _ROUGH
+    cropped = changes.seen[:, : height * _ROUGH, : width * _ROUGH]
+    cells = cropped.reshape(pairs, height, _ROUGH, width, _ROUGH).mean(axis=(2, 4))
+    seen = cells.reshape(pairs, -1)
+    seen = seen - seen.mean(axis=1, keepdims=True)
+    return seen / (np.linalg.norm(seen) + 1e-9)
 
 
 def _looking(
@@ -355,6 +397,29 @@ def _looking(
     aside = generator.normal(0, 0.25 * reach, 2)
     T[:3, 3] = centre - away * ahead + T[:3, :2] @ aside
     return T
+
+
+def _hardly_moves(view: str) -> CalibrationError:
+    return CalibrationError(
+        f"view '{view}': the arm hardly moves in this recording; record one in which all joints "
+        'move'
+    )
+
+
+def _colour_distance(
+    a: NDArray[np.float32], b: NDArray[np.float32], brightness: float
+) -> NDArray[np.floating]:
+    """(H, W) root mean square of the channels' differences, with a share of the brightness's."""
+    apart, both = a - b, a + b
+    along = (apart * both).sum(axis=-1) / np.maximum(np.linalg.norm(both, axis=-1), 1.0)
+    total = (apart**2).sum(axis=-1) - (1 - brightness**2) * along**2
+    return np.sqrt(np.maximum(total, 0.0) / apart.shape[-1])
+
+
+def _way(part: LinkShape, poses: FloatArray) -> float:
+    """How far a part's points get from where they are at first, at most [m]."""
+    points = _sample(part.points) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    return float(np.linalg.norm(points - points[0], axis=-1).max())
 
 
 def _sample(points: FloatArray, count: int = 12) -> FloatArray:

@@ -4,6 +4,7 @@ from dataclasses import replace
 import shutil
 
 from crane import load, make_cameras, make_positions, write_episode
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_shape import load_shape
+from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape
 from mtv_world_ros.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.fixed_camera import FixedCamera
@@ -60,6 +61,44 @@ def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
     mm, degrees = difference(door.T_mount_camera, found.camera.T_mount_camera)
     assert mm < 20 and degrees < 0.5, (mm, degrees)
     assert mm < 2 * found.std_mm
+
+
+def test_shadows_on_the_table_do_not_move_the_camera(tmp_path):
+    """Real arms cast soft shadows: here one lies beside the arm, a fifth darker than the rest."""
+    robot = load(tmp_path)
+    door = replace(make_cameras()['door'], mount_link='world')
+    path = write_episode(tmp_path / 'episode', robot, {'door': door}, make_positions(5.0))
+    episode = read_episode(path)
+    joints, parts = JointTrack(episode.joint_states, robot), load_shape(robot).parts
+    track = episode.images['door']
+    arm = draw_silhouettes(parts, door, robot, joints.at(track.stamps_ns))
+    frames = np.asarray(track.frames).astype(np.float32)
+    aside = np.roll(arm, (20, 40), axis=(1, 2))
+    soft = np.stack([cv2.GaussianBlur(one.astype(np.float32), (0, 0), 6) for one in aside])
+    frames *= 1 - 0.2 * np.where(arm, 0, soft)[..., None]
+    shaded = track._replace(frames=frames.astype(np.uint8))
+    change = moved(np.eye(4), np.array([0.05, -0.04, 0.08, 0.04, 0.03, -0.05]), np.zeros(3))
+    guess = replace(door, T_mount_camera=door.T_mount_camera @ change)
+    found = FixedCamera(shaded, guess, robot, parts, joints).estimate()
+    mm, degrees = difference(door.T_mount_camera, found.camera.T_mount_camera)
+    assert mm < 25 and degrees < 1.0, (mm, degrees, found.match)
+    assert found.match > 0.85
+
+
+def test_a_part_of_the_recording_is_enough(tmp_path, capsys):
+    robot = load(tmp_path)
+    door = replace(make_cameras()['door'], mount_link='world')
+    path = write_episode(tmp_path / 'episode', robot, {'door': door}, make_positions(5.0))
+    command = ['calibrate-camera', str(path), '--view', 'door', '--robot', str(robot.file)]
+    out = tmp_path / 'found.yaml'
+    assert main([*command, '--between', '0,4', '--out', str(out)]) == 0
+    mm, degrees = difference(door.T_mount_camera, load_calibration(out)['door'].T_mount_camera)
+    assert mm < 20 and degrees < 0.8, (mm, degrees)
+    assert main([*command, '--between', '90,99', '--out', str(tmp_path / 'none.yaml')]) == 1
+    assert 'no joint states between 90 and 99 s' in capsys.readouterr().err
+    for wrong in ('4,0', '3', 'a,b'):
+        with pytest.raises(SystemExit):
+            main([*command, '--between', wrong])
 
 
 def test_an_arm_that_stands_still_calibrates_nothing(tmp_path):
