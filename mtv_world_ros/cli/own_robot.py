@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
+import re
 import sys
 import tempfile
 from typing import TYPE_CHECKING
@@ -259,10 +260,10 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
 
 
 def _interval(text: str) -> tuple[float, float]:
-    start, end = (float(word) for word in text.split(','))
-    if not 0 <= start < end:
-        raise argparse.ArgumentTypeError(f"'{text}'; it must be FROM,TO with 0 <= FROM < TO")
-    return start, end
+    words = re.fullmatch(r'(\d+\.?\d*),(\d+\.?\d*)', text)
+    if words is None or not float(words[1]) < float(words[2]):
+        raise argparse.ArgumentTypeError(f"'{text}'; it must be FROM,TO in seconds, FROM < TO")
+    return float(words[1]), float(words[2])
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
