@@ -152,8 +152,12 @@ class FixedCamera:
         T = self._camera.T_mount_camera
         starts = [(T, reading) for reading in _READINGS] if guess else self._search(seed)
         found = []
+        sizes = {
+            reading: (self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading))
+            for _, reading in starts
+        }
         for start, reading in starts:
-            wide, middle = self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading)
+            wide, middle = sizes[reading]
             pose = self._aligned(self._aligned(start, wide), middle)
             found.append((self._fit(pose, middle), pose, reading))
         _, T, reading = max(found, key=lambda one: one[0])

@@ -43,16 +43,22 @@ def test_a_fixed_camera_is_found_from_a_guess(tmp_path, capsys):
     assert main([*command, '--out', str(out)]) == 1  # nothing that exists is overwritten
 
 
-def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
-    """Least squares alone, along poses that look alike, end 27 mm away here, the search 15."""
+def recorded_door(tmp_path):
+    """Robot, true camera, images, joints and shapes of a recording in which all joints move."""
     robot = load(tmp_path)
     door = replace(make_cameras()['door'], mount_link='world')
     path = write_episode(tmp_path / 'episode', robot, {'door': door}, make_positions(5.0))
     episode = read_episode(path)
     joints, parts = JointTrack(episode.joint_states, robot), load_shape(robot).parts
+    return robot, door, episode.images['door'], joints, parts
+
+
+def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
+    """Least squares alone, along poses that look alike, end 27 mm away here, the search 15."""
+    robot, door, images, joints, parts = recorded_door(tmp_path)
 
     def estimator(camera):
-        return FixedCamera(episode.images['door'], camera, robot, parts, joints)
+        return FixedCamera(images, camera, robot, parts, joints)
 
     circled = np.array([0, 0.3, 0, 0, 0, 0])
     T = moved(door.T_mount_camera, circled, estimator(door).centre)
@@ -65,12 +71,7 @@ def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
 
 def test_shadows_on_the_table_do_not_move_the_camera(tmp_path):
     """Real arms cast soft shadows: here one lies beside the arm, a fifth darker than the rest."""
-    robot = load(tmp_path)
-    door = replace(make_cameras()['door'], mount_link='world')
-    path = write_episode(tmp_path / 'episode', robot, {'door': door}, make_positions(5.0))
-    episode = read_episode(path)
-    joints, parts = JointTrack(episode.joint_states, robot), load_shape(robot).parts
-    track = episode.images['door']
+    robot, door, track, joints, parts = recorded_door(tmp_path)
     arm = draw_silhouettes(parts, door, robot, joints.at(track.stamps_ns))
     frames = np.asarray(track.frames).astype(np.float32)
     aside = np.roll(arm, (20, 40), axis=(1, 2))

@@ -99,16 +99,13 @@ class ObjectMotionPredictor:
         item = np.arange(len(points)) % _MAX_OBJECTS
         return points + self._places[:, item], features * self._scales[:, item]
 
-    def errors(
-        self, motions: Sequence[int] | np.ndarray, first: int, count: int, num_objects: int
-    ) -> FloatArray:
-        """Returns (K, T, O, 3) errors of some motions, see `ObjectMotionNetwork.roll`.
+    def errors(self, first: int, count: int, num_objects: int) -> FloatArray:
+        """Returns (K, T, O, 3) errors of all motions, see `ObjectMotionNetwork.roll`.
 
         They depend on the step since the objects were found alone, not on how a plan is cut into
         chunks; those of the expected motion are none.
 
         Args:
-            motions: K numbers.
             first: step since the objects were found.
             count: T steps.
             num_objects: O.
@@ -122,7 +119,7 @@ class ObjectMotionPredictor:
             axis=1,
         )
         drawn[0] = 0.0
-        return drawn[np.asarray(motions)][:, :, np.arange(num_objects) % _MAX_OBJECTS]
+        return drawn[:, :, np.arange(num_objects) % _MAX_OBJECTS]
 
     def find(
         self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
@@ -186,6 +183,9 @@ class TrackedObjects:
         places, features = self.model.disturbed(
             np.where(known[:, None], self.reference, 0.0), self.features
         )
+        first = self.before[0].steps if self.before else 0
+        count = (len(positions) - 1) // self.commands_a_step
+        errors = self.model.errors(first, count, known.size)
         points, rotations, thens = [], [], []
         followed: dict[int, tuple[FloatArray, FloatArray, ArmState | None]] = {}
         for number, rows in enumerate(self.model.shares):
@@ -202,17 +202,17 @@ class TrackedObjects:
                 tools=_tensor(tools).expand(len(rows), -1, -1, -1, -1),
                 gaps=_tensor(gaps).expand(len(rows), -1, -1),
             )
-            errors = self.model.errors(rows, last.steps if last else 0, len(tools) - 2, known.size)
             with torch.inference_mode():
                 motion, memory = member.network.roll(
-                    scene, last and last.memory, skip=1, errors=_tensor(errors)
+                    scene, last and last.memory, skip=1, errors=_tensor(errors[rows])
                 )
             ways = motion.points.double().numpy() - places[rows, None]
             points += list(np.where(known[:, None], self.reference + ways, np.nan))
             rotations += list(motion.rotations.double().numpy())
-            steps = (last.steps if last else 0) + len(tools) - 2
             thens.append(
-                _Before(memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms, steps=steps)
+                _Before(
+                    memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms, steps=first + count
+                )
             )
         moved = tuple(
             ObjectMotion(reference=self.reference, points=way, rotations=turns)
