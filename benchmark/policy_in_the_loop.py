@@ -31,6 +31,7 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.model import world_model as model_module
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ranking.worlds import run_policy, SimulatedWorld
 from mtv_world_ros.sim.expert.expert import home_positions
 from mtv_world_ros.sim.world.simulator import SimEpisode
@@ -253,7 +254,7 @@ def _simulated_s(pipeline: Pipeline, path: Path, options: Any) -> float:
         file.write_text(POLICY)
         make = assemble_policy(file, robot)
     info = read_info(path)
-    policy = make(info.task, int(info.seed or 0))
+    policy = make(EpisodeOrigin(task=info.task, scene_seed=int(info.seed or 0)))
     policy.reset(seed=options.seed)
     begun = time.perf_counter()
     world = SimulatedWorld(sim, spec.fps, int(info.seed or 0), info.task)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,12 +15,14 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.pipeline import Pipeline, WorldModel
-from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
 from mtv_world_ros.policies.policy_config import (
     load_policy_config,
     PolicyConfig,
+    RecordedPolicySettings,
     ScriptedPolicySettings,
 )
+from mtv_world_ros.policies.recorded_policy import RecordedPolicy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     CALIBRATION,
@@ -41,8 +44,8 @@ if TYPE_CHECKING:
 
 BUNDLED = 'bundled'
 _YAML = ('.yaml', '.yml')
-#: makes a policy for the scene of a task and a seed (-1 = not known); most do not look at either
-PolicyMaker = Callable[[str, int], Policy]
+#: makes a policy for an episode's origin; most do not look at it
+PolicyMaker = Callable[[EpisodeOrigin], Policy]
 
 
 def checkpoint_path(name: str | Path) -> Path:
@@ -283,8 +286,10 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     config = policy_settings(name, robot)
     if isinstance(config, ScriptedPolicySettings):
         return _scripted(config, robot)
+    if isinstance(config, RecordedPolicySettings):
+        return partial(_recorded, config, robot)
     made = config.make()
-    return lambda task, scene_seed: made
+    return lambda origin: made
 
 
 def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
@@ -311,7 +316,8 @@ def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMake
     variant = settings.variant
     expert = Expert(robot)
 
-    def make(task: str, scene_seed: int) -> Policy:
+    def make(origin: EpisodeOrigin) -> Policy:
+        task, scene_seed = origin.task, origin.scene_seed
         if not task or scene_seed < 0:
             raise PolicyError(
                 f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
@@ -320,6 +326,22 @@ def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMake
         return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
 
     return make
+
+
+def _recorded(
+    settings: RecordedPolicySettings, robot: RobotModel, origin: EpisodeOrigin
+) -> RecordedPolicy:
+    from mtv_world_ros.data.episode_reader import read_episode
+    from mtv_world_ros.data.recording import stitched_commands
+
+    if not origin.recording:
+        raise PolicyError(
+            "policy 'recorded' repeats the commands of the episode that it begins from, and there "
+            "is none: give --episodes instead of --live, or set the parameter 'recording'"
+        )
+    episode = read_episode(Path(origin.recording), with_cameras=False, with_masks=False)
+    commands = stitched_commands(episode, robot, origin.recording_ns)
+    return RecordedPolicy(commands, settings.hold_s)
 
 
 def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:

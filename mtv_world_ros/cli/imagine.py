@@ -97,8 +97,8 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--policy',
         default='scripted',
-        help='YAML file, name of one in config/policies, or a scripted policy such as '
-        'expert-miss-0.5',
+        help='YAML file, name of one in config/policies (recorded: the commands of --episodes), '
+        'or a scripted policy such as expert-miss-0.5',
     )
     parser.add_argument(
         '--episodes',

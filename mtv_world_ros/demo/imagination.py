@@ -15,9 +15,10 @@ from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, policy_set
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.demo.node_processes import ROOM_BYTES
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free, check_room
 from mtv_world_ros.model.card import read_card
+from mtv_world_ros.policies.policy_config import RecordedPolicySettings
 from mtv_world_ros.processes import (
     how_it_ended,
     module_command,
@@ -85,7 +86,13 @@ def imagine_episodes(
     """
     views = read_card(checkpoint_path(options.checkpoint)).spec.views
     # a wrong name is an error here, before anything is removed
-    policy_settings(options.policy, checkpoint_robot(options.checkpoint, options.robot or None))
+    robot = checkpoint_robot(options.checkpoint, options.robot or None)
+    policy = policy_settings(options.policy, robot)
+    if isinstance(policy, RecordedPolicySettings) and not options.episodes:
+        raise ConfigError(
+            f"policy '{options.policy}' repeats what was commanded in a recorded episode: give "
+            '--episodes'
+        )
     commands = {
         'world_model': _world_model_command(options, views),
         'policy': _policy_command(options, views),

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.resample import cut_off, SAME_S
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeOrigin:
+    """Where an episode comes from, for policies that know it instead of looking at it.
+
+    Attributes:
+        task: its name; empty = not known.
+        scene_seed: seed of the simulated scene; -1 = not known.
+        recording: folder of the recorded episode; empty = there is none.
+        recording_ns: stamp of the recorded frame that it begins from [ns].
+    """
+
+    task: str = ''
+    scene_seed: int = -1
+    recording: str = ''
+    recording_ns: int = 0
 
 
 class Policy(Protocol):

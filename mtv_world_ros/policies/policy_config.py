@@ -29,6 +29,15 @@ class ScriptedPolicySettings(Schema):
     )
 
 
+class RecordedPolicySettings(Schema):
+    """What was commanded in the episode that an imagined one begins from."""
+
+    kind: Literal['recorded'] = 'recorded'
+    hold_s: float = Field(
+        default=0.6, ge=0, description='from the last command to the end of the episode [s]'
+    )
+
+
 class PythonPolicyConfig(Schema):
     """A policy in Python code of the user's."""
 
@@ -56,9 +65,12 @@ class PythonPolicyConfig(Schema):
             ) from error
 
 
-PolicyConfig = ScriptedPolicySettings | PythonPolicyConfig | OpenPiConfig | LeRobotConfig
+#: of these the layers above make the policy, once they know the episode's origin
+OriginSettings = ScriptedPolicySettings | RecordedPolicySettings
+PolicyConfig = OriginSettings | PythonPolicyConfig | OpenPiConfig | LeRobotConfig
 _KINDS: dict[str, type[PolicyConfig]] = {
     'scripted': ScriptedPolicySettings,
+    'recorded': RecordedPolicySettings,
     'python': PythonPolicyConfig,
     'openpi': OpenPiConfig,
     'lerobot': LeRobotConfig,

@@ -21,8 +21,10 @@ from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.policies.policy_config import (
+    OriginSettings,
     policy_config,
     PolicyConfig,
+    RecordedPolicySettings,
     ScriptedPolicySettings,
 )
 from mtv_world_ros.policies.server_process import PORT, ServerProcess
@@ -121,6 +123,11 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
     config = policy_config(values, robot, where)
     if isinstance(config, ScriptedPolicySettings):
         parse_variant(config.variant)
+    if isinstance(config, RecordedPolicySettings):
+        raise ConfigError(
+            f"{where} is of kind 'recorded': it repeats an episode, and a ranking draws scenes of "
+            'its own; `mtv-world imagine` runs it'
+        )
     if isinstance(config, OpenPiConfig | LeRobotConfig):
         config.make().close()  # says which package is missing
     elif entry.command:
@@ -278,7 +285,7 @@ class GuardedPolicy:
             address = _ADDRESSES[config.kind].format(port=self._server.port)
             self._config = config.model_copy(update={'server': address})
         if self._policy is None:
-            assert not isinstance(self._config, ScriptedPolicySettings)
+            assert not isinstance(self._config, OriginSettings)
             self._policy = self._config.make()
         self._policy.reset(seed=seed)
 

@@ -143,7 +143,7 @@ def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk):
     """Goes on from what the test above has trained."""
     if not (at_the_desk / 'runs' / 'mine' / 'checkpoint').is_dir():
         pytest.skip('the first half of the page was not run')
-    serve, play, imagine = [words for words in lines() if of_ros(words)]
+    serve, play, *imagine = [words for words in lines() if of_ros(words)]
     node = Node(serve, at_the_desk / 'node.log')
     try:
         said = run_in_process([*play, *PATIENT])
@@ -151,5 +151,6 @@ def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk):
         status = node.stop()
     assert status == 0 and ' done' in said and 'rejected' not in said, said + node.log.read_text()
     assert 'robot crane' in node.log.read_text()
-    assert 'max_chunks' in run_in_process(imagine)
-    assert any((at_the_desk / 'out' / 'mine_imagined').glob('episode_00000/*.mcap'))
+    for words, out in zip(imagine, ('mine_repeated', 'mine_imagined'), strict=True):
+        assert 'max_chunks' in run_in_process(words)
+        assert any((at_the_desk / 'out' / out).glob('episode_00000/*.mcap'))

@@ -16,6 +16,7 @@ from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import fitted
 
 SERVER = Path(__file__).with_name('openpi_server.py')
@@ -44,7 +45,7 @@ def make_policy(tmp_path, port, **changes):
     values |= {'server': f'ws://127.0.0.1:{port}', 'timeout_s': 1.0, **changes}
     path = tmp_path / 'policy.yaml'
     path.write_text(yaml.safe_dump(values))
-    return assemble_policy(path, ROBOT)('', -1)
+    return assemble_policy(path, ROBOT)(EpisodeOrigin())
 
 
 def observe(positions=HOME):

@@ -58,4 +58,4 @@ JOINTS = tuple(
 
 
 if __name__ == '__main__':
-    sys.exit(main(load=lambda settings: lambda task, scene_seed: FakePolicy(task)))
+    sys.exit(main(load=lambda settings: lambda origin: FakePolicy(origin.task)))

@@ -133,6 +133,8 @@ class EpisodeRunner(Node):
                 'max_chunks': options.max_chunks,
                 'task': start.task,
                 'scene_seed': start.scene_seed,
+                'recording': start.recording,
+                'recording_ns': start.recording_ns,
                 'instruction': options.instruction or start.instruction,
             },
         )

@@ -30,6 +30,8 @@ class EpisodeStart:
         source: where it comes from.
         task: name of the task, if known.
         scene_seed: seed of the scene; -1 = not known.
+        recording: folder of the recorded episode; empty = there is none.
+        recording_ns: stamp of this moment in it [ns].
         instruction: what the robot is told, if known.
         calibration_file: every view's pose; empty = the one the nodes have.
         images: image by view.
@@ -40,6 +42,8 @@ class EpisodeStart:
     source: str
     task: str = ''
     scene_seed: int = -1
+    recording: str = ''
+    recording_ns: int = 0
     instruction: str = ''
     calibration_file: str = ''
     images: Mapping[str, Image]
@@ -93,6 +97,8 @@ def recorded_start(path: Path, views: Sequence[str], start_s: float = 0.0) -> Ep
         source=str(path),
         task=info.task,
         scene_seed=-1 if info.seed is None else info.seed,
+        recording=str(path.absolute()),
+        recording_ns=stamp_ns,
         instruction=info.instruction,
         calibration_file=str(calibration.absolute()) if calibration.is_file() else '',
         images=images,

@@ -20,6 +20,7 @@ from mtv_world_ros.assembly import assemble_policy, checkpoint_robot, PolicyMake
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -177,7 +178,13 @@ class PolicyNode(Node):
         self._buffer.clear()
         if settings.instruction:
             self._instruction.publish(String(data=settings.instruction))
-        self._loop.start(partial(self._make_policy, settings.task, settings.scene_seed), settings)
+        origin = EpisodeOrigin(
+            task=settings.task,
+            scene_seed=settings.scene_seed,
+            recording=settings.recording,
+            recording_ns=settings.recording_ns,
+        )
+        self._loop.start(partial(self._make_policy, origin), settings)
         response.success, response.message = True, f'episode {self._loop.episode}'
         return response
 

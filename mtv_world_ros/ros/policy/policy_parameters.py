@@ -19,6 +19,10 @@ class PolicySettings(NodeSettings):
     instruction: str = parameter('', 'What the policy is told.')
     task: str = parameter('', 'Task of the scene, for policies that know it (scripted).')
     scene_seed: int = parameter(-1, 'Seed of the scene, for the same; -1 = none.', (-1, 2**62))
+    recording: str = parameter('', 'Episode folder, for policies that repeat it (recorded).')
+    recording_ns: int = parameter(
+        0, 'Stamp in it at which the episode begins, for the same [ns].', (0, 2**62)
+    )
     seed: int = parameter(0, "Seed of the policy's own randomness.", (0, 2**31 - 1))
     max_chunks: int = parameter(
         0, 'An episode ends after this number of chunks; 0 = no limit.', (0, 10**6)
