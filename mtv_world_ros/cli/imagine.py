@@ -158,7 +158,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.viewing.sheets import write_pictures
 
     for result in results:
-        if result['num_chunks'] and Path(str(result['bag'])).is_dir():
+        if int(str(result['num_chunks'])) and Path(str(result['bag'])).is_dir():
             write_pictures([Path(str(result['bag']))], Path(str(result['bag'])))
     print('episode  end          chunks  seconds  bag')
     for result in results:

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import SetBool, Trigger
@@ -26,6 +25,7 @@ from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded
 from mtv_world_ros.ros.messages.conversions import values_of
 from mtv_world_ros.ros.peers import Peers
 from mtv_world_ros.ros.policy.loop import GOOD_ENDS
+from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.status_publisher import StatusPublisher
 
@@ -220,8 +220,8 @@ class EpisodeRunner(Node):
     # plumbing
 
     def _offer(self, kind: Any, topic: str) -> Publisher:
-        profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-        return self.create_publisher(kind, f'{START}/{topic}', profile)
+        # what is shown once also reaches those who only now connect as they want to
+        return self.create_publisher(kind, f'{START}/{topic}', LATCHED)
 
     def _on_report(self, message: DiagnosticArray) -> None:
         for status in message.status:

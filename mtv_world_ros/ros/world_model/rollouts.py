@@ -40,6 +40,8 @@ from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.requests import RequestMaker
 from mtv_world_ros.ros.world_model.worker import RolloutWorker
 
+#: the first plan of an imagined episode may come this long before what it answers [s]
+_EARLY_S = 1.0
 #: what a node makes and can destroy
 _ENTITIES = ('publisher', 'subscription', 'service', 'timer', 'guard_condition')
 
@@ -176,6 +178,7 @@ class Rollouts:
         """Looks at the worker and at the publishers again; to be called now and then."""
         self._worker.supervise(self._settings().stuck_after_s)
         self._inputs.refresh()
+        self._arrivals.trigger()  # a plan that waited may have waited long enough
 
     def missing(self) -> Sequence[str]:
         """What the node needs and does not get; in imagine mode only to begin."""
@@ -207,6 +210,7 @@ class Rollouts:
         """Hands real images on; an observation of all views once a frame of the model."""
         if not self._is_active:
             return
+        self._arrivals.trigger()  # a plan may wait for it
         self._fidelity.see(view, message)
         if self._worker.sees(self._buffer.newest_stamp_ns):
             with suppress(Rejection):  # the plan that comes too early is told
@@ -225,8 +229,22 @@ class Rollouts:
         self._arrivals.trigger()
 
     def _start_rollouts(self) -> None:
-        while self._arrived:
+        while self._arrived and not (self._is_active and self._is_early(*self._arrived[0])):
             self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
+
+    def _is_early(self, received_s: float, plan: JointTrajectory | Goal) -> bool:
+        """Whether an imagined episode begins with a plan that overtook what it answers.
+
+        Nothing orders topics, and a policy may answer faster than this node hears of the start.
+        """
+        if not self._maker.imagine or self._worker.last_scene is not None or self._worker.busy:
+            return False
+        message = plan.message if isinstance(plan, Goal) else plan
+        is_behind = self._buffer.newest_stamp_ns < to_ns(message.header.stamp)
+        now_ns = self._node.get_clock().now().nanoseconds
+        return time.monotonic() - received_s < _EARLY_S and (
+            is_behind or bool(self._buffer.problems(now_ns))
+        )
 
     def _start_rollout(self, arrived: tuple[float, JointTrajectory | Goal]) -> None:
         received_s, plan = arrived

@@ -232,6 +232,17 @@ def test_imagine_mode_goes_on_without_gap_or_overlap(client):
     assert len({c['observation_stamp_ns'] for c in chunks}) == 3
 
 
+def test_a_plan_that_overtakes_what_it_answers_waits_for_it(client):
+    client.imagine(True)
+    client.send_scene()
+    since, stamp_ns = len(client.report_values()), client.now_ns()
+    client.send_trajectory(stamp_ns=stamp_ns)
+    time.sleep(0.1)
+    client.send_scene(stamp_ns)
+    assert client.next_end(since)['state'] == 'done'
+    assert client.report_values('chunk')[-1]['source_stamp_ns'] == str(stamp_ns)
+
+
 def test_history_and_anchor_go_on_over_requests_until_reset(client):
     def shown(message):  # what the fake writes into each frame of its history
         pixels = to_rgb(message)[0]
