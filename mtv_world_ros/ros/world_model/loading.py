@@ -21,7 +21,7 @@ from mtv_world_ros.ros.parameters import NodeSettings, Settings
 
 Cameras = tuple[CameraModel, ...]
 #: a calibration file that takes longer is given up [s]
-_READ_S = 1.0
+_READ_S = 3.0
 
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
