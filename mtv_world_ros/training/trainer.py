@@ -181,7 +181,8 @@ class Trainer:
             ]
             raise TrainingError(
                 f"'{folder}' does not fit the preset's transformer: {'; '.join(differ) or error}. "
-                'Give --preset the one it was trained with, or leave --init out'
+                'Give --preset the one it was trained with, set what differs (--set transformer.NAME='
+                'VALUE), or leave --init out'
             ) from error
         self.weights.load(given)
         self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
