@@ -81,7 +81,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'early': _kind('timing', 'train', 0.5, 2.0, 's', 'the grippers go this much ahead'),
     'hasty': _kind('timing', 'train', 0.03, 0.1, 'm', 'it rises this far while the fingers close'),
     'snap': _kind(
-        'timing', 'test', 0.045, 0.09, 'm', 'the fingers close over the last part of the way down'
+        'timing', 'train', 0.045, 0.09, 'm', 'the fingers close over the last part of the way down'
     ),
     'soft': _kind(
         'timing', 'train', 0.6, 1.5, 's', 'time constant with which the grippers follow'
@@ -246,7 +246,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'cut': _kind(
         'collision',
-        'test',
+        'train',
         0.1,
         0.2,
         'm',
@@ -289,7 +289,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'rival': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.9,
         1.0,
         '',
@@ -300,7 +300,7 @@ FAULTS: Mapping[str, FaultKind] = {
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
     ),
     'torn': _kind(
-        'object', 'test', 0.1, 0.5, '', 'share of the way to the next object that a grasp is off'
+        'object', 'train', 0.1, 0.5, '', 'share of the way to the next object that a grasp is off'
     ),
     'meddle': _kind(
         'object',
@@ -399,7 +399,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'coarse': _kind(
         'joint', 'calibrate', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
     ),
-    'lash': _kind('joint', 'test', 0.09, 0.4, 'rad', 'play of every arm joint'),
+    'lash': _kind('joint', 'calibrate', 0.09, 0.4, 'rad', 'play of every arm joint'),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -438,7 +438,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'tidy': _kind(
         'regrasp',
-        'test',
+        'train',
         0.05,
         0.1,
         'm',
