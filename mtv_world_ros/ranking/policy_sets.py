@@ -147,6 +147,18 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
     ),
     'test': (
         'expert',
+        'expert-shuffle-0.8',
+        'expert-shuffle-1',
+        'expert-starve-0.45',
+        'expert-starve-0.5',
+        'expert-splay-0.7',
+        'expert-splay-0.85',
+        'expert-putt-0.04',
+        'expert-putt-0.06',
+        'expert-brake-2',
+        'expert-brake-3',
+        'expert-topple-0.9',
+        'expert-topple-1',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

@@ -98,6 +98,14 @@ FAULTS: Mapping[str, FaultKind] = {
         's',
         'every chunk of commands is up to this long off its time',
     ),
+    'shuffle': _kind(
+        'timing',
+        'test',
+        0.8,
+        2.0,
+        's',
+        'two chunks of commands of this length are carried out in the wrong order, once',
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -166,6 +174,22 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'again and again the gripper jerks open, to this share',
+    ),
+    'starve': _kind(
+        'opening',
+        'test',
+        0.5,
+        1.0,
+        '',
+        'the gripper gives way as its arm moves, by up to this share of its range',
+    ),
+    'splay': _kind(
+        'opening',
+        'test',
+        0.8,
+        1.0,
+        '',
+        'shut fingers come down beside the object and open there, to this share',
     ),
     # release
     'drops': _kind(
@@ -295,6 +319,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of the way that the other arm comes to where an object is grasped',
     ),
+    'putt': _kind(
+        'collision',
+        'test',
+        0.04,
+        0.1,
+        'm',
+        'it lets go this far before its goal, and shut fingers push the object on',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -400,6 +432,9 @@ FAULTS: Mapping[str, FaultKind] = {
         'joint', 'calibrate', 0.12, 0.4, 'rad', 'every arm joint knows only multiples of this'
     ),
     'lash': _kind('joint', 'calibrate', 0.09, 0.4, 'rad', 'play of every arm joint'),
+    'brake': _kind(
+        'joint', 'test', 3.0, 5.0, 's', 'one joint stands still for this long, the others do not'
+    ),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -427,6 +462,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.15,
         'm',
         'half-way it lets the object fall from this height, and takes it again',
+    ),
+    'topple': _kind(
+        'regrasp',
+        'test',
+        1.0,
+        1.1,
+        'rad',
+        'it raises the object, lets it fall leaning by this much, and grasps where it was',
     ),
     'undo': _kind(
         'regrasp',
@@ -615,12 +658,16 @@ _TWITCH_EVERY_S = 0.8
 _TREMBLE_HZ = 2.5
 #: length of a chunk of commands [s]
 _CHUNK_S = 0.8
+#: part of a plan in which one joint comes to stand still, as shares of it
+_BRAKES = (0.1, 0.7)
 #: of arms that swing, as a share of the critical damping
 _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
 _OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival')
+#: kinds of what a gripper does
+_OF_GRIPPERS = ('starve', 'splay', 'putt', 'topple')
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -637,14 +684,10 @@ def with_faults(
         rng: draws the noise.
 
     Raises:
-        PolicyError: a fault of two arms, of a robot that has one.
+        PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
+            that has none.
     """
-    of_two = [kind for kind in variant.kinds if kind in _OF_TWO_ARMS]
-    if of_two and len(robot.tools) < 2:
-        raise PolicyError(
-            f"policy '{variant.name}': {', '.join(of_two)} takes two arms, robot '{robot.name}' "
-            f'has {len(robot.tools)}; leave it out'
-        )
+    _refuse(variant, robot)
     period = float(plan.times[1] - plan.times[0])
     tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
     grippers = [robot.joint_names.index(tool.gripper_joint or '') for tool in tools]
@@ -654,11 +697,14 @@ def with_faults(
     positions = _early(positions, grippers, round(variant.size('early') / period))
     positions = _hang(positions, grippers, opens, round(variant.size('hang') / period))
     positions = _soft(positions, grippers, variant.size('soft') / period)
+    closed = np.array([tool.gripper_closed for tool in tools])
     if variant.size('twitch'):
-        closed = np.array([tool.gripper_closed for tool in tools])
         jerks = closed + variant.size('twitch') * travel * _twitches(len(positions), period)
-        both = np.stack([positions[:, grippers], jerks]) * opens
-        positions[:, grippers] = both.max(axis=0) * opens
+        positions = _opened(positions, grippers, opens, jerks)
+    if variant.size('starve'):
+        haste = _haste(positions, grippers, len(robot.tools))
+        gives = closed + variant.size('starve') * travel * haste
+        positions = _opened(positions, grippers, opens, gives)
     if variant.size('stall'):
         share = _own(rng).uniform(0.15, 0.6)
         positions = _stall(
@@ -690,6 +736,22 @@ def with_faults(
     )
 
 
+def _refuse(variant: PolicyVariant, robot: RobotModel) -> None:
+    """Refuses faults that a robot cannot have."""
+    of_two = [kind for kind in variant.kinds if kind in _OF_TWO_ARMS]
+    if of_two and len(robot.tools) < 2:
+        raise PolicyError(
+            f"policy '{variant.name}': {', '.join(of_two)} takes two arms, robot '{robot.name}' "
+            f'has {len(robot.tools)}; leave it out'
+        )
+    of_grippers = [kind for kind in variant.kinds if kind in _OF_GRIPPERS]
+    if of_grippers and all(tool.gripper_joint is None for tool in robot.tools):
+        raise PolicyError(
+            f"policy '{variant.name}': {', '.join(of_grippers)} takes a gripper, robot "
+            f"'{robot.name}' has none; leave it out"
+        )
+
+
 def _own(rng: np.random.Generator) -> np.random.Generator:
     """A fault's own generator: whatever it draws, those after it draw the same."""
     return np.random.default_rng(rng.integers(2**32))
@@ -719,9 +781,7 @@ def _controller_faults(
         positions = _coarse(positions, grippers, variant.size('coarse'), period)
         positions = np.clip(positions, robot.lower, robot.upper)
     positions = _lash(positions, grippers, variant.size('lash') / 2)
-    if variant.size('weak'):
-        own = _own(rng)
-        positions = _weak(positions, grippers, variant.size('weak'), own)
+    positions = _one_joint(positions, variant, grippers, period, rng)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
     positions = _off_course(positions, variant, robot, grippers, period, rng)
     if variant.size('freeze'):
@@ -752,13 +812,33 @@ def _out_of_time(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T', J): chunks, or joints, each with a timing of its own."""
+    """(T', J): chunks in the wrong order; chunks, or joints, each with a timing of its own."""
+    if variant.size('shuffle'):
+        share, num = _own(rng).uniform(), round(variant.size('shuffle') / period)
+        positions = _shuffle(positions, float(share), num, period)
     if variant.size('seams'):
         own = _own(rng)
         positions = _seams(positions, variant.size('seams') / period, period, own)
     if variant.size('ragged'):
         own = _own(rng)
         positions = _ragged(positions, grippers, variant.size('ragged') / period, own)
+    return positions
+
+
+def _one_joint(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    grippers: list[int],
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): one joint that moves less than the others, or for a while not at all."""
+    if variant.size('weak'):
+        own = _own(rng)
+        positions = _weak(positions, grippers, variant.size('weak'), own)
+    if variant.size('brake'):
+        own = _own(rng)
+        positions = _brake(positions, grippers, round(variant.size('brake') / period), period, own)
     return positions
 
 
@@ -895,6 +975,22 @@ def _skip(positions: FloatArray, share: float, num: int, period: float) -> Float
     return np.concatenate([positions[:begin], rest])
 
 
+def _shuffle(positions: FloatArray, share: float, num: int, period: float) -> FloatArray:
+    """(T, J): the later one of two chunks of `num` samples comes first, at a share of the plan."""
+    rows = np.arange(len(positions))
+    num = min(num, (len(rows) - 1) // 2)
+    begin = 1 + int(share * (len(rows) - 1 - 2 * num))
+    middle, end = begin + num, begin + 2 * num
+    order = np.concatenate([rows[:begin], rows[middle:end], rows[begin:middle], rows[end:]])
+    whole = positions[order]
+    jump = min(round(_JUMP_S / period), num)
+    for first in (begin, middle, end):
+        after = whole[first : first + jump].copy()
+        blend = (np.arange(1, len(after) + 1) / jump)[:, None]
+        whole[first : first + jump] = (1 - blend) * whole[first - 1] + blend * after
+    return whole
+
+
 def _choppy(positions: FloatArray, num: int, period: float) -> FloatArray:
     """(T, J): the first of every `num` samples is held until the next."""
     if num < 2:
@@ -966,10 +1062,30 @@ def _ring(positions: FloatArray, grippers: list[int], angle: float) -> FloatArra
     return whole
 
 
+def _opened(
+    positions: FloatArray, grippers: list[int], opens: FloatArray, least: FloatArray
+) -> FloatArray:
+    """(T, J): the grippers are at least as far open as at their positions `least` (T, G)."""
+    whole = positions.copy()
+    both = np.stack([positions[:, grippers], least]) * opens
+    whole[:, grippers] = both.max(axis=0) * opens
+    return whole
+
+
 def _twitches(num: int, period: float) -> FloatArray:
     """(T, 1) from 0, which is most of the time, to 1."""
     times = np.arange(num) * period % _TWITCH_EVERY_S
     return np.interp(times, _JUMP_S * np.arange(4), [0.0, 1.0, 1.0, 0.0])[:, None]
+
+
+def _haste(positions: FloatArray, grippers: list[int], num_arms: int) -> FloatArray:
+    """(T, G) from 0 to 1: how fast the arm of each gripper moves, of its top speed."""
+    num_joints = positions.shape[1] // num_arms
+    steps = np.gradient(positions, axis=0)
+    steps[:, grippers] = 0.0
+    speeds = np.linalg.norm(steps.reshape(len(steps), num_arms, num_joints), axis=2)
+    top = speeds.max(axis=0)
+    return (speeds / np.where(top > 0, top, 1.0))[:, np.array(grippers) // num_joints]
 
 
 def _mirrored(positions: FloatArray, num_arms: int, period: float) -> FloatArray:
@@ -1001,11 +1117,32 @@ def _weak(
     positions: FloatArray, grippers: list[int], lacking: float, rng: np.random.Generator
 ) -> FloatArray:
     """(T, J): one of the arm joints that move moves only part of its way from the first row."""
+    joint, whole = _moving(positions, grippers, rng), positions.copy()
+    whole[:, joint] -= lacking * (whole[:, joint] - whole[0, joint])
+    return whole
+
+
+def _moving(positions: FloatArray, grippers: list[int], rng: np.random.Generator) -> int:
+    """One of the arm joints that move, drawn."""
     travel = np.ptp(positions, axis=0)
     travel[grippers] = 0.0
-    joint = int(rng.choice(np.flatnonzero(travel >= min(_MOVES_RAD, travel.max()))))
-    whole = positions.copy()
-    whole[:, joint] -= lacking * (whole[:, joint] - whole[0, joint])
+    return int(rng.choice(np.flatnonzero(travel >= min(_MOVES_RAD, travel.max()))))
+
+
+def _brake(
+    positions: FloatArray,
+    grippers: list[int],
+    num: int,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): one of the arm joints that move stands still for `num` samples, then catches up."""
+    joint, whole = _moving(positions, grippers, rng), positions.copy()
+    first = int(rng.uniform(*_BRAKES) * len(positions))
+    stands = whole[first, joint]
+    after = np.maximum(np.arange(len(whole)) - first - num, 0)
+    blend = np.minimum(after * period / _JUMP_S, 1.0)[first:]
+    whole[first:, joint] = stands + blend * (positions[first:, joint] - stands)
     return whole
 
 

@@ -31,8 +31,12 @@ _HERD_BESIDE_M = 0.02
 _RUB_DEPTH = 0.75
 #: standard deviation of how far off its middle shut fingers push what was put down [m]
 _TIDY_BESIDE_M = 0.02
+#: shut fingers open beside an object: how far off they come down, and where they open [m]
+_SPLAY_FROM_M, _SPLAY_AT_M = 0.06, 0.04
+#: standard deviation of how far off its middle shut fingers push an object to its goal [m]
+_PUTT_BESIDE_M = 0.025
 #: kinds whose added way points leave the others their time
-_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle', 'cut', 'tidy'))
+_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle', 'cut', 'tidy', 'splay', 'putt', 'topple'))
 #: phases in which another arm comes where this one is, and the kind of fault that it is
 _CROWDED = {'close': 'rival', 'open': 'crowd'}
 #: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
@@ -367,6 +371,37 @@ def _rub(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:end], above, down, down.moved(way), above.moved(way), *stops[end:]]
 
 
+def _splay(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers come down beside the object and open there; it is grasped where it was.
+
+    On the other side, drawn anew, where the arm does not reach so far.
+    """
+    above, grasp, close = stops[: _first(stops, 'close') + 1][-3:]
+    to = float(side.play.choice((-1.0, 1.0))) * side.along
+    far, near = _SPLAY_FROM_M * to, _SPLAY_AT_M * to
+    down = replace(grasp.moved(far), phase='above', opening=0.0)
+    shut = replace(down, position=grasp.position + near)
+    opened = replace(shut, opening=size, seconds=close.seconds)
+    over = replace(above.moved(near), opening=size)
+    return [replace(above.moved(far), opening=0.0), down, shut, opened, over, *stops]
+
+
+def _putt(stops: Stops, size: float, side: _Side) -> Stops:
+    """It lets go on the way to its goal, and shut fingers push the object on, off its middle.
+
+    Drawn anew where the arm does not reach so far.
+    """
+    lower, end = _first(stops, 'lower'), _first(stops, 'retreat') + 1
+    goal, rise = stops[lower], stops[end - 1].position - stops[end - 2].position
+    way = (goal.position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
+    distance = float(np.linalg.norm(way))
+    on = way / distance if distance > size else side.anywhere
+    short = [stop.moved(-size * on) for stop in stops[lower - 1 : end]]
+    beside = side.play.normal(0.0, _PUTT_BESIDE_M) * np.array([-on[1], on[0], 0.0])
+    push = _pushed(goal.moved(beside), 0.0, rise, on, size)
+    return [*stops[: lower - 1], *short, *push, *stops[end:]]
+
+
 def _odd(stops: Stops, size: float, side: _Side) -> Stops:
     """Runs of way points drawn at random, each with one thing that is not the expert's."""
     rng, floor = side.play, min(stop.position[2] for stop in stops)
@@ -517,6 +552,21 @@ def _juggle(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[: lift + 1], over, held, let_go, again, low, over, *stops[lift + 1 :]]
 
 
+def _topple(stops: Stops, size: float, side: _Side) -> Stops:
+    """It raises the object, leans and lets it fall; then it grasps where the object was.
+
+    To the other side, drawn anew, where the wrist does not lean so far.
+    """
+    first = stops[: _first(stops, 'lift')]
+    raised = replace(first[-1].moved(_up(_TRY_LIFT_M)), seconds=None)
+    lean = float(side.play.choice((-1.0, 1.0))) * size
+    leaning = replace(raised, lean=raised.lean + lean)
+    let_go = replace(leaning, opening=1.0, seconds=0.3)
+    upright = replace(raised, opening=1.0).moved(_up(_TRY_LIFT_M))
+    begin = [*first, raised, leaning, let_go, upright]
+    return [*(replace(stop, phase='above') for stop in begin), *stops]
+
+
 def _undo(stops: Stops, size: float, side: _Side) -> Stops:
     """Once it has let go, it closes, carries what it holds back, and lets go again."""
     opened, rise = _first(stops, 'open'), _up(_TRY_LIFT_M)
@@ -592,10 +642,13 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'stir': _stir,
     'herd': _herd,
     'rub': _rub,
+    'splay': _splay,
+    'putt': _putt,
     'elsewhere': _elsewhere,
     'retry': _retry,
     'regrasp': _regrasp,
     'juggle': _juggle,
+    'topple': _topple,
     'undo': _undo,
     'tidy': _tidy,
     'wander': _wander,

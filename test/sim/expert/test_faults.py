@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.expert.faults import (
     draw_variant,
@@ -205,6 +208,25 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
             with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
 
 
+@pytest.mark.parametrize('kind', ['starve', 'splay', 'putt', 'topple'])
+def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
+    robot = expert.robot
+    bare = RobotModel(
+        name='bare',
+        model=robot.pinocchio_model,
+        joint_names=robot.joint_names,
+        tools=[replace(tool, gripper_joint=None) for tool in robot.tools],
+        base_link=robot.base_link,
+        mimics=robot.mimics,
+    )
+    policy = scripted_policy('expert', TASK, SEED, expert)
+    policy.reset(seed=SEED)
+    rng, name = np.random.default_rng(0), f'expert-{kind}-{FAULTS[kind].typical:g}'
+    assert len(with_faults(policy.plan, PolicyVariant(), bare, rng).times) > 0
+    with pytest.raises(PolicyError, match=f"{kind} takes a gripper, robot 'bare' has none"):
+        with_faults(policy.plan, parse_variant(name), bare, rng)
+
+
 def test_it_circles_about_its_object_at_its_height():
     place, up = np.array([0.0, 0.3, 0.03]), np.array([0, 0, 0.1])
     stops = [
@@ -346,6 +368,101 @@ def test_what_was_put_down_is_pushed_by_shut_fingers():
     assert 1e-3 < np.linalg.norm(ways[1] + 0.07 * way) < 0.08
 
 
+def test_shut_fingers_open_beside_the_object_which_is_grasped_where_it_was():
+    stops, changed = changed_stops('expert-splay-0.7')
+    assert changed[5:] == stops
+    ways = np.array([stop.position - stops[1].position for stop in changed[:5]])
+    side = np.sign(ways[0, 0])
+    np.testing.assert_allclose(side * ways[:, 0], [0.06, 0.06, 0.04, 0.04, 0.04])
+    np.testing.assert_allclose(ways[:, 1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0, 0.1], atol=1e-12)
+    assert [stop.opening for stop in changed[:5]] == [0, 0, 0, 0.7, 0.7]
+
+
+@pytest.mark.parametrize('size', [0.04, 0.1])
+def test_what_is_let_go_too_early_is_pushed_on_from_behind(size):
+    stops, changed = changed_stops(f'expert-putt-{size}')
+    assert changed[:4] == stops[:4] and changed[-1] == stops[-1] and len(changed) == 13
+    # from the grasp to the goal it goes towards -x
+    for late, early in zip(stops[4:8], changed[4:8], strict=True):
+        np.testing.assert_allclose(early.position - late.position, [size, 0, 0], atol=1e-12)
+        assert (early.phase, early.opening) == (late.phase, late.opening)
+    push = changed[8:12]
+    assert all(stop.opening == 0 for stop in push)
+    ways = np.array([stop.position - stops[5].position for stop in push])
+    np.testing.assert_allclose(ways[:, 0], [size + 0.07, size + 0.07, 0.03, 0.03])
+    np.testing.assert_allclose(ways[:, 1], ways[0, 1])
+    assert 1e-4 < abs(ways[0, 1]) < 0.1
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.1], atol=1e-12)
+
+
+def test_it_lets_the_object_fall_leaning_and_grasps_where_it_was():
+    stops, changed = changed_stops('expert-topple-0.9')
+    assert changed[7:] == stops
+    assert [stop.opening for stop in changed[:7]] == [1, 1, 0, 0, 0, 1, 1]
+    leans = [stop.lean for stop in changed[:7]]
+    assert [abs(lean) for lean in leans] == pytest.approx([0, 0, 0, 0, 0.9, 0.9, 0])
+    assert leans[4] == leans[5]
+    ways = np.array([stop.position - stops[1].position for stop in changed[:7]])
+    np.testing.assert_allclose(ways[:, :2], 0.0)
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.04, 0.04, 0.04, 0.08], atol=1e-12)
+
+
+@pytest.mark.parametrize(('kind', 'size'), [('splay', 0.7), ('topple', 0.9)])
+def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
+    expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
+    assert len(changed) > len(expert_plan) + 80
+    # from the grasp on
+    np.testing.assert_allclose(changed[-200:], expert_plan[-200:], atol=0.02)
+
+
+def test_two_chunks_are_carried_out_in_the_wrong_order(expert):
+    expert_plan, shuffle = plan(expert, 'expert'), plan(expert, 'expert-shuffle-1')
+    assert len(shuffle) == len(expert_plan)
+    rows = np.flatnonzero(np.abs(shuffle - expert_plan).max(axis=1) > 1e-9)
+    first, last = int(rows[0]), int(rows[-1])
+    # both chunks, and the jump from the earlier one to what follows the later one
+    assert 90 <= last - first <= 105
+    middle = [first + 20, first + 30]
+    np.testing.assert_allclose(shuffle[middle], expert_plan[np.add(middle, 50)], atol=1e-12)
+    later = np.add(middle, 50)
+    np.testing.assert_allclose(shuffle[later], expert_plan[middle], atol=1e-12)
+    # no jump is carried out at once
+    step = np.abs(np.diff(shuffle, axis=0)).max()
+    assert step < np.abs(expert_plan[50:] - expert_plan[:-50]).max() / 2
+
+
+def test_a_gripper_gives_way_as_its_arm_moves(expert):
+    expert_plan, starve = plan(expert, 'expert'), plan(expert, 'expert-starve-0.4')
+    arms = arm_columns(expert)
+    np.testing.assert_array_equal(starve[:, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, starve)]
+    assert (openings[1] >= openings[0] - 1e-9).all()
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_allclose(openings[1][1 - used], openings[0][1 - used])
+    speeds = np.linalg.norm(np.gradient(expert_plan[:, arms], axis=0), axis=1)
+    is_shut = openings[0][used] < 1e-9
+    np.testing.assert_allclose(
+        openings[1][used][is_shut], 0.4 * speeds[is_shut] / speeds.max(), atol=1e-9
+    )
+    assert openings[1][used][is_shut].max() > 0.15
+
+
+def test_one_joint_stands_still_for_a_while_and_catches_up(expert):
+    expert_plan, brake = plan(expert, 'expert'), plan(expert, 'expert-brake-1.5')
+    assert len(brake) == len(expert_plan)
+    (joint,) = np.flatnonzero(np.abs(brake - expert_plan).max(axis=0) > 1e-9)
+    assert joint in arm_columns(expert) and np.ptp(expert_plan[:, joint]) > 0.2
+    differs = np.flatnonzero(np.abs(brake[:, joint] - expert_plan[:, joint]) > 1e-9)
+    # while it stands, and for the jump at the end
+    assert np.ptp(differs) <= 75 + 5
+    first, longer = int(differs[0]), plan(expert, 'expert-brake-3')
+    parts = int(np.argmax(np.abs(longer - brake).max(axis=1) > 1e-9))
+    assert first < parts <= first + 76
+    np.testing.assert_allclose(brake[first - 1 : parts, joint], brake[first, joint], atol=1e-9)
+    np.testing.assert_allclose(longer[parts : parts + 75, joint], brake[first, joint], atol=1e-9)
+
+
 def test_the_other_arm_comes_where_an_arm_grasps(expert):
     expert_plan, rival = plan(expert, 'expert'), plan(expert, 'expert-rival-0.5')
     openings = expert.robot.gripper_openings(expert_plan)
@@ -450,6 +567,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'torn',
         'lash',
         'tidy',
+        'shuffle',
+        'starve',
+        'splay',
+        'putt',
+        'brake',
+        'topple',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -509,9 +632,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-torn-0.1' has torn"
+    said = r"split test are not for training: 'expert-high-0.1-topple-1' has topple"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-torn-0.1'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-topple-1'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
