@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
@@ -162,12 +163,21 @@ class Trainer:
     def start_from(self, folder: Path) -> None:
         """Loads the weights of a checkpoint of the same architecture; the optimizer state is new.
 
+        Its object motion network comes along where robot and views are the same.
+
         Raises:
             CheckpointError: the folder holds no checkpoint.
             TrainingError: its transformer is of another shape.
         """
         loaded = load_checkpoint(folder)
-        self._object_motion = loaded.object_motion
+        theirs, video = loaded.card, self.config.video
+        if (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
+            self._object_motion = loaded.object_motion
+        elif loaded.object_motion is not None and self.processes.is_main:
+            tqdm.write(
+                f"the object motion network of '{folder}' is left out: it is of robot "
+                f"'{theirs.robot}' with {len(theirs.spec.views)} views; train-motion makes one"
+            )
         given = loaded.transformer.state_dict()
         given = with_new_source(given, self.weights.worker.state_dict())
         try:
@@ -181,8 +191,8 @@ class Trainer:
             ]
             raise TrainingError(
                 f"'{folder}' does not fit the preset's transformer: {'; '.join(differ) or error}. "
-                'Give --preset the one it was trained with, set what differs (--set transformer.NAME='
-                'VALUE), or leave --init out'
+                'Give --preset the one it was trained with, set what differs '
+                '(--set transformer.NAME=VALUE), or leave --init out'
             ) from error
         self.weights.load(given)
         self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]

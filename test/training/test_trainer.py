@@ -221,6 +221,26 @@ def test_a_run_may_start_from_the_weights_of_a_checkpoint(
         assert torch.equal(averaged, weight) and torch.equal(weight, worker)
 
 
+@pytest.mark.parametrize('name', ['yam_bimanual', 'franka'])
+def test_the_object_motion_network_comes_along_to_the_same_robot_alone(
+    name: str,
+    tiny: TrainingConfig,
+    source: BatchSource,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    first = make(tiny, tmp_path / 'first')
+    first.export(tmp_path / 'checkpoint')
+    (tmp_path / 'checkpoint' / 'object_motion').mkdir()
+    (tmp_path / 'checkpoint' / 'object_motion' / 'config.json').write_text('{}')
+    second = make(tiny.replace(video=tiny.video.replace(robot=name)), tmp_path / 'second')
+    second.start_from(tmp_path / 'checkpoint')
+    second.export(tmp_path / 'exported')
+    is_same = tiny.video.robot == name
+    assert (tmp_path / 'exported' / 'object_motion').is_dir() == is_same
+    assert ("left out: it is of robot 'yam_bimanual'" in capsys.readouterr().out) != is_same
+
+
 def test_weights_of_another_architecture_are_refused(
     tiny: TrainingConfig, source: BatchSource, tmp_path: Path
 ) -> None:
