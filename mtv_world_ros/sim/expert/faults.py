@@ -249,6 +249,15 @@ FAULTS: Mapping[str, FaultKind] = {
         'number of visits to any object of the scene, through it or past it, drawn at random: '
         'when, from where, how low, open or shut, turned and leaning',
     ),
+    'fidget': _kind(
+        'collision',
+        'train',
+        5,
+        12,
+        '',
+        'number of things done one after the other at any object, drawn at random: open or close, '
+        'rise or sink, lean, turn, go aside',
+    ),
     'meet': _kind(
         'collision',
         'train',

@@ -36,7 +36,9 @@ _SPLAY_FROM_M, _SPLAY_AT_M = 0.06, 0.04
 #: standard deviation of how far off its middle shut fingers push an object to its goal [m]
 _PUTT_BESIDE_M = 0.025
 #: kinds whose added way points leave the others their time
-_KEEP_TEMPO = frozenset(('herd', 'rub', 'juggle', 'cut', 'tidy', 'splay', 'putt', 'topple'))
+_KEEP_TEMPO = frozenset(
+    ('herd', 'rub', 'juggle', 'cut', 'tidy', 'splay', 'putt', 'topple', 'fidget')
+)
 #: phases in which another arm comes where this one is, and the kind of fault that it is
 _CROWDED = {'close': 'rival', 'open': 'crowd'}
 #: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
@@ -45,6 +47,9 @@ _CROWDED = {'close': 'rival', 'open': 'crowd'}
 _VISIT_FROM_M, _VISIT_TO_M = (0.0, 0.08), (-0.02, 0.06)
 _VISIT_HEIGHT_M, _VISIT_RISE_M = (-0.03, 0.05), (0.03, 0.1)
 _VISIT_BESIDE_M, _VISIT_YAW_RAD, _VISIT_LEAN_RAD = 0.012, 0.6, 0.35
+#: one thing after the other at an object: standard deviations beside its centre [m], of a lean and
+#: of a turn [rad]; how far it rises or sinks [m]; the time that opening or closing takes [s]
+_FIDGET_BESIDE_M, _FIDGET_RAD, _FIDGET_RISE_M, _FIDGET_S = 0.03, 0.5, (-0.04, 0.06), 0.3
 #: what is carried meets an object: how high the tool is over where it grasped, how far the centres
 #: pass each other [m]
 _MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
@@ -486,6 +491,43 @@ def _visit(stops: Stops, size: float, side: _Side) -> Stops:
     return stops
 
 
+def _fidget(stops: Stops, size: float, side: _Side) -> Stops:
+    """At an object, over it or beside it, one thing changes after the other.
+
+    So fingers also open where they are, and what is held is raised, leaned and let go.
+    """
+    rng, floor = side.play, min(stop.position[2] for stop in stops)
+    at = int(rng.integers(len(stops)))
+    place = side.objects[int(rng.integers(len(side.objects)))]
+    here = WayPoint(
+        phase='above',
+        position=place + rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0),
+        yaw=float(rng.normal(0.0, _VISIT_YAW_RAD)),
+        opening=float(rng.choice((0.0, rng.uniform(), 1.0))),
+    )
+    run = [_above(here, floor)]
+    for _ in range(round(size)):
+        last = replace(run[-1], seconds=None)
+        match str(
+            rng.choice(['opening', 'height', 'place', 'lean', 'turn'], p=[0.4, *[0.15] * 4])
+        ):
+            case 'opening':
+                opening = float(rng.choice((0.0, rng.uniform(), 1.0)))
+                last = replace(last, opening=opening, seconds=_FIDGET_S)
+            case 'height':
+                last = _above(last.moved(_up(rng.uniform(*_FIDGET_RISE_M))), floor)
+            case 'place':
+                last = last.moved(rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0))
+            case 'lean':
+                last = replace(last, lean=float(rng.normal(0.0, _FIDGET_RAD)))
+            case _:
+                last = replace(last, yaw=last.yaw + float(rng.normal(0.0, _FIDGET_RAD)))
+        run.append(last)
+    before, after = (_up(rng.uniform(*_VISIT_RISE_M)) for _ in range(2))
+    left = replace(run[-1], seconds=None).moved(after)
+    return [*stops[:at], run[0].moved(before), *run, left, *stops[at:]]
+
+
 def _meet(stops: Stops, size: float, side: _Side) -> Stops:
     """What the gripper holds is carried low through another object's place, or past it."""
     rng = side.play
@@ -632,6 +674,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'play': _play,
     'odd': _odd,
     'visit': _visit,
+    'fidget': _fidget,
     'meet': _meet,
     'knock': _knock,
     'brush': _brush,

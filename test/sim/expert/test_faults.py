@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -620,6 +621,30 @@ def test_what_is_held_is_carried_low_to_another_object(seed):
     low = [stop.position for stop in new[1:3]]
     assert all(own[2] <= place[2] <= own[2] + 0.09 for place in low)
     assert np.linalg.norm((low[1] - other)[:2]) < 0.15
+
+
+def test_at_an_object_one_thing_changes_after_the_other():
+    stops, _ = changed_stops('expert')
+    place, counts = np.array([0.1, 0.3, 0.05]), {'opening': 0, 'lean': 0, 'yaw': 0, 'position': 0}
+    floor = min(stop.position[2] for stop in stops)
+    for seed in range(20):
+        faults = WayPointFaults(parse_variant('expert-fidget-6'), np.random.default_rng(seed))
+        changed = faults.applied(stops, 0.0, [place])
+        own = {id(stop) for stop in stops}
+        new = [stop for stop in changed if id(stop) not in own]
+        assert len(new) == 9 and len(changed) == len(stops) + 9
+        assert np.linalg.norm((new[1].position - place)[:2]) < 0.15
+        assert all(stop.position[2] >= floor - 1e-9 for stop in new)
+        for before, after in pairwise(new[1:-1]):
+            same = np.array_equal(before.position, after.position)
+            differ = [
+                n for n in ('opening', 'lean', 'yaw') if getattr(before, n) != getattr(after, n)
+            ]
+            differ += [] if same else ['position']
+            assert len(differ) <= 1
+            for name in differ:
+                counts[name] += 1
+    assert counts['opening'] > 20 and min(counts.values()) > 5
 
 
 def test_random_policies_are_of_the_kinds_asked_for():
