@@ -154,7 +154,7 @@ class FixedCamera:
         found = []
         sizes = {
             reading: (self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading))
-            for _, reading in starts
+            for reading in dict.fromkeys(reading for _, reading in starts)
         }
         for start, reading in starts:
             wide, middle = sizes[reading]

@@ -179,7 +179,7 @@ class Rollouts:
         """Looks at the worker and at the publishers again; to be called now and then."""
         self._worker.supervise(self._settings().stuck_after_s)
         self._inputs.refresh()
-        self._arrivals.trigger()  # a plan that waited may have waited long enough
+        self._look_again()
 
     def missing(self) -> Sequence[str]:
         """What the node needs and does not get; in imagine mode only to begin."""
@@ -211,7 +211,7 @@ class Rollouts:
         """Hands real images on; an observation of all views once a frame of the model."""
         if not self._is_active:
             return
-        self._arrivals.trigger()  # a plan may wait for it
+        self._look_again()
         self._fidelity.see(view, message)
         if self._worker.sees(self._buffer.newest_stamp_ns):
             with suppress(Rejection):  # the plan that comes too early is told
@@ -232,6 +232,11 @@ class Rollouts:
     def _start_rollouts(self) -> None:
         while self._arrived and not (self._is_active and self._is_early(*self._arrived[0])):
             self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
+
+    def _look_again(self) -> None:
+        """At a plan that waits: what it answers may be here, or it waited long enough."""
+        if self._arrived:
+            self._arrivals.trigger()
 
     def _is_early(self, received_s: float, plan: JointTrajectory | Goal) -> bool:
         """Whether an imagined episode begins with a plan that overtook what it answers.
