@@ -100,7 +100,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'shuffle': _kind(
         'timing',
-        'test',
+        'calibrate',
         0.8,
         2.0,
         's',
@@ -177,7 +177,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'starve': _kind(
         'opening',
-        'test',
+        'train',
         0.5,
         1.0,
         '',
@@ -185,7 +185,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'splay': _kind(
         'opening',
-        'test',
+        'train',
         0.8,
         1.0,
         '',
@@ -330,7 +330,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'putt': _kind(
         'collision',
-        'test',
+        'train',
         0.04,
         0.1,
         'm',
@@ -442,7 +442,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'lash': _kind('joint', 'calibrate', 0.09, 0.4, 'rad', 'play of every arm joint'),
     'brake': _kind(
-        'joint', 'test', 3.0, 5.0, 's', 'one joint stands still for this long, the others do not'
+        'joint', 'calibrate', 3.0, 5.0, 's', 'one joint stands still for this long, the others do not'
     ),
     # regrasp
     'retry': _kind(
@@ -474,7 +474,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'topple': _kind(
         'regrasp',
-        'test',
+        'train',
         1.0,
         1.1,
         'rad',
