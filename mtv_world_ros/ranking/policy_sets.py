@@ -160,6 +160,18 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
     ),
     'test': (
         'expert',
+        'expert-drag-0.75',
+        'expert-drag-0.85',
+        'expert-askew-0.12',
+        'expert-askew-0.14',
+        'expert-chatter-0.45',
+        'expert-chatter-0.5',
+        'expert-grind-0.09',
+        'expert-grind-0.1',
+        'expert-sluggish-0.67',
+        'expert-sluggish-0.69',
+        'expert-perch-0.05',
+        'expert-perch-0.06',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

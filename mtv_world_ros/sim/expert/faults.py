@@ -112,6 +112,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'height', 'train', 1.0, 1.0, '', 'share that lacks of its height before it goes down'
     ),
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
+    'drag': _kind(
+        'height',
+        'test',
+        0.75,
+        1.0,
+        '',
+        'share of the way to its goal over which it drags the object before it lifts it',
+    ),
     # lateral
     'shift': _kind(
         'lateral',
@@ -135,6 +143,9 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'wander': _kind(
         'lateral', 'train', 0.015, 0.08, 'm', 'standard deviation of every way point, in x, y, z'
+    ),
+    'askew': _kind(
+        'lateral', 'test', 0.12, 0.3, 'rad', 'all places are turned about where the arm rests'
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
@@ -190,6 +201,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'shut fingers come down beside the object and open there, to this share',
+    ),
+    'chatter': _kind(
+        'opening',
+        'test',
+        0.45,
+        2.0,
+        's',
+        'whenever a gripper opens or closes, it flickers to and fro for this long',
     ),
     # release
     'drops': _kind(
@@ -336,6 +355,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'it lets go this far before its goal, and shut fingers push the object on',
     ),
+    'grind': _kind(
+        'collision',
+        'test',
+        0.09,
+        0.12,
+        'm',
+        'what it holds is pressed on its goal and rubbed to and fro there, this far',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -406,6 +433,14 @@ FAULTS: Mapping[str, FaultKind] = {
         's',
         'period with which the arms swing about their commands',
     ),
+    'sluggish': _kind(
+        'speed',
+        'test',
+        0.67,
+        0.95,
+        '',
+        'share that lacks of the top speed of every arm joint; the grippers are in time',
+    ),
     # joint
     'zero': _kind(
         'joint',
@@ -442,7 +477,12 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'lash': _kind('joint', 'calibrate', 0.09, 0.4, 'rad', 'play of every arm joint'),
     'brake': _kind(
-        'joint', 'calibrate', 3.0, 5.0, 's', 'one joint stands still for this long, the others do not'
+        'joint',
+        'calibrate',
+        3.0,
+        5.0,
+        's',
+        'one joint stands still for this long, the others do not',
     ),
     # regrasp
     'retry': _kind(
@@ -495,6 +535,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'once done, shut fingers push the object this far, off its middle',
+    ),
+    'perch': _kind(
+        'regrasp',
+        'test',
+        0.05,
+        0.08,
+        'm',
+        'it puts the object on another one, this far off its middle, and takes it again',
     ),
 }
 
@@ -663,6 +711,9 @@ _NUM_SPIKES, _SPIKE_S = 3, 0.4
 _JUMP_S = 0.1
 #: from one jerk of a gripper to the next [s]
 _TWITCH_EVERY_S = 0.8
+#: from shut to open or back as a gripper flickers [s]; how often at most; how long before it
+#: passes its middle it is still open, or shut [s]
+_FLICKER_S, _NUM_FLICKERS, _BEFORE_S = (0.1, 0.3), 30, 0.6
 #: of an oscillation [Hz]
 _TREMBLE_HZ = 2.5
 #: length of a chunk of commands [s]
@@ -676,7 +727,7 @@ _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
 _OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival')
 #: kinds of what a gripper does
-_OF_GRIPPERS = ('starve', 'splay', 'putt', 'topple')
+_OF_GRIPPERS = ('starve', 'splay', 'putt', 'topple', 'drag', 'chatter', 'grind', 'perch')
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -714,6 +765,10 @@ def with_faults(
         haste = _haste(positions, grippers, len(robot.tools))
         gives = closed + variant.size('starve') * travel * haste
         positions = _opened(positions, grippers, opens, gives)
+    if variant.size('chatter'):
+        own, middles = _own(rng), closed + travel / 2
+        lasts = variant.size('chatter')
+        positions = _chatter(positions, grippers, middles, lasts, period, own)
     if variant.size('stall'):
         share = _own(rng).uniform(0.15, 0.6)
         positions = _stall(
@@ -792,6 +847,7 @@ def _controller_faults(
     positions = _lash(positions, grippers, variant.size('lash') / 2)
     positions = _one_joint(positions, variant, grippers, period, rng)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
+    positions = _sluggish(positions, grippers, variant.size('sluggish'))
     positions = _off_course(positions, variant, robot, grippers, period, rng)
     if variant.size('freeze'):
         own = _own(rng)
@@ -1095,6 +1151,39 @@ def _haste(positions: FloatArray, grippers: list[int], num_arms: int) -> FloatAr
     speeds = np.linalg.norm(steps.reshape(len(steps), num_arms, num_joints), axis=2)
     top = speeds.max(axis=0)
     return (speeds / np.where(top > 0, top, 1.0))[:, np.array(grippers) // num_joints]
+
+
+def _chatter(
+    positions: FloatArray,
+    grippers: list[int],
+    middles: FloatArray,
+    lasts: float,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): for `lasts` [s] after a gripper has passed its middle, it goes back and forth."""
+    whole, times = positions.copy(), np.arange(len(positions)) * period
+    for column, middle in zip(grippers, middles, strict=True):
+        for change in np.flatnonzero(np.diff(positions[:, column] > middle)) + 1:
+            since = times - times[change]
+            knots = np.cumsum(rng.uniform(*_FLICKER_S, _NUM_FLICKERS))
+            back = np.interp(since, knots, np.arange(_NUM_FLICKERS) % 2)
+            back *= np.clip((lasts - since) / _JUMP_S + 1, 0.0, 1.0)
+            before = positions[max(change - round(_BEFORE_S / period), 0), column]
+            whole[:, column] += back * (before - whole[:, column])
+    return whole
+
+
+def _sluggish(positions: FloatArray, grippers: list[int], lacking: float) -> FloatArray:
+    """(T, J): no arm joint turns faster than at a part of its top speed, and so it is behind."""
+    if not lacking:
+        return positions
+    whole = positions.copy()
+    most = (1 - lacking) * np.abs(np.diff(positions, axis=0)).max(axis=0)
+    for row in range(1, len(whole)):
+        whole[row] = whole[row - 1] + np.clip(positions[row] - whole[row - 1], -most, most)
+    whole[:, grippers] = positions[:, grippers]
+    return whole
 
 
 def _mirrored(positions: FloatArray, num_arms: int, period: float) -> FloatArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.expert.faults import PolicyVariant
 
 _GRASP = ('above', 'grasp', 'close')
@@ -37,7 +38,20 @@ _SPLAY_FROM_M, _SPLAY_AT_M = 0.06, 0.04
 _PUTT_BESIDE_M = 0.025
 #: kinds whose added way points leave the others their time
 _KEEP_TEMPO = frozenset(
-    ('herd', 'rub', 'juggle', 'cut', 'tidy', 'splay', 'putt', 'topple', 'fidget')
+    (
+        'herd',
+        'rub',
+        'juggle',
+        'cut',
+        'tidy',
+        'splay',
+        'putt',
+        'topple',
+        'fidget',
+        'drag',
+        'grind',
+        'perch',
+    )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
 _CROWDED = {'close': 'rival', 'open': 'crowd'}
@@ -53,6 +67,13 @@ _FIDGET_BESIDE_M, _FIDGET_RAD, _FIDGET_RISE_M, _FIDGET_S = 0.03, 0.5, (-0.04, 0.
 #: what is carried meets an object: how high the tool is over where it grasped, how far the centres
 #: pass each other [m]
 _MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
+#: how deep what is held is pressed on the table as it is dragged [m]
+_DRAG_DEPTH_M = 0.02
+#: how deep what is held is pressed on its goal as it is rubbed there [m]; time of a stroke [s]
+_GRIND_DEPTH_M, _GRIND_S = 0.008, 0.4
+#: what it is put down on is at most this far from its goal, and from where its arm rests, or this
+#: much farther from there than its goal; how far it rises there [m]
+_PERCH_GOAL_M, _PERCH_ARM_M, _PERCH_MORE_M, _PERCH_RISE_M = 0.2, 0.27, 0.03, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -643,6 +664,74 @@ def _tidy(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:end], *push, *stops[end:]]
 
 
+def _drag(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds is pressed on the table and dragged towards its goal before it is lifted."""
+    lift, lower = _first(stops, 'lift'), _first(stops, 'lower')
+    way = size * (stops[lower].position - stops[lift].position) * (1, 1, 0)
+    closed = replace(stops[lift - 1], phase='lift', seconds=None)
+    pressed = closed.moved(_up(-_DRAG_DEPTH_M))
+    return [*stops[:lift], pressed, pressed.moved(way), stops[lift].moved(way), *stops[lift + 1 :]]
+
+
+def _askew(stops: Stops, size: float, side: _Side) -> Stops:
+    """All places are turned about where the arm rests."""
+    home, angle = stops[-1].position, side.sign * size
+    turn = rotation((0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)))
+    turned = [
+        replace(s, position=home + turn @ (s.position - home), yaw=s.yaw + angle)
+        for s in stops[:-1]
+    ]
+    return [*turned, stops[-1]]
+
+
+def _grind(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds is pressed on its goal and rubbed to and fro there, before it is let go.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    opened, angle = _first(stops, 'open'), side.play.uniform(0.0, 2 * np.pi)
+    way = size * np.array([np.cos(angle), np.sin(angle), 0.0])
+    pressed = replace(stops[opened - 1], seconds=_GRIND_S).moved(_up(-_GRIND_DEPTH_M))
+    strokes = [pressed.moved(to * way) for to in (1, -1, 1, -1, 0)]
+    return [*stops[:opened], pressed, *strokes, *stops[opened:]]
+
+
+def _perch(stops: Stops, size: float, side: _Side) -> Stops:
+    """It puts the object on the other one next to its goal, off its middle, and takes it again.
+
+    To another side, drawn anew, where the arm does not reach so far; where no other object is
+    near its goal and its arm, on the table.
+    """
+    lift, opened = _first(stops, 'lift'), _first(stops, 'open')
+    closed, let_go, angle = stops[lift - 1], stops[opened], side.play.uniform(0.0, 2 * np.pi)
+    goal, home = let_go.position, stops[-1].position
+    farthest = max(_PERCH_ARM_M, _PERCH_MORE_M + float(np.linalg.norm((goal - home)[:2])))
+    nears = [
+        place
+        for place in side.objects
+        if np.linalg.norm((place - closed.position)[:2]) > _VISIT_TO_M[1]
+        and np.linalg.norm((place - goal)[:2]) < _PERCH_GOAL_M
+        and np.linalg.norm((place - home)[:2]) < farthest
+    ]
+    at = min(nears, key=lambda p: np.linalg.norm((p - goal)[:2]), default=goal * (1, 1, 0))
+    # what lies on the table is twice as high as its centre
+    over = at * (1, 1, 2) + size * np.array([np.cos(angle), np.sin(angle), 0.0])
+    low = replace(
+        closed, phase='carry', position=over + _up(closed.position[2] + 0.002), seconds=None
+    )
+    raised, wide = low.moved(_up(_PERCH_RISE_M)), stops[lift - 2].opening
+    perched = [
+        raised,
+        low,
+        replace(low, opening=let_go.opening, seconds=let_go.seconds),
+        replace(raised, opening=wide),
+        replace(low, opening=wide),
+        replace(low, seconds=closed.seconds),
+        raised,
+    ]
+    return [*stops[: lift + 1], *perched, *stops[lift + 1 :]]
+
+
 def _wander(stops: Stops, size: float, side: _Side) -> Stops:
     floor = min(stop.position[2] for stop in stops)
 
@@ -695,4 +784,8 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'undo': _undo,
     'tidy': _tidy,
     'wander': _wander,
+    'drag': _drag,
+    'askew': _askew,
+    'grind': _grind,
+    'perch': _perch,
 }

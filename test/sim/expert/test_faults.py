@@ -209,7 +209,9 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
             with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize('kind', ['starve', 'splay', 'putt', 'topple'])
+@pytest.mark.parametrize(
+    'kind', ['starve', 'splay', 'putt', 'topple', 'drag', 'chatter', 'grind', 'perch']
+)
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
     robot = expert.robot
     bare = RobotModel(
@@ -311,7 +313,8 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
 
 
 @pytest.mark.parametrize(
-    ('kind', 'same', 'more'), [('rub', 0.8, 80), ('juggle', 0.3, 80), ('tidy', 0.8, 60)]
+    ('kind', 'same', 'more'),
+    [('rub', 0.8, 80), ('juggle', 0.3, 80), ('tidy', 0.8, 60), ('grind', 0.6, 80)],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-0.08')
@@ -407,6 +410,97 @@ def test_it_lets_the_object_fall_leaning_and_grasps_where_it_was():
     ways = np.array([stop.position - stops[1].position for stop in changed[:7]])
     np.testing.assert_allclose(ways[:, :2], 0.0)
     np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.04, 0.04, 0.04, 0.08], atol=1e-12)
+
+
+def test_what_is_held_is_dragged_over_the_table_before_it_is_lifted():
+    stops, changed = changed_stops('expert-drag-0.6')
+    assert changed[:3] == stops[:3] and changed[6:] == stops[4:] and len(changed) == 11
+    assert all(stop.opening == 0 for stop in changed[3:6])
+    ways = np.array([stop.position - stops[2].position for stop in changed[3:6]])
+    # the goal is 0.2 m away, and 0.02 m higher
+    wanted = [[0, 0, -0.02], [-0.12, 0, -0.02], [-0.12, 0, 0.1]]
+    np.testing.assert_allclose(ways, wanted, atol=1e-12)
+
+
+def test_all_places_are_turned_about_where_the_arm_rests():
+    stops, changed = changed_stops('expert-askew-0.1')
+    assert len(changed) == len(stops) and changed[-1] == stops[-1]
+    home = stops[-1].position
+    for stop, turned in zip(stops[:-1], changed[:-1], strict=True):
+        ways = [(point.position - home)[:2] for point in (stop, turned)]
+        assert np.linalg.norm(ways[1]) == pytest.approx(np.linalg.norm(ways[0]))
+        angles = [np.arctan2(way[1], way[0]) for way in ways]
+        assert angles[1] - angles[0] == pytest.approx(turned.yaw) == pytest.approx(changed[0].yaw)
+        assert turned.position[2] == stop.position[2] and turned.opening == stop.opening
+    assert abs(changed[0].yaw) == pytest.approx(0.1)
+
+
+def test_what_is_held_is_rubbed_to_and_fro_on_its_goal():
+    stops, changed = changed_stops('expert-grind-0.09')
+    assert changed[:6] == stops[:6] and changed[12:] == stops[6:] and len(changed) == 15
+    assert all(stop.opening == 0 for stop in changed[6:12])
+    ways = np.array([stop.position - stops[5].position for stop in changed[6:12]])
+    np.testing.assert_allclose(ways[:, 2], -0.008)
+    assert np.linalg.norm(ways[1, :2]) == pytest.approx(0.09)
+    strokes = ways[:, :2] @ ways[1, :2] / 0.09**2
+    np.testing.assert_allclose(strokes, [0, 1, -1, 1, -1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize('is_near', [True, False])
+def test_it_is_put_on_the_other_object_next_to_its_goal_and_taken_again(is_near):
+    stops, _ = changed_stops('expert')
+    own, goal = stops[1].position, stops[6].position
+    other = np.array([-0.25, 0.35, 0.04]) if is_near else np.array([0.2, 0.3, 0.04])
+    faults = WayPointFaults(parse_variant('expert-perch-0.03'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [own, other])
+    assert changed[:4] == stops[:4] and changed[11:] == stops[4:] and len(changed) == 16
+    over, low, let_go, wide, again, taken, raised = changed[4:11]
+    assert [s.opening for s in changed[4:11]] == [0, 0, 0.7, 1, 1, 0, 0]
+    lows = [s.position for s in (let_go, again, taken)]
+    np.testing.assert_array_equal(lows, np.repeat(low.position[None], 3, axis=0))
+    highs = [s.position - low.position for s in (over, wide, raised)]
+    np.testing.assert_allclose(highs, np.repeat([[0, 0, 0.05]], 3, axis=0), atol=1e-12)
+    # as high over the other's top, or the table, as it was over the table
+    height = 0.032 + (0.08 if is_near else 0)
+    assert low.position[2] == pytest.approx(height)
+    middle = other if is_near else goal
+    assert np.linalg.norm((low.position - middle)[:2]) == pytest.approx(0.03)
+
+
+def test_a_gripper_flickers_after_it_has_opened_or_closed(expert):
+    expert_plan, chatter = plan(expert, 'expert'), plan(expert, 'expert-chatter-0.6')
+    arms = arm_columns(expert)
+    np.testing.assert_array_equal(chatter[:, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, chatter)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
+    own, flickers = openings[0][used], openings[1][used]
+    closes, lets_go = np.flatnonzero(np.diff(own > 0.5)) + 1
+    differs = np.flatnonzero(np.abs(flickers - own) > 1e-9)
+    after = [differs[differs < lets_go] - closes, differs[differs >= lets_go] - lets_go]
+    # 0.6 s, and the last stroke
+    assert all(0 < rows.min() <= 15 and 20 < rows.max() <= 35 for rows in after)
+    assert flickers[closes + after[0]].max() > 0.8
+    # as long as it flickers, another size draws the same
+    longer = plan(expert, 'expert-chatter-1')
+    np.testing.assert_array_equal(longer[: closes + 29], chatter[: closes + 29])
+
+
+def test_sluggish_arms_fall_behind_on_quick_ways_and_catch_up(expert):
+    expert_plan, sluggish = plan(expert, 'expert'), plan(expert, 'expert-sluggish-0.6')
+    arms = arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    assert len(sluggish) == len(expert_plan)
+    np.testing.assert_array_equal(sluggish[:, grippers], expert_plan[:, grippers])
+    speeds = [np.abs(np.diff(positions[:, arms], axis=0)) for positions in (expert_plan, sluggish)]
+    assert (speeds[1] <= 0.4 * speeds[0].max(axis=0) + 1e-12).all()
+    # at its limit, wherever it is behind
+    off = np.abs(sluggish - expert_plan)[1:, arms] > 1e-9
+    limits = np.broadcast_to(0.4 * speeds[0].max(axis=0), off.shape)
+    np.testing.assert_allclose(speeds[1][off], limits[off], atol=1e-12)
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0.2]
+    behind = np.abs(sluggish - expert_plan)[:, moves]
+    assert (behind.max(axis=0) > 0.05).any() and (behind.min(axis=1) < 1e-9).any()
 
 
 @pytest.mark.parametrize(('kind', 'size'), [('splay', 0.7), ('topple', 0.9)])
@@ -574,6 +668,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'putt',
         'brake',
         'topple',
+        'drag',
+        'askew',
+        'chatter',
+        'grind',
+        'sluggish',
+        'perch',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -657,9 +757,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-topple-1' has topple"
+    said = r"split test are not for training: 'expert-high-0.1-perch-0.03' has perch"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-topple-1'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-perch-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
