@@ -158,9 +158,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-brake-2',
         'expert-brake-3',
     ),
-    'test': (
-        'expert',
-    ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

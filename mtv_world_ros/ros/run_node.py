@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.files import share_path
 from mtv_world_ros.processes import PARENT_VARIABLE
 from mtv_world_ros.signals import end_on_signals
 
@@ -55,6 +56,8 @@ def run(
 ) -> int:
     """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
 
+    Fast DDS is set to send soon again what a reliable subscriber missed, unless it has a profile.
+
     Args:
         make: makes the node; where it has `close()`, that ends it.
         args: command line with the program's name; default: the process' own.
@@ -72,6 +75,8 @@ def run(
     end_with_parent()
     starting = end_on_signals('mtv_world_ros')
     _find_log_folder()
+    heartbeat = share_path('config', 'fastdds_heartbeat.xml')
+    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(heartbeat))
     rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     node: AnyNode | None = None
     failure = ''

@@ -67,6 +67,11 @@ def test_middleware_profile_enlarges_the_shared_memory():
     space = {'dds': root.tag.split('}')[0].strip('{')}
     assert root.find('.//dds:segment_size', space).text == str(32 * 1024**2)
     assert root.find('.//dds:participant', space).get('is_default_profile') == 'true'
+    heartbeats = [
+        ElementTree.parse(share_path('config', name)).find('.//dds:heartbeatPeriod/*', space).text
+        for name in ('fastdds_profile.xml', 'fastdds_heartbeat.xml')
+    ]
+    assert heartbeats == ['100000000'] * 2
 
 
 @pytest.mark.parametrize('name', ['world_model.launch.py', 'replay.launch.py'])

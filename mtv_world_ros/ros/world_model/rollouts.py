@@ -41,7 +41,7 @@ from mtv_world_ros.ros.world_model.requests import RequestMaker
 from mtv_world_ros.ros.world_model.worker import RolloutWorker
 
 #: the first plan of an imagined episode may come this long before what it answers [s]: a lost
-#: message without a next one comes again after the middleware's heartbeat, every 3 s
+#: message without a next one comes again after the sender's heartbeat, by default every 3 s
 _EARLY_S = 5.0
 #: what a node makes and can destroy
 _ENTITIES = ('publisher', 'subscription', 'service', 'timer', 'guard_condition')

@@ -442,7 +442,12 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'lash': _kind('joint', 'calibrate', 0.09, 0.4, 'rad', 'play of every arm joint'),
     'brake': _kind(
-        'joint', 'calibrate', 3.0, 5.0, 's', 'one joint stands still for this long, the others do not'
+        'joint',
+        'calibrate',
+        3.0,
+        5.0,
+        's',
+        'one joint stands still for this long, the others do not',
     ),
     # regrasp
     'retry': _kind(
