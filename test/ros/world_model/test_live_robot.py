@@ -152,6 +152,48 @@ def test_a_camera_placed_by_tf_on_the_robot_and_one_on_its_wrist(start, new_clie
 
 
 @needs_tf2
+def test_a_camera_on_a_head_that_turns_is_where_it_was_at_the_time_of_the_image(
+    start, new_client, ros, cameras
+):
+    client, shown = new_client, '/world_model/high/trajectory/image_raw'
+    start('extrinsics:=tf')
+    client.connect_inputs(ros.INPUTS)
+    client.connect_outputs({shown: Image})
+    tf, high = Broadcaster(client), cameras['high'].T_mount_camera
+    tf.send(('base', LOW, cameras['low'].T_mount_camera), ('head', HIGH, np.eye(4)))
+
+    def turn(angle):
+        """The head's joint is in /tf alone."""
+        turned = pose((0, 0, 0), (0, np.sin(angle / 2), 0, np.cos(angle / 2)))
+        stamp_ns = client.now_ns()
+        tf.send(('base', 'head', high @ turned), moving=True, stamp_ns=stamp_ns)
+        return stamp_ns
+
+    def draw():
+        """Returns the trajectory video of a plan from the newest images."""
+        client.received[shown].clear()
+        since = len(client.report_values())
+        client.send_trajectory()
+        assert client.next_end(since)['state'] == 'done'
+        client.wait(lambda: len(client.received[shown]) == ros.NUM_FRAMES, 'the video')
+        return np.array([message.data for message in client.received[shown]])
+
+    client.send_scene(turn(0.0))
+    ahead = draw()
+    assert client.diagnostic_values().get('extrinsics.high') != 'tf, moving'
+    client.send_scene(turn(0.3))
+    aside = draw()
+    client.wait(
+        lambda: client.diagnostic_values().get('extrinsics.high') == 'tf, moving', 'the source'
+    )
+    assert (ahead != aside).any()
+    stamp_ns = turn(0.0)  # after the image that the next plan starts from
+    np.testing.assert_array_equal(draw(), aside)
+    client.send_scene(stamp_ns)
+    np.testing.assert_array_equal(draw(), ahead)
+
+
+@needs_tf2
 def test_tf_older_than_the_image(start, new_client, ros, cameras):
     client = new_client
     start('extrinsics:=tf', 'max_tf_age_s:=0.5')
