@@ -8,13 +8,14 @@ from geometry_msgs.msg import TransformStamped
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header, String
 
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.transforms import pose, quaternion
-from mtv_world_ros.ros.messages.stamps import NANO, to_stamp
+from mtv_world_ros.ros.messages.stamps import NANO, to_ns, to_stamp
 
 needs_tf2 = pytest.mark.skipif(
     find_spec('tf2_msgs') is None,
@@ -191,6 +192,35 @@ def test_a_camera_on_a_head_that_turns_is_where_it_was_at_the_time_of_the_image(
     np.testing.assert_array_equal(draw(), aside)
     client.send_scene(stamp_ns)
     np.testing.assert_array_equal(draw(), ahead)
+
+
+@needs_tf2
+def test_a_head_that_turned_may_be_elsewhere_when_the_clock_starts_over(
+    start, new_client, ros, cameras
+):
+    client = new_client
+    start('extrinsics:=tf', 'use_sim_time:=true')
+    client.connect_inputs(ros.INPUTS)
+    clock = client.node.create_publisher(Clock, '/clock', 10)
+    tf, high = Broadcaster(client), cameras['high'].T_mount_camera
+    tf.send(('base', LOW, cameras['low'].T_mount_camera), ('head', HIGH, np.eye(4)))
+
+    def end_at(second, x):
+        """Returns how a plan ends at a time with the head at a place."""
+
+        def follows():
+            clock.publish(Clock(clock=to_stamp(second * NANO)))
+            arrays = client.received['/diagnostics']
+            return arrays and to_ns(arrays[-1].header.stamp) == second * NANO
+
+        client.wait(follows, f'the node at {second} s')
+        place = high @ pose((x, 0, 0), (0, 0, 0, 1))
+        tf.send(('base', 'head', place), moving=True, stamp_ns=second * NANO)
+        client.send_scene(second * NANO)
+        return client.imagine_one(scene='sent')['state']
+
+    assert [end_at(60, 0.0), end_at(61, 0.2), end_at(1, 0.1)] == ['done'] * 3
+    assert client.diagnostic_values()['clock_jumps_back'] == '1'
 
 
 @needs_tf2
