@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from typing import Any, NamedTuple
 
@@ -20,6 +21,8 @@ from mtv_world_ros.geometry.transforms import inverse, pose
 STILL = 1e-4
 #: frames kept; a publisher that makes up a name a message must not fill the memory
 _MOST_FRAMES = 2000
+#: transforms kept from one frame to another that moves; at 1 kHz this is a quarter of a second
+_NUM_RECENT = 256
 
 _Numbers = tuple[float, ...]
 
@@ -67,6 +70,7 @@ class _Edge:
         stamp_ns: of the newest one [ns]; None = from /tf_static.
         count: transforms.
         is_still: whether they vary by no more than `STILL`.
+        recent: stamps [ns] and numbers of the last ones while it moves, in the order received.
     """
 
     T: FloatArray
@@ -76,15 +80,33 @@ class _Edge:
     stamp_ns: int | None
     count: int = 1
     is_still: bool = True
+    recent: deque[tuple[int, _Numbers]] = field(default_factory=lambda: deque(maxlen=_NUM_RECENT))
 
-    def see(self, numbers: _Numbers) -> None:
+    def see(self, numbers: _Numbers, stamp_ns: int | None) -> None:
         """Widens the span by a transform; one that moves anyway is not looked at."""
+        if self.is_still:
+            self.recent.clear()
+            self.recent.append((self.stamp_ns or 0, self.last))
         self.count += 1
         if numbers != self.last and self.is_still:
             T = pose(numbers[:3], numbers[3:])
             self.low, self.high = np.minimum(self.low, T), np.maximum(self.high, T)
             self.is_still = bool((self.high - self.low).max() <= STILL)
         self.last = numbers
+        if not self.is_still:
+            self.recent.append((stamp_ns or 0, numbers))
+
+    def at(self, stamp_ns: int | None) -> FloatArray:
+        """(4, 4) the transform at a time, between two interpolated; None = the last one."""
+        if self.is_still:
+            return self.T
+        if stamp_ns is None:
+            return pose(self.last[:3], self.last[3:])
+        recent = sorted(self.recent)
+        after = bisect_left(recent, stamp_ns, key=lambda item: item[0])
+        ends = recent[max(after - 1, 0)], recent[min(after, len(recent) - 1)]
+        low, high = (pose(numbers[:3], numbers[3:]) for _, numbers in ends)
+        return _between(low, high, stamp_ns, ends[0][0], ends[1][0])
 
 
 class TransformTree:
@@ -130,7 +152,7 @@ class TransformTree:
             T = pose(numbers[:3], numbers[3:])
             self._edges[names] = _Edge(T, numbers, T, T, stamp_ns)
             return
-        edge.see(numbers)
+        edge.see(numbers, stamp_ns)
         if edge.stamp_ns is not None and stamp_ns is not None:
             edge.stamp_ns = max(edge.stamp_ns, stamp_ns)
 
@@ -223,14 +245,21 @@ class TransformTree:
             top = parents[top]
         return fixed[top]
 
-    def moving_mount(self, frame: str, links: Collection[str]) -> Mount:
-        """Returns the nearest of the robot's links that TF leads to, by the newest transforms.
+    def moving_mount(
+        self, frame: str, links: Collection[str], stamp_ns: int | None = None
+    ) -> Mount:
+        """Returns the nearest of the robot's links that TF leads to.
+
+        Args:
+            frame: e.g. a camera's optical frame.
+            links: of the robot.
+            stamp_ns: when the pose is wanted [ns]; None = by the newest transforms.
 
         Raises:
             CalibrationError: TF does not lead from the frame to a link.
         """
         frame = self.name(frame)
-        for mount in self._reachable(frame, only_still=False):
+        for mount in self._reachable(frame, only_still=False, stamp_ns=stamp_ns):
             if mount.link in links:
                 return mount
         raise CalibrationError(f"/tf and /tf_static do not lead from frame '{frame}' to the robot")
@@ -277,7 +306,9 @@ class TransformTree:
         ordered = sorted(self._edges, key=lambda names: self._edges[names].count)
         return {child: parent for parent, child in ordered}
 
-    def _reachable(self, frame: str, *, only_still: bool) -> Iterator[Mount]:
+    def _reachable(
+        self, frame: str, *, only_still: bool, stamp_ns: int | None = None
+    ) -> Iterator[Mount]:
         """Yields the frames that TF leads to as mounts, itself and the nearest first.
 
         A breadth-first search that visits a frame once: frames in a circle end it, too.
@@ -285,6 +316,7 @@ class TransformTree:
         Args:
             frame: where to begin.
             only_still: leave out transforms that move.
+            stamp_ns: when the poses are wanted [ns]; None = by the newest transforms.
         """
         neighbours: dict[str, list[tuple[str, _Edge]]] = defaultdict(list)
         for child, parent in self._parents().items():
@@ -299,7 +331,7 @@ class TransformTree:
             for other, edge in neighbours[here.link]:
                 if other not in found:
                     is_parent = self._edges.get((other, here.link)) is edge
-                    T = edge.T if edge.is_still else pose(edge.last[:3], edge.last[3:])
+                    T = edge.at(stamp_ns)
                     T_other_here = T if is_parent else inverse(T)
                     stamps = [s for s in (here.stamp_ns, edge.stamp_ns) if s is not None]
                     T = T_other_here @ here.T_link_frame
@@ -386,11 +418,18 @@ def _interpolated(
         )
     found = []
     for stamp, low, high in zip(stamps_ns, before, after, strict=True):
-        ends = [pin.SE3(known[int(times[i])]) for i in (low, high)]
-        span = times[high] - times[low]
-        share = 0.0 if span <= 0 else float(np.clip((stamp - times[low]) / span, 0, 1))
-        found.append(pin.SE3.Interpolate(*ends, share).homogeneous)
+        ends = int(times[low]), int(times[high])
+        found.append(_between(known[ends[0]], known[ends[1]], int(stamp), *ends))
     return np.array(found)
+
+
+def _between(
+    low: FloatArray, high: FloatArray, stamp_ns: int, low_ns: int, high_ns: int
+) -> FloatArray:
+    """(4, 4) a pose between two, or the nearer one of a time outside of theirs."""
+    span_ns = high_ns - low_ns
+    share = min(max((stamp_ns - low_ns) / span_ns, 0.0), 1.0) if span_ns > 0 else 0.0
+    return np.array(pin.SE3.Interpolate(pin.SE3(low), pin.SE3(high), share).homogeneous)
 
 
 def read_tree(messages: Iterable[Any], prefix: str = '') -> TransformTree:

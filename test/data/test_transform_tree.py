@@ -101,6 +101,20 @@ def test_a_camera_that_moves_is_where_the_newest_transform_says():
     np.testing.assert_allclose(mount.T_link_frame[:3, 3], (0.6, 0, 0))
 
 
+@pytest.mark.parametrize(
+    ('stamp_s', 'x'),
+    [(0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (2.25, 0.25), (2.5, 0.5), (3.0, 0.5), (9.0, 0.5)],
+)
+def test_a_camera_that_moves_is_where_it_was_at_a_time(stamp_s, x):
+    tree = TransformTree()
+    tree.add(message(edge('pan', 'optical', 0.1)), latched=True)
+    for at_s, place in ((1, 0.0), (2, 0.0), (3, 0.5), (2.5, 0.5)):  # the last one came late
+        tree.add(message(edge('base', 'pan', place, stamp_s=at_s)))
+    mount = tree.moving_mount('optical', LINKS, round(stamp_s * 1e9))
+    assert (mount.link, mount.stamp_ns) == ('base', 3_000_000_000)
+    np.testing.assert_allclose(mount.T_link_frame[:3, 3], (0.1 + x, 0, 0))
+
+
 def test_poses_between_two_transforms_are_interpolated_over_another_branch():
     sent = [message(edge('map', 'base', 1.0), edge('pan', 'optical', 0.1))]
     sent += [message(edge('map', 'pan', 0.2 * k, stamp_s=0.2 * k)) for k in range(6)]

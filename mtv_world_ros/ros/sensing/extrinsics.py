@@ -94,9 +94,10 @@ class Extrinsics:
             return None
         try:
             if self._tree.is_moving(frame, self._links):
-                mount = self._tree.moving_mount(frame, self._links)
+                mount = self._tree.moving_mount(frame, self._links, stamp_ns)
                 self._check_age(view, frame, mount, stamp_ns, settings.max_tf_age_s)
                 self._sources[view] = 'tf, moving'
+                self._used.pop(view, None)  # it may be anywhere when /tf starts over
                 return mount
             mount = self._tree.mount(frame, self._links)
         except CalibrationError as error:

@@ -8,13 +8,14 @@ from geometry_msgs.msg import TransformStamped
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header, String
 
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.transforms import pose, quaternion
-from mtv_world_ros.ros.messages.stamps import NANO, to_stamp
+from mtv_world_ros.ros.messages.stamps import NANO, to_ns, to_stamp
 
 needs_tf2 = pytest.mark.skipif(
     find_spec('tf2_msgs') is None,
@@ -149,6 +150,77 @@ def test_a_camera_placed_by_tf_on_the_robot_and_one_on_its_wrist(start, new_clie
     assert end['reason'] == 'camera_pose_changed' and "'left_link_6'" in end['text']
     assert client.reset().success
     assert client.imagine_one()['state'] == 'done'
+
+
+@needs_tf2
+def test_a_camera_on_a_head_that_turns_is_where_it_was_at_the_time_of_the_image(
+    start, new_client, ros, cameras
+):
+    client, shown = new_client, '/world_model/high/trajectory/image_raw'
+    start('extrinsics:=tf')
+    client.connect_inputs(ros.INPUTS)
+    client.connect_outputs({shown: Image})
+    tf, high = Broadcaster(client), cameras['high'].T_mount_camera
+    tf.send(('base', LOW, cameras['low'].T_mount_camera), ('head', HIGH, np.eye(4)))
+
+    def turn(angle):
+        """The head's joint is in /tf alone."""
+        turned = pose((0, 0, 0), (0, np.sin(angle / 2), 0, np.cos(angle / 2)))
+        stamp_ns = client.now_ns()
+        tf.send(('base', 'head', high @ turned), moving=True, stamp_ns=stamp_ns)
+        return stamp_ns
+
+    def draw():
+        """Returns the trajectory video of a plan from the newest images."""
+        client.received[shown].clear()
+        since = len(client.report_values())
+        client.send_trajectory()
+        assert client.next_end(since)['state'] == 'done'
+        client.wait(lambda: len(client.received[shown]) == ros.NUM_FRAMES, 'the video')
+        return np.array([message.data for message in client.received[shown]])
+
+    client.send_scene(turn(0.0))
+    ahead = draw()
+    assert client.diagnostic_values().get('extrinsics.high') != 'tf, moving'
+    client.send_scene(turn(0.3))
+    aside = draw()
+    client.wait(
+        lambda: client.diagnostic_values().get('extrinsics.high') == 'tf, moving', 'the source'
+    )
+    assert (ahead != aside).any()
+    stamp_ns = turn(0.0)  # after the image that the next plan starts from
+    np.testing.assert_array_equal(draw(), aside)
+    client.send_scene(stamp_ns)
+    np.testing.assert_array_equal(draw(), ahead)
+
+
+@needs_tf2
+def test_a_head_that_turned_may_be_elsewhere_when_the_clock_starts_over(
+    start, new_client, ros, cameras
+):
+    client = new_client
+    start('extrinsics:=tf', 'use_sim_time:=true')
+    client.connect_inputs(ros.INPUTS)
+    clock = client.node.create_publisher(Clock, '/clock', 10)
+    tf, high = Broadcaster(client), cameras['high'].T_mount_camera
+    tf.send(('base', LOW, cameras['low'].T_mount_camera), ('head', HIGH, np.eye(4)))
+
+    def end_at(second, x):
+        """Returns how a plan ends at a time with the head at a place."""
+
+        def follows():
+            clock.publish(Clock(clock=to_stamp(second * NANO)))
+            arrays = client.received['/diagnostics']
+            return arrays and to_ns(arrays[-1].header.stamp) == second * NANO
+
+        client.wait(follows, f'the node at {second} s')
+        place = high @ pose((x, 0, 0), (0, 0, 0, 1))
+        tf.send(('base', 'head', place), moving=True, stamp_ns=second * NANO)
+        client.send_scene(second * NANO)
+        return client.imagine_one(scene='sent')['state']
+
+    assert [end_at(60, 0.0), end_at(61, 0.2), end_at(1, 0.1)] == ['done'] * 3
+    assert client.diagnostic_values()['clock_jumps_back'] == '1'
 
 
 @needs_tf2
