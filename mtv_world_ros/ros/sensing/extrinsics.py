@@ -219,5 +219,5 @@ def _differ(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _words(mount: Mount) -> str:
-    x, y, z = mount.T_link_frame[:3, 3]
-    return f"at ({x:.3f}, {y:.3f}, {z:.3f}) m in '{mount.link}'"
+    ahead, place = (', '.join(f'{v:.3f}' for v in mount.T_link_frame[:3, k]) for k in (2, 3))
+    return f"at ({place}) m in '{mount.link}', looking along ({ahead})"
