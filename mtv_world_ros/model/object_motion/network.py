@@ -37,6 +37,8 @@ _EXPECTED, _LARGEST_ERROR_M = 0.8, 0.05
 #: ways of an object out of a finger; the longest [m]; thickness and half the breadth of a finger
 #: before they are learned [m]
 _NUM_WAYS_OUT, _FARTHEST_OUT_M, _FINGER_M = 3, 0.05, 0.01
+#: how much faster than the rest of the network it learns how much of a way is gone
+_YIELDS_GAIN = 8.0
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
 
@@ -433,7 +435,8 @@ class ObjectMotionNetwork(nn.Module):
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
         if self.yielding:
             ways = _ways_out(after, gaps[:, 2], self.fingers / _SCALE, extents, now)
-            linear = linear + (self.yields(edge).tanh()[..., None] * ways).sum(-2)
+            shares = (_YIELDS_GAIN * self.yields(edge)).tanh()
+            linear = linear + (shares[..., None] * ways).sum(-2)
         angular = (frame @ push[..., 3:, None])[..., 0]
         return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
 
