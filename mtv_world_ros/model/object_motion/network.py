@@ -34,6 +34,11 @@ _NUM_FINGERTIP_HEIGHTS = 2 * 4
 #: standard deviation along x and y of an error in the plane whose mean length is 1; the largest of
 #: a step [m]. A yaw errs by as much of a turn as the place of 5 cm
 _EXPECTED, _LARGEST_ERROR_M = 0.8, 0.05
+#: ways of an object out of a finger; the longest [m]; thickness and half the breadth of a finger
+#: before they are learned [m]
+_NUM_WAYS_OUT, _FARTHEST_OUT_M, _FINGER_M = 3, 0.05, 0.01
+#: how much faster than the rest of the network it learns how much of a way is gone
+_YIELDS_GAIN = 8.0
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
 
@@ -153,6 +158,7 @@ class ObjectMotionNetwork(nn.Module):
         hidden: numbers that an object remembers from step to step.
         fingertips: it is told how high either fingertip is over an object's bottom and top;
             differs where a tool leans.
+        yielding: it may move an object just as far as a finger would reach into it.
     """
 
     def __init__(
@@ -162,6 +168,7 @@ class ObjectMotionNetwork(nn.Module):
         hidden: int = 48,
         *,
         fingertips: bool = False,
+        yielding: bool = False,
     ) -> None:
         super().__init__()
         self.config = {
@@ -169,8 +176,10 @@ class ObjectMotionNetwork(nn.Module):
             'width': width,
             'hidden': hidden,
             'fingertips': fingertips,
+            'yielding': yielding,
         }
         self.width, self.hidden, self.fingertips = width, hidden, fingertips
+        self.yielding = yielding
         self.shape = _mlp(num_features + 1, width, _SHAPE)
         # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
         # clearances now and next
@@ -188,14 +197,19 @@ class ObjectMotionNetwork(nn.Module):
         self.stay = nn.Linear(width, 1)
         self.memory = nn.GRUCell(width, hidden)
         self.scale = nn.Linear(width, 1)
-        for layer in (self.push, self.free):
+        still = [self.push, self.free]
+        if yielding:
+            self.yields = nn.Linear(width, _NUM_WAYS_OUT)
+            self.fingers = nn.Parameter(torch.full((2,), _FINGER_M * _SCALE))
+            still.append(self.yields)
+        for layer in still:
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         nn.init.constant_(self.stay.bias, 2.0)
         nn.init.constant_(self.scale.bias, -6.0)
 
     def widened(self, width: int, hidden: int) -> ObjectMotionNetwork:
-        """Returns a wider network with fingertips that computes the same, and can learn more.
+        """Returns a wider one, with fingertips and yielding, that computes the same and can learn.
 
         What is new hears everything and is not listened to at first (Net2Net: Chen et al. 2016).
 
@@ -207,7 +221,9 @@ class ObjectMotionNetwork(nn.Module):
                 f'the network is {self.width} wide and remembers {self.hidden} numbers; it cannot '
                 f'shrink to {width} and {hidden}'
             )
-        wider = ObjectMotionNetwork(self.config['num_features'], width, hidden, fingertips=True)
+        wider = ObjectMotionNetwork(
+            self.config['num_features'], width, hidden, fingertips=True, yielding=True
+        )
         w, h = (self.width, width), (self.hidden, hidden)
         tips = (_NUM_FINGERTIP_HEIGHTS if self.fingertips else 0, _NUM_FINGERTIP_HEIGHTS)
         old, new = self.state_dict(), wider.state_dict()
@@ -217,6 +233,8 @@ class ObjectMotionNetwork(nn.Module):
             'node.0.weight': [(14 + _SHAPE, 14 + _SHAPE), h, w, w],
         }
         for name, value in new.items():
+            if name not in old:  # does nothing at first
+                continue
             same = [(n, m) for n, m in zip(old[name].shape, value.shape, strict=True)]
             rows = [h] * 3 if name.startswith('memory') else same[:1]
             columns = blocks.get(name, same[-1:])
@@ -415,6 +433,10 @@ class ObjectMotionNetwork(nn.Module):
         push = self.push(edge)
         frame = here[:, None, :, :3, :3]
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
+        if self.yielding:
+            ways = _ways_out(after, gaps[:, 2], self.fingers / _SCALE, extents, now)
+            shares = (_YIELDS_GAIN * self.yields(edge)).tanh()
+            linear = linear + (shares[..., None] * ways).sum(-2)
         angular = (frame @ push[..., 3:, None])[..., 0]
         return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
 
@@ -485,6 +507,30 @@ def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory
         above - extents.low[..., None],
     ]
     return _near(torch.stack(rows, -1))
+
+
+def _ways_out(
+    tools: Tensor, gaps: Tensor, fingers: Tensor, extents: _Extents, now: Memory
+) -> Tensor:
+    """(B, O, A, 3, 3) how far an object would have to go so that no finger is in its place [m].
+
+    Out of the nearer finger: away from the tool, across the fingers' travel, towards the tool.
+    `fingers` (2,) are thickness and half the breadth of a finger [m].
+    """
+    x, y, _ = _local(tools, now.points).unbind(-1)
+    axes = tools[:, None, :, :3, :2].expand(-1, now.points.shape[1], -1, -1, -1)
+    directions = F.normalize(axes[..., :2, :], dim=-2, eps=1e-4)
+    across = extents.half_width(directions[..., 0])
+    along = extents.half_width(directions[..., 1])
+    gap = gaps[:, None]
+    to_x, to_y = axes.unbind(-1)
+    depths = [
+        (gap + fingers[0] + along - y.abs(), y.sign(), to_y),
+        (fingers[1] + across - x.abs(), x.sign(), to_x),
+        (y.abs() + along - gap, -y.sign(), to_y),
+    ]
+    rows = [(d.clamp(0.0, _FARTHEST_OUT_M) * sign)[..., None] * way for d, sign, way in depths]
+    return torch.stack(rows, -2)
 
 
 def _fingertip_heights(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory) -> Tensor:

@@ -100,6 +100,38 @@ def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
         network.widened(16, 16)
 
 
+@pytest.mark.parametrize(
+    ('way', 'place', 'gap', 'moved'),
+    [
+        (0, (0.0, 0.06), 0.0375, (0.0, 0.0075)),  # beside a finger that opens
+        (0, (0.0, -0.06), 0.02, (0.0, 0.0)),  # not as far as that
+        (1, (-0.025, 0.0), 0.02, (-0.005, 0.0)),  # across the fingers' travel
+        (2, (0.0, 0.01), 0.025, (0.0, -0.005)),  # a finger closes on it
+    ],
+)
+def test_an_object_yields_just_as_far_as_a_finger_would_reach_into_it(way, place, gap, moved):
+    network = ObjectMotionNetwork(width=16, hidden=8, yielding=True).eval()
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    tools = torch.eye(4).repeat(1, 2, 1, 1, 1)
+    tools[..., :3, :3] = turn
+    gaps = torch.tensor([0.0, gap])[None, :, None]
+    points = turn @ torch.tensor([*place, 0.02])
+    features = torch.tensor([0.04] * 4 + [-0.02, 0.02] + [0.0] * 3).repeat(1, 1, 2, 1)
+    given = Scene(
+        points=points[None, None],
+        features=features,
+        present=torch.ones(1, 1, dtype=torch.bool),
+        tools=tools,
+        gaps=gaps,
+    )
+    with torch.inference_mode():
+        before = network(given).points[0, 1, 0] - points  # untrained, it holds everything still
+        network.yields.bias[way] = 20.0
+        after = network(given).points[0, 1, 0] - points
+    torch.testing.assert_close(before, torch.zeros(3))
+    torch.testing.assert_close(turn.T @ after, torch.tensor([*moved, 0.0]))
+
+
 def test_padding_changes_nothing_and_rotations_stay_rotations(network):
     given = scene(2, 2)
     padded = replace(
