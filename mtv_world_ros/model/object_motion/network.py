@@ -483,6 +483,18 @@ def _near(clearance: Tensor) -> Tensor:
     return (clearance * _NEAR).clamp(-3, 3)
 
 
+def _seen_from(
+    tools: Tensor, extents: _Extents, now: Memory
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(B, O, A) where objects are along x and y of tools (B, A, 4, 4), and half as wide [m]."""
+    x, y, _ = _local(tools, now.points).unbind(-1)
+    frame = tools[:, None, :, :2, :2].expand(-1, now.points.shape[1], -1, -1, -1)
+    directions = F.normalize(frame, dim=-2, eps=1e-4)  # of the tool's x and y in the plane
+    across = extents.half_width(directions[..., 0])
+    along = extents.half_width(directions[..., 1])
+    return x, y, across, along
+
+
 def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory) -> Tensor:
     """(B, O, A, 7) of tools (B, A, 4, 4) with fingers `gaps` (B, A) away.
 
@@ -490,11 +502,7 @@ def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory
     fingers' outside; how far it is from them across their travel; how much wider it is than the
     fingers are apart; how far tips are above its top and above its bottom.
     """
-    x, y, _ = _local(tools, now.points).unbind(-1)
-    frame = tools[:, None, :, :2, :2].expand(-1, now.points.shape[1], -1, -1, -1)
-    directions = F.normalize(frame, dim=-2, eps=1e-4)  # of the tool's x and y in the plane
-    across = extents.half_width(directions[..., 0])
-    along = extents.half_width(directions[..., 1])
+    x, y, across, along = _seen_from(tools, extents, now)
     gap = gaps[:, None]
     above = tools[:, None, :, 2, 3] - now.points[..., None, 2]
     rows = [
@@ -517,13 +525,9 @@ def _ways_out(
     Out of the nearer finger: away from the tool, across the fingers' travel, towards the tool.
     `fingers` (2,) are thickness and half the breadth of a finger [m].
     """
-    x, y, _ = _local(tools, now.points).unbind(-1)
-    axes = tools[:, None, :, :3, :2].expand(-1, now.points.shape[1], -1, -1, -1)
-    directions = F.normalize(axes[..., :2, :], dim=-2, eps=1e-4)
-    across = extents.half_width(directions[..., 0])
-    along = extents.half_width(directions[..., 1])
+    x, y, across, along = _seen_from(tools, extents, now)
     gap = gaps[:, None]
-    to_x, to_y = axes.unbind(-1)
+    to_x, to_y = tools[:, None, :, :3, :2].unbind(-1)
     depths = [
         (gap + fingers[0] + along - y.abs(), y.sign(), to_y),
         (fingers[1] + across - x.abs(), x.sign(), to_x),
