@@ -84,14 +84,13 @@ class _Edge:
 
     def see(self, numbers: _Numbers, stamp_ns: int | None) -> None:
         """Widens the span by a transform; one that moves anyway is not looked at."""
-        if self.is_still:
-            self.recent.clear()
-            self.recent.append((self.stamp_ns or 0, self.last))
         self.count += 1
         if numbers != self.last and self.is_still:
             T = pose(numbers[:3], numbers[3:])
             self.low, self.high = np.minimum(self.low, T), np.maximum(self.high, T)
             self.is_still = bool((self.high - self.low).max() <= STILL)
+            if not self.is_still:
+                self.recent.append((self.stamp_ns or 0, self.last))
         self.last = numbers
         if not self.is_still:
             self.recent.append((stamp_ns or 0, numbers))
