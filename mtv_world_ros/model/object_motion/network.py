@@ -158,7 +158,8 @@ class ObjectMotionNetwork(nn.Module):
         hidden: numbers that an object remembers from step to step.
         fingertips: it is told how high either fingertip is over an object's bottom and top;
             differs where a tool leans.
-        yielding: it may move an object just as far as a finger would reach into it.
+        yielding: it may move an object just as far as a finger, or another object, would reach
+            into it.
     """
 
     def __init__(
@@ -201,7 +202,8 @@ class ObjectMotionNetwork(nn.Module):
         if yielding:
             self.yields = nn.Linear(width, _NUM_WAYS_OUT)
             self.fingers = nn.Parameter(torch.full((2,), _FINGER_M * _SCALE))
-            still.append(self.yields)
+            self.gives_way = nn.Linear(width, 1)
+            still += [self.yields, self.gives_way]
         for layer in still:
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -359,7 +361,7 @@ class ObjectMotionNetwork(nn.Module):
         """
         before, here, after = tools.unbind(1)
         heard, gates, pushed = self._from_tools(gaps, extents, now, (before, here, after))
-        told = self._from_objects(present, extents, now)
+        told, shares = self._from_objects(present, extents, now)
         height = now.points[..., 2]
         node = self.node(
             torch.cat(
@@ -392,6 +394,8 @@ class ObjectMotionNetwork(nn.Module):
             + pushed[..., :3]
             + free[..., :3] / _SCALE
         )
+        if shares is not None:
+            moved = moved - (shares[..., None] * _ways_apart(moved, extents, now)).sum(2)
         spin = _vector(carry[..., :3, :3])  # (B, A, 3)
         turn = (held[..., None] * spin[:, None]).sum(2) + pushed[..., 3:] + free[..., 3:]
         turned = _rotation(turn) @ now.rotations
@@ -440,8 +444,10 @@ class ObjectMotionNetwork(nn.Module):
         angular = (frame @ push[..., 3:, None])[..., 0]
         return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
 
-    def _from_objects(self, present: Tensor, extents: _Extents, now: Memory) -> Tensor:
-        """Messages (B, O, D) of the other objects."""
+    def _from_objects(
+        self, present: Tensor, extents: _Extents, now: Memory
+    ) -> tuple[Tensor, Tensor | None]:
+        """Messages (B, O, D) of the others, and shares (B, O, O) of how far each is given way."""
         count = now.points.shape[1]
         offset = now.points[:, None] - now.points[:, :, None]  # of the second from the first
         own = torch.cat([extents.shape, now.hidden], dim=-1)
@@ -462,7 +468,10 @@ class ObjectMotionNetwork(nn.Module):
         ]
         edge = self.object_edge(torch.cat(inputs, dim=-1))
         pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=offset.device)
-        return (edge * pairs[..., None]).sum(2)
+        heard = (edge * pairs[..., None]).sum(2)
+        if not self.yielding:
+            return heard, None
+        return heard, (_YIELDS_GAIN * self.gives_way(edge)[..., 0]).tanh() * pairs
 
 
 def _erring(moved: Tensor, turned: Tensor, more: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
@@ -560,6 +569,18 @@ def _object_clearances(offset: Tensor, extents: _Extents, now: Memory) -> Tensor
         bottom[:, :, None] - top[:, None],
     ]
     return _near(torch.stack(rows, -1))
+
+
+def _ways_apart(moved: Tensor, extents: _Extents, now: Memory) -> Tensor:
+    """(B, O, O, 3) how far the second object would reach into the first, more than now [m]."""
+    offset = now.points[:, None, :, :2] - now.points[:, :, None, :2]
+    direction = F.normalize(offset, dim=-1, eps=1e-4)
+    half = extents.half_width(direction)
+    apart = half + half.transpose(1, 2)
+    after = moved[:, None, :, :2] - moved[:, :, None, :2]
+    free = (offset.norm(dim=-1) - apart).clamp(min=0.0)
+    depth = ((offset - after) * direction).sum(-1) - free
+    return F.pad(depth.clamp(0.0, _FARTHEST_OUT_M)[..., None] * direction, (0, 1))
 
 
 def _local(tools: Tensor, points: Tensor) -> Tensor:

@@ -112,24 +112,39 @@ def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
 def test_an_object_yields_just_as_far_as_a_finger_would_reach_into_it(way, place, gap, moved):
     network = ObjectMotionNetwork(width=16, hidden=8, yielding=True).eval()
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    given, points = beside_fingers([place], gap, turn)
+    with torch.inference_mode():
+        before = network(given).points[0, 1] - points  # untrained, it holds everything still
+        network.yields.bias[way] = 20.0
+        after = network(given).points[0, 1] - points
+    torch.testing.assert_close(before, torch.zeros(1, 3))
+    torch.testing.assert_close(after @ turn, torch.tensor([[*moved, 0.0]]))
+
+
+def test_an_object_yields_just_as_far_as_another_would_reach_into_it():
+    network = ObjectMotionNetwork(width=16, hidden=8, yielding=True).eval()
+    given, points = beside_fingers([(0.0, 0.06), (0.0, 0.105), (0.0, 0.3)], 0.0375, torch.eye(3))
+    with torch.inference_mode():
+        network.yields.bias[0] = network.gives_way.bias[0] = 20.0
+        after = network(given).points[0, 1] - points
+    # the first is pushed by 7.5 mm, 5 mm are between the two, and each gives way to the other
+    expected = torch.tensor([[0, 0.005, 0], [0, 0.0025, 0], [0, 0, 0]])
+    torch.testing.assert_close(after, expected)
+
+
+def beside_fingers(places, gap: float, turn: torch.Tensor) -> tuple[Scene, torch.Tensor]:
+    """Objects 4 cm wide at places in a tool's frame, whose shut fingers open; their points."""
     tools = torch.eye(4).repeat(1, 2, 1, 1, 1)
     tools[..., :3, :3] = turn
-    gaps = torch.tensor([0.0, gap])[None, :, None]
-    points = turn @ torch.tensor([*place, 0.02])
-    features = torch.tensor([0.04] * 4 + [-0.02, 0.02] + [0.0] * 3).repeat(1, 1, 2, 1)
-    given = Scene(
-        points=points[None, None],
-        features=features,
-        present=torch.ones(1, 1, dtype=torch.bool),
+    points = torch.tensor([[*place, 0.02] for place in places]) @ turn.T
+    scene = Scene(
+        points=points[None],
+        features=torch.tensor([0.04] * 4 + [-0.02, 0.02, 0, 0, 0]).repeat(1, len(places), 2, 1),
+        present=torch.ones(1, len(places), dtype=torch.bool),
         tools=tools,
-        gaps=gaps,
+        gaps=torch.tensor([0.0, gap])[None, :, None],
     )
-    with torch.inference_mode():
-        before = network(given).points[0, 1, 0] - points  # untrained, it holds everything still
-        network.yields.bias[way] = 20.0
-        after = network(given).points[0, 1, 0] - points
-    torch.testing.assert_close(before, torch.zeros(3))
-    torch.testing.assert_close(turn.T @ after, torch.tensor([*moved, 0.0]))
+    return scene, points
 
 
 def test_padding_changes_nothing_and_rotations_stay_rotations(network):
