@@ -91,6 +91,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-putt-0.06',
         'expert-topple-0.9',
         'expert-topple-1',
+        'expert-drag-0.75',
+        'expert-drag-0.85',
+        'expert-chatter-0.45',
+        'expert-chatter-0.5',
+        'expert-grind-0.09',
+        'expert-grind-0.1',
+        'expert-perch-0.05',
+        'expert-perch-0.06',
     ),
     'calibrate': (
         'expert',
@@ -157,22 +165,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-shuffle-1',
         'expert-brake-2',
         'expert-brake-3',
-    ),
-    'test': (
-        'expert',
-        'expert-drag-0.75',
-        'expert-drag-0.85',
         'expert-askew-0.12',
         'expert-askew-0.14',
-        'expert-chatter-0.45',
-        'expert-chatter-0.5',
-        'expert-grind-0.09',
-        'expert-grind-0.1',
         'expert-sluggish-0.67',
         'expert-sluggish-0.69',
-        'expert-perch-0.05',
-        'expert-perch-0.06',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -114,7 +114,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'drop_high': _kind('height', 'calibrate', 0.04, 0.15, 'm', 'it lets go this much too high'),
     'drag': _kind(
         'height',
-        'test',
+        'train',
         0.75,
         1.0,
         '',
@@ -145,7 +145,7 @@ FAULTS: Mapping[str, FaultKind] = {
         'lateral', 'train', 0.015, 0.08, 'm', 'standard deviation of every way point, in x, y, z'
     ),
     'askew': _kind(
-        'lateral', 'test', 0.12, 0.3, 'rad', 'all places are turned about where the arm rests'
+        'lateral', 'calibrate', 0.12, 0.3, 'rad', 'all places are turned about where the arm rests'
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
@@ -204,7 +204,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'chatter': _kind(
         'opening',
-        'test',
+        'train',
         0.45,
         2.0,
         's',
@@ -357,7 +357,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'grind': _kind(
         'collision',
-        'test',
+        'train',
         0.09,
         0.12,
         'm',
@@ -435,7 +435,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'sluggish': _kind(
         'speed',
-        'test',
+        'calibrate',
         0.67,
         0.95,
         '',
@@ -538,7 +538,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'perch': _kind(
         'regrasp',
-        'test',
+        'train',
         0.05,
         0.08,
         'm',
