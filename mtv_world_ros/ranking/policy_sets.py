@@ -30,6 +30,7 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-visit-1',
         'expert-meet-1',
         'expert-fidget-5',
+        'expert-tinker-4',
         'expert-glitch-3',
         # of `test`, until they had been measured
         'expert-early-0.3',

@@ -277,6 +277,15 @@ FAULTS: Mapping[str, FaultKind] = {
         'number of things done one after the other at any object, drawn at random: open or close, '
         'rise or sink, lean, turn, go aside',
     ),
+    'tinker': _kind(
+        'collision',
+        'train',
+        4,
+        12,
+        '',
+        'number of things done one after the other with what it holds, drawn at random: press it '
+        'down, drag, lean or turn it, put it on any object or where that lies, let it go, take it',
+    ),
     'meet': _kind(
         'collision',
         'train',
@@ -727,7 +736,17 @@ _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
 _OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival')
 #: kinds of what a gripper does
-_OF_GRIPPERS = ('starve', 'splay', 'putt', 'topple', 'drag', 'chatter', 'grind', 'perch')
+_OF_GRIPPERS = (
+    'starve',
+    'splay',
+    'putt',
+    'topple',
+    'tinker',
+    'drag',
+    'chatter',
+    'grind',
+    'perch',
+)
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 

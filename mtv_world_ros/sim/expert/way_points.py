@@ -48,6 +48,7 @@ _KEEP_TEMPO = frozenset(
         'putt',
         'topple',
         'fidget',
+        'tinker',
         'drag',
         'grind',
         'perch',
@@ -64,6 +65,8 @@ _VISIT_BESIDE_M, _VISIT_YAW_RAD, _VISIT_LEAN_RAD = 0.012, 0.6, 0.35
 #: one thing after the other at an object: standard deviations beside its centre [m], of a lean and
 #: of a turn [rad]; how far it rises or sinks [m]; the time that opening or closing takes [s]
 _FIDGET_BESIDE_M, _FIDGET_RAD, _FIDGET_RISE_M, _FIDGET_S = 0.03, 0.5, (-0.04, 0.06), 0.3
+#: how deep what is held may be pressed on what is under it [m]; how often it comes to an object
+_TINKER_DEPTH_M, _TINKER_OTHER = 0.025, 0.2
 #: what is carried meets an object: how high the tool is over where it grasped, how far the centres
 #: pass each other [m]
 _MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
@@ -528,25 +531,51 @@ def _fidget(stops: Stops, size: float, side: _Side) -> Stops:
     )
     run = [_above(here, floor)]
     for _ in range(round(size)):
-        last = replace(run[-1], seconds=None)
-        match str(
-            rng.choice(['opening', 'height', 'place', 'lean', 'turn'], p=[0.4, *[0.15] * 4])
-        ):
-            case 'opening':
-                opening = float(rng.choice((0.0, rng.uniform(), 1.0)))
-                last = replace(last, opening=opening, seconds=_FIDGET_S)
-            case 'height':
-                last = _above(last.moved(_up(rng.uniform(*_FIDGET_RISE_M))), floor)
-            case 'place':
-                last = last.moved(rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0))
-            case 'lean':
-                last = replace(last, lean=float(rng.normal(0.0, _FIDGET_RAD)))
-            case _:
-                last = replace(last, yaw=last.yaw + float(rng.normal(0.0, _FIDGET_RAD)))
-        run.append(last)
+        run.append(_varied(run[-1], floor, rng))
     before, after = (_up(rng.uniform(*_VISIT_RISE_M)) for _ in range(2))
     left = replace(run[-1], seconds=None).moved(after)
     return [*stops[:at], run[0].moved(before), *run, left, *stops[at:]]
+
+
+def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
+    """What comes after a way point if one thing changes: opening, height, place, lean or turn."""
+    last = replace(stop, seconds=None)
+    match str(rng.choice(['opening', 'height', 'place', 'lean', 'turn'], p=[0.4, *[0.15] * 4])):
+        case 'opening':
+            opening = float(rng.choice((0.0, rng.uniform(), 1.0)))
+            return replace(last, opening=opening, seconds=_FIDGET_S)
+        case 'height':
+            return _above(last.moved(_up(rng.uniform(*_FIDGET_RISE_M))), floor)
+        case 'place':
+            return last.moved(rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0))
+        case 'lean':
+            return replace(last, lean=float(rng.normal(0.0, _FIDGET_RAD)))
+        case _:
+            return replace(last, yaw=last.yaw + float(rng.normal(0.0, _FIDGET_RAD)))
+
+
+def _tinker(stops: Stops, size: float, side: _Side) -> Stops:
+    """With what the gripper holds, one thing changes after the other, on the table and on objects.
+
+    So it is pressed down, dragged, leaned, put on what lies there, let go and taken again.
+    """
+    rng, lift = side.play, _first(stops, 'lift')
+    low = float(stops[lift - 1].position[2])
+    floor = low - rng.uniform(0.0, _TINKER_DEPTH_M)
+    at = int(rng.integers(lift, _first(stops, 'open') + 1))
+    run = [replace(stops[at - 1], phase='carry', seconds=None)]
+    for _ in range(round(size)):
+        if rng.random() < _TINKER_OTHER:
+            place = side.objects[int(rng.integers(len(side.objects)))]
+            # what lies on the table is twice as high as its centre
+            over = place * (1, 1, rng.choice((0, 2))) + _up(floor)
+            over = over + rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0)
+            there = replace(run[-1], position=over, seconds=None)
+            high = _up(max(_PERCH_RISE_M, run[-1].position[2] - over[2]))
+            run += [there.moved(high), there]
+        else:
+            run.append(_varied(run[-1], floor, rng))
+    return [*stops[:at], *run[1:], *stops[at:]]
 
 
 def _meet(stops: Stops, size: float, side: _Side) -> Stops:
@@ -764,6 +793,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'odd': _odd,
     'visit': _visit,
     'fidget': _fidget,
+    'tinker': _tinker,
     'meet': _meet,
     'knock': _knock,
     'brush': _brush,

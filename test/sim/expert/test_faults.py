@@ -747,6 +747,29 @@ def test_at_an_object_one_thing_changes_after_the_other():
     assert counts['opening'] > 20 and min(counts.values()) > 5
 
 
+def test_what_is_held_is_pressed_dragged_put_on_objects_and_let_go():
+    stops, _ = changed_stops('expert')
+    places = [stops[2].position, np.array([0.1, 0.3, 0.05])]
+    low, seen, counts = stops[2].position[2], [], []
+    for seed in range(40):
+        faults = WayPointFaults(parse_variant('expert-tinker-6'), np.random.default_rng(seed))
+        changed = faults.applied(stops, 0.0, places)
+        own = {id(stop) for stop in stops}
+        new = [number for number, stop in enumerate(changed) if id(stop) not in own]
+        assert new == list(range(new[0], new[-1] + 1)), 'in one run'
+        assert changed[new[0] - 1].phase in ('close', 'lift', 'carry', 'lower')
+        assert len(changed) == len(stops) + len(new) and 6 <= len(new) <= 12
+        run = [changed[number] for number in new]
+        assert all(stop.position[2] >= low - 0.025 - 1e-9 for stop in run)
+        seen += run
+        counts.append(len(new))
+    assert any(stop.position[2] < low - 0.01 for stop in seen), 'pressed down'
+    assert any(stop.opening == 1.0 for stop in seen) and any(stop.lean for stop in seen)
+    assert np.mean(counts) > 6.5, 'some come to an object, over it first'
+    others = [stop for stop in seen if np.linalg.norm((stop.position - places[1])[:2]) < 0.08]
+    assert any(stop.position[2] < 2 * places[1][2] + low for stop in others)
+
+
 def test_random_policies_are_of_the_kinds_asked_for():
     rng = np.random.default_rng(0)
     drawn = [draw_variant(kinds_of('calibrate'), rng) for _ in range(400)]
