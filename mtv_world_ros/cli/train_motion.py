@@ -68,6 +68,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='torch.compile: 1.8 times as fast; needs a C++ compiler',
     )
     parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1')
+    parser.add_argument(
+        '--dtype',
+        default='float32',
+        help='of the products of matrices: float32, bfloat16, or auto (bfloat16 where the '
+        'processor has it)',
+    )
     parser.add_argument('--threads', type=int, default=0, help='0 = all cores but one')
     add_overwrite(parser)
     parser.set_defaults(handler=_train)
@@ -84,7 +90,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.geometry.robot_file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
     from mtv_world_ros.model.object_motion.predictor import add_members, load_network
-    from mtv_world_ros.model.runtime import check_device, set_num_threads
+    from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.object_motion.motion_training import (
         end_errors,
@@ -97,6 +103,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_run import find_episodes
 
     check_device(arguments.device)
+    dtype = choose_dtype(arguments.dtype, arguments.device)
     check_free(arguments.out / OBJECT_MOTION_FOLDER, arguments.overwrite)
     given = [load_network(Path(folder) / OBJECT_MOTION_FOLDER) for folder in arguments.init]
     init = mean_network(given) if given else None
@@ -124,6 +131,7 @@ def _train(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             compile=arguments.compile,
             device=arguments.device,
+            dtype=dtype,
             width=arguments.width,
             hidden=arguments.hidden,
         ),

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import copy
 from dataclasses import dataclass, fields
+from functools import partial
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import nn, Tensor
 import torch.nn.functional as F
 from tqdm import tqdm
 
@@ -62,6 +63,8 @@ class MotionTraining:
         seed: of weights and windows.
         compile: with torch.compile, which needs a C++ compiler and is 1.8 times as fast.
         device: to train on; on a GPU a step's passes are captured and replayed.
+        dtype: of the products of matrices over pairs and nodes; weights, geometry and sums stay
+            float32.
         width: D of the network; what it goes on from is widened and computes the same at first;
             None = as it is, or 128.
         hidden: numbers that an object remembers from step to step; likewise, or 48.
@@ -74,6 +77,7 @@ class MotionTraining:
     seed: int = 0
     compile: bool = False
     device: str = 'cpu'
+    dtype: torch.dtype = torch.float32
     width: int | None = None
     hidden: int | None = None
 
@@ -195,6 +199,7 @@ def _losses(
     optimizers = _optimizers(network, config.learning_rate)
     pools = pools_of(tracks, config.device)
     shares = np.array([len(pool) for pool in pools]) / len(tracks)
+    _multiply_in(network, config.dtype)
     if config.compile:
         network.step = torch.compile(network.step)
     passes = _Passes(network)
@@ -212,6 +217,19 @@ def _losses(
                 optimizer.step()
         averaged.update_parameters(network)
         yield loss.item()
+
+
+def _multiply_in(network: ObjectMotionNetwork, dtype: torch.dtype) -> None:
+    """Lets layers over pairs and nodes multiply in a number format; what comes out is float32."""
+    if dtype == torch.float32:
+        return
+    for layer in (*network.tool_edge, *network.object_edge, *network.node):
+        if isinstance(layer, nn.Linear):
+            layer.forward = partial(_product, layer, dtype)  # type: ignore[method-assign]
+
+
+def _product(layer: nn.Linear, dtype: torch.dtype, x: Tensor) -> Tensor:
+    return F.linear(x.to(dtype), layer.weight.to(dtype), layer.bias.to(dtype)).float()
 
 
 class _Passes:

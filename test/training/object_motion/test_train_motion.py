@@ -110,6 +110,17 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
         train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
+def test_products_in_bfloat16_train_nearly_the_same_and_keep_float32(episodes, robot, tmp_path):
+    tracks = [starts[0] for starts in read_tracks(episodes, robot, VIEWS)[0]]
+    config = MotionTraining(steps=8, batch_size=4, forced_share=1.0, width=24, hidden=8)
+    weights = []
+    for dtype in (torch.float32, torch.bfloat16):
+        network = train_motion(tracks, tmp_path / str(dtype), replace(config, dtype=dtype))
+        assert {value.dtype for value in network.state_dict().values()} == {torch.float32}
+        weights.append(network.node[0].weight.detach())
+    assert 0 < (weights[1] - weights[0]).norm() < 0.05 * weights[0].norm()
+
+
 def test_training_goes_on_from_networks_and_replaces_none_unasked(
     episodes, robot, tmp_path, capsys
 ):
