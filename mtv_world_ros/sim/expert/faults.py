@@ -106,6 +106,14 @@ FAULTS: Mapping[str, FaultKind] = {
         's',
         'two chunks of commands of this length are carried out in the wrong order, once',
     ),
+    'offbeat': _kind(
+        'timing',
+        'test',
+        0.4,
+        1.0,
+        '',
+        'share by which the grippers are faster or slower than the arms, at most',
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -150,6 +158,9 @@ FAULTS: Mapping[str, FaultKind] = {
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
     'lean': _kind('wrist', 'train', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
+    'scoop': _kind(
+        'wrist', 'test', 0.6, 0.9, 'rad', 'it comes down leaning, upright as the fingers close'
+    ),
     # opening
     'loose': _kind(
         'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
@@ -372,6 +383,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'what it holds is pressed on its goal and rubbed to and fro there, this far',
     ),
+    'paw': _kind(
+        'collision',
+        'test',
+        0.05,
+        0.12,
+        'm',
+        'shut fingers press on the object and drag it this far; it is grasped where it was',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -450,6 +469,9 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share that lacks of the top speed of every arm joint; the grippers are in time',
     ),
+    'waggle': _kind(
+        'speed', 'test', 0.1, 0.12, 'm', 'once lifted, it waves what it holds to and fro, this far'
+    ),
     # joint
     'zero': _kind(
         'joint',
@@ -492,6 +514,14 @@ FAULTS: Mapping[str, FaultKind] = {
         5.0,
         's',
         'one joint stands still for this long, the others do not',
+    ),
+    'ratchet': _kind(
+        'joint',
+        'test',
+        0.1,
+        0.5,
+        '',
+        'share that every joint loses of the way that it turns to one side',
     ),
     # regrasp
     'retry': _kind(
@@ -552,6 +582,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.08,
         'm',
         'it puts the object on another one, this far off its middle, and takes it again',
+    ),
+    'nibble': _kind(
+        'regrasp',
+        'test',
+        0.06,
+        0.1,
+        'm',
+        'it comes down this far off and closes three times on its way to the right place',
     ),
 }
 
@@ -746,6 +784,10 @@ _OF_GRIPPERS = (
     'chatter',
     'grind',
     'perch',
+    'offbeat',
+    'paw',
+    'waggle',
+    'nibble',
 )
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
@@ -864,7 +906,7 @@ def _controller_faults(
         positions = _coarse(positions, grippers, variant.size('coarse'), period)
         positions = np.clip(positions, robot.lower, robot.upper)
     positions = _lash(positions, grippers, variant.size('lash') / 2)
-    positions = _one_joint(positions, variant, grippers, period, rng)
+    positions = _one_joint(positions, variant, robot, grippers, period, rng)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
     positions = _sluggish(positions, grippers, variant.size('sluggish'))
     positions = _off_course(positions, variant, robot, grippers, period, rng)
@@ -896,7 +938,7 @@ def _out_of_time(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T', J): chunks in the wrong order; chunks, or joints, each with a timing of its own."""
+    """(T', J): chunks in the wrong order; chunks, joints or grippers off their time."""
     if variant.size('shuffle'):
         share, num = _own(rng).uniform(), round(variant.size('shuffle') / period)
         positions = _shuffle(positions, float(share), num, period)
@@ -906,23 +948,31 @@ def _out_of_time(
     if variant.size('ragged'):
         own = _own(rng)
         positions = _ragged(positions, grippers, variant.size('ragged') / period, own)
+    if variant.size('offbeat'):
+        own = _own(rng)
+        positions = _offbeat(positions, grippers, variant.size('offbeat'), own)
     return positions
 
 
 def _one_joint(
     positions: FloatArray,
     variant: PolicyVariant,
+    robot: RobotModel,
     grippers: list[int],
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): one joint that moves less than the others, or for a while not at all."""
+    """(T, J): one joint moves less than the others, or for a while not at all; or all lose way."""
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
     if variant.size('brake'):
         own = _own(rng)
         positions = _brake(positions, grippers, round(variant.size('brake') / period), period, own)
+    if variant.size('ratchet'):
+        own = _own(rng)
+        positions = _ratchet(positions, grippers, variant.size('ratchet'), own)
+        positions = np.clip(positions, robot.lower, robot.upper)
     return positions
 
 
@@ -1132,6 +1182,19 @@ def _ragged(
     return np.stack([np.interp(rows - by, rows, column) for by, column in columns], axis=1)
 
 
+def _offbeat(
+    positions: FloatArray, grippers: list[int], most: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T', J): the grippers are faster than the arms, or slower, by a share of up to `most`."""
+    share = most * rng.uniform(-1.0, 1.0)
+    tempo = 1 + share if share > 0 else 1 / (1 - share)
+    whole, _ = _delayed(positions, int(np.ceil(max(-share, 0.0) * len(positions))))
+    rows = np.arange(len(whole))
+    for column in grippers:
+        whole[:, column] = np.interp(tempo * rows, rows, whole[:, column])
+    return whole
+
+
 def _ring(positions: FloatArray, grippers: list[int], angle: float) -> FloatArray:
     """(T, J): the arms follow as masses on springs do, which swing by `angle` [rad] a sample."""
     damped = angle * np.sqrt(1 - _DAMPING**2)
@@ -1260,6 +1323,18 @@ def _brake(
     after = np.maximum(np.arange(len(whole)) - first - num, 0)
     blend = np.minimum(after * period / _JUMP_S, 1.0)[first:]
     whole[first:, joint] = stands + blend * (positions[first:, joint] - stands)
+    return whole
+
+
+def _ratchet(
+    positions: FloatArray, grippers: list[int], lost: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J): an arm joint loses a share of its way to one side, drawn, and its error adds up."""
+    steps, sides = np.diff(positions, axis=0), rng.choice((-1.0, 1.0), positions.shape[1])
+    behind = np.cumsum(np.where(steps * sides > 0, lost * steps, 0.0), axis=0)
+    whole = positions.copy()
+    whole[1:] -= behind
+    whole[:, grippers] = positions[:, grippers]
     return whole
 
 

@@ -52,6 +52,9 @@ _KEEP_TEMPO = frozenset(
         'drag',
         'grind',
         'perch',
+        'paw',
+        'waggle',
+        'nibble',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -77,6 +80,12 @@ _GRIND_DEPTH_M, _GRIND_S = 0.008, 0.4
 #: what it is put down on is at most this far from its goal, and from where its arm rests, or this
 #: much farther from there than its goal; how far it rises there [m]
 _PERCH_GOAL_M, _PERCH_ARM_M, _PERCH_MORE_M, _PERCH_RISE_M = 0.2, 0.27, 0.03, 0.05
+#: how high over its grasp shut fingers press on an object that they drag away [m]
+_PAW_HEIGHT_M = 0.01
+#: what is held is waved to and fro: how often, and time of a stroke [s]
+_NUM_WAGGLES, _WAGGLE_S = 4, 0.2
+#: how often fingers close on their way to the right place
+_NUM_NIBBLES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -761,6 +770,56 @@ def _perch(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[: lift + 1], *perched, *stops[lift + 1 :]]
 
 
+def _scoop(stops: Stops, size: float, side: _Side) -> Stops:
+    """It comes down leaning and is upright only as the fingers close.
+
+    To the other side, drawn anew, where the wrist does not lean so far.
+    """
+    lean = float(side.play.choice((-1.0, 1.0))) * size
+    return _changed(stops, ('above', 'grasp'), lambda s: replace(s, lean=s.lean + lean))
+
+
+def _paw(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers press on the object and drag it away; it is grasped where it was.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    grasp, way = stops[_first(stops, 'grasp')], size * _drawn_way(side)
+    above = replace(stops[0], opening=0.0)
+    down = replace(grasp, phase='above', opening=0.0).moved(_up(_PAW_HEIGHT_M))
+    return [above, down, down.moved(way), above.moved(way), *stops]
+
+
+def _waggle(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds is waved to and fro, once lifted, and may slip out of the fingers.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    lift, way = _first(stops, 'lift'), size * _drawn_way(side)
+    lifted = replace(stops[lift], phase='carry', seconds=_WAGGLE_S)
+    strokes = [lifted.moved(to * way) for to in (1, -1) * _NUM_WAGGLES]
+    return [*stops[: lift + 1], *strokes, lifted, *stops[lift + 1 :]]
+
+
+def _nibble(stops: Stops, size: float, side: _Side) -> Stops:
+    """It comes down beside the object, and closes again and again on its way to the right place.
+
+    From another side, drawn anew, where the arm does not reach so far.
+    """
+    first, way = _first(stops, 'close'), size * _drawn_way(side)
+    grasp, close = (replace(stop, phase='above') for stop in stops[first - 1 : first + 1])
+    bite = [grasp, close, replace(close, opening=grasp.opening)]
+    shares = np.arange(_NUM_NIBBLES, 0, -1) / _NUM_NIBBLES
+    bites = [stop.moved(share * way) for share in shares for stop in bite]
+    return [stops[0].moved(way), *bites, *stops[first - 1 :]]
+
+
+def _drawn_way(side: _Side) -> FloatArray:
+    """Unit vector (3,) in a direction of the plane that every draw of a plan has anew."""
+    angle = side.play.uniform(0.0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
 def _wander(stops: Stops, size: float, side: _Side) -> Stops:
     floor = min(stop.position[2] for stop in stops)
 
@@ -818,4 +877,8 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'askew': _askew,
     'grind': _grind,
     'perch': _perch,
+    'scoop': _scoop,
+    'paw': _paw,
+    'waggle': _waggle,
+    'nibble': _nibble,
 }

@@ -210,7 +210,21 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
 
 
 @pytest.mark.parametrize(
-    'kind', ['starve', 'splay', 'putt', 'topple', 'drag', 'chatter', 'grind', 'perch']
+    'kind',
+    [
+        'starve',
+        'splay',
+        'putt',
+        'topple',
+        'drag',
+        'chatter',
+        'grind',
+        'perch',
+        'offbeat',
+        'paw',
+        'waggle',
+        'nibble',
+    ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
     robot = expert.robot
@@ -314,7 +328,13 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
 
 @pytest.mark.parametrize(
     ('kind', 'same', 'more'),
-    [('rub', 0.8, 80), ('juggle', 0.3, 80), ('tidy', 0.8, 60), ('grind', 0.6, 80)],
+    [
+        ('rub', 0.8, 80),
+        ('juggle', 0.3, 80),
+        ('tidy', 0.8, 60),
+        ('grind', 0.6, 80),
+        ('waggle', 0.3, 80),
+    ],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-0.08')
@@ -503,7 +523,111 @@ def test_sluggish_arms_fall_behind_on_quick_ways_and_catch_up(expert):
     assert (behind.max(axis=0) > 0.05).any() and (behind.min(axis=1) < 1e-9).any()
 
 
-@pytest.mark.parametrize(('kind', 'size'), [('splay', 0.7), ('topple', 0.9)])
+def test_it_comes_down_leaning_and_is_upright_as_the_fingers_close():
+    stops, changed = changed_stops('expert-scoop-0.5')
+    assert changed[2:] == stops[2:] and len(changed) == len(stops)
+    leans = [stop.lean for stop in changed[:2]]
+    assert leans[0] == leans[1] and abs(leans[0]) == pytest.approx(0.5)
+    assert [replace(stop, lean=0.0) for stop in changed[:2]] == stops[:2]
+
+
+def test_shut_fingers_press_on_the_object_which_is_grasped_where_it_was():
+    stops, changed = changed_stops('expert-paw-0.05')
+    assert changed[4:] == stops
+    assert all(stop.opening == 0 and stop.phase == 'above' for stop in changed[:4])
+    ways = np.array([stop.position - stops[1].position for stop in changed[:4]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0.01, 0.01, 0.1], atol=1e-12)
+    np.testing.assert_allclose(ways[:2, :2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(ways[2:, :2], axis=1), 0.05)
+    np.testing.assert_allclose(ways[2, :2], ways[3, :2])
+
+
+def test_what_is_held_is_waved_to_and_fro_once_lifted():
+    stops, changed = changed_stops('expert-waggle-0.1')
+    assert changed[:4] == stops[:4] and changed[13:] == stops[4:] and len(changed) == 18
+    assert all(stop.opening == 0 and stop.seconds == 0.2 for stop in changed[4:13])
+    ways = np.array([stop.position - stops[3].position for stop in changed[4:13]])
+    np.testing.assert_allclose(ways[:, 2], 0.0, atol=1e-12)
+    assert np.linalg.norm(ways[0]) == pytest.approx(0.1)
+    np.testing.assert_allclose(ways @ ways[0] / 0.1**2, [*(1, -1) * 4, 0], atol=1e-12)
+
+
+def test_fingers_close_again_and_again_on_their_way_to_the_object():
+    stops, changed = changed_stops('expert-nibble-0.06')
+    assert changed[10:] == stops[1:] and len(changed) == 18
+    assert [stop.opening for stop in changed[:10]] == [1, *(1, 0, 1) * 3]
+    assert all(stop.phase == 'above' for stop in changed[:10])
+    ways = np.array([stop.position - stops[1].position for stop in changed[:10]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, *[0.0] * 9], atol=1e-12)
+    lengths = np.linalg.norm(ways[:, :2], axis=1)
+    np.testing.assert_allclose(lengths, [0.06, *np.repeat([0.06, 0.04, 0.02], 3)])
+    np.testing.assert_allclose(ways[:, :2] @ ways[0, :2], 0.06 * lengths)
+
+
+@pytest.mark.parametrize(('kind', 'size'), [('paw', 0.05), ('waggle', 0.1), ('nibble', 0.06)])
+def test_directions_are_drawn_anew_and_are_the_same_for_another_size(kind, size):
+    stops, _ = changed_stops('expert')
+    own, runs = stops[1].position, []
+    for share in (1.0, 0.5):
+        name = parse_variant(f'expert-{kind}-{share * size}')
+        faults = WayPointFaults(name, np.random.default_rng(0))
+        # a plan out of reach is drawn once more
+        runs.append([faults.applied(stops, 0.0, [own]) for _ in range(2)])
+    farthest = [
+        [max((s.position - own for s in run[:8]), key=lambda w: np.linalg.norm(w[:2]))[:2]
+         for run in both]
+        for both in runs
+    ]  # fmt: skip
+    np.testing.assert_allclose(farthest[1], 0.5 * np.array(farthest[0]), atol=1e-12)
+    assert np.linalg.norm(farthest[0][0] - farthest[0][1]) > 1e-3
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_grippers_have_a_tempo_of_their_own(expert, seed):
+    positions = []
+    for name in ('expert', 'expert-offbeat-0.4'):
+        policy = scripted_policy(name, TASK, seed, expert)
+        policy.reset(seed=seed)
+        positions.append(policy.plan.positions)
+    (expert_plan, offbeat), arms = positions, arm_columns(expert)
+    num = len(expert_plan)
+    np.testing.assert_array_equal(offbeat[:num, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(p) for p in (expert_plan, offbeat)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_allclose(openings[1][:, -1], openings[0][:, -1], atol=1e-9)
+    # when it is half shut, and half open again
+    own, off = (np.flatnonzero(np.diff(opening[used] > 0.5)) for opening in openings)
+    tempo = own / off
+    assert len(off) == 2 and tempo[0] == pytest.approx(tempo[1], rel=0.02)
+    assert 1 / 1.41 < tempo[0] < 1.41 and abs(tempo[0] - 1) > 1e-3
+    # it waits for slow grippers
+    assert len(offbeat) == pytest.approx(num * max(1.0, 1 / tempo[0]), rel=0.02)
+
+
+def test_joints_lose_a_share_of_the_way_to_one_side(expert):
+    expert_plan, ratchet = plan(expert, 'expert'), plan(expert, 'expert-ratchet-0.1')
+    arms = arm_columns(expert)
+    grippers = [j for j in range(expert_plan.shape[1]) if j not in arms]
+    assert len(ratchet) == len(expert_plan)
+    np.testing.assert_array_equal(ratchet[:, grippers], expert_plan[:, grippers])
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0.2]
+    own, lossy = (np.diff(p[:, moves], axis=0) for p in (expert_plan, ratchet))
+    counts = np.abs(own) > 1e-9
+    shares = np.where(counts, lossy / np.where(counts, own, 1.0), np.nan)
+    for share, step in zip(shares.T, own.T, strict=True):
+        sides = [share[step > 1e-9], share[step < -1e-9]]
+        means = sorted(float(np.mean(side)) for side in sides)
+        assert means == pytest.approx([0.9, 1.0], abs=1e-6)
+        assert all(np.ptp(side) < 1e-5 for side in sides)
+    # none comes back to where it was
+    assert (np.abs(ratchet - expert_plan)[-1, moves] > 0.01).all()
+    twice = plan(expert, 'expert-ratchet-0.2') - expert_plan
+    np.testing.assert_allclose(twice, 2 * (ratchet - expert_plan), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'size'), [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06)]
+)
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
     assert len(changed) > len(expert_plan) + 80
@@ -674,6 +798,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'grind',
         'sluggish',
         'perch',
+        'offbeat',
+        'scoop',
+        'paw',
+        'waggle',
+        'ratchet',
+        'nibble',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -780,9 +910,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-perch-0.03' has perch"
+    said = r"split test are not for training: 'expert-high-0.1-nibble-0.03' has nibble"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-perch-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-nibble-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
