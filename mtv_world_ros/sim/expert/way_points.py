@@ -727,8 +727,7 @@ def _grind(stops: Stops, size: float, side: _Side) -> Stops:
 
     In another direction, drawn anew, where the arm does not reach so far.
     """
-    opened, angle = _first(stops, 'open'), side.play.uniform(0.0, 2 * np.pi)
-    way = size * np.array([np.cos(angle), np.sin(angle), 0.0])
+    opened, way = _first(stops, 'open'), size * _drawn_way(side)
     pressed = replace(stops[opened - 1], seconds=_GRIND_S).moved(_up(-_GRIND_DEPTH_M))
     strokes = [pressed.moved(to * way) for to in (1, -1, 1, -1, 0)]
     return [*stops[:opened], pressed, *strokes, *stops[opened:]]
@@ -741,7 +740,7 @@ def _perch(stops: Stops, size: float, side: _Side) -> Stops:
     near its goal and its arm, on the table.
     """
     lift, opened = _first(stops, 'lift'), _first(stops, 'open')
-    closed, let_go, angle = stops[lift - 1], stops[opened], side.play.uniform(0.0, 2 * np.pi)
+    closed, let_go, way = stops[lift - 1], stops[opened], size * _drawn_way(side)
     goal, home = let_go.position, stops[-1].position
     farthest = max(_PERCH_ARM_M, _PERCH_MORE_M + float(np.linalg.norm((goal - home)[:2])))
     nears = [
@@ -753,7 +752,7 @@ def _perch(stops: Stops, size: float, side: _Side) -> Stops:
     ]
     at = min(nears, key=lambda p: np.linalg.norm((p - goal)[:2]), default=goal * (1, 1, 0))
     # what lies on the table is twice as high as its centre
-    over = at * (1, 1, 2) + size * np.array([np.cos(angle), np.sin(angle), 0.0])
+    over = at * (1, 1, 2) + way
     low = replace(
         closed, phase='carry', position=over + _up(closed.position[2] + 0.002), seconds=None
     )

@@ -216,6 +216,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'splay',
         'putt',
         'topple',
+        'tinker',
         'drag',
         'chatter',
         'grind',
