@@ -100,6 +100,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-grind-0.1',
         'expert-perch-0.05',
         'expert-perch-0.06',
+        'expert-scoop-0.57',
+        'expert-scoop-0.6',
+        'expert-paw-0.05',
+        'expert-paw-0.06',
+        'expert-waggle-0.09',
+        'expert-waggle-0.1',
+        'expert-nibble-0.05',
+        'expert-nibble-0.07',
     ),
     'calibrate': (
         'expert',
@@ -170,22 +178,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-askew-0.14',
         'expert-sluggish-0.67',
         'expert-sluggish-0.69',
-    ),
-    'test': (
-        'expert',
         'expert-offbeat-0.35',
         'expert-offbeat-0.45',
-        'expert-scoop-0.57',
-        'expert-scoop-0.6',
-        'expert-paw-0.05',
-        'expert-paw-0.06',
-        'expert-waggle-0.09',
-        'expert-waggle-0.1',
         'expert-ratchet-0.09',
         'expert-ratchet-0.11',
-        'expert-nibble-0.05',
-        'expert-nibble-0.07',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

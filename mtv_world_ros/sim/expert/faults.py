@@ -108,7 +108,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'offbeat': _kind(
         'timing',
-        'test',
+        'calibrate',
         0.4,
         1.0,
         '',
@@ -159,7 +159,7 @@ FAULTS: Mapping[str, FaultKind] = {
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
     'lean': _kind('wrist', 'train', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
     'scoop': _kind(
-        'wrist', 'test', 0.6, 0.9, 'rad', 'it comes down leaning, upright as the fingers close'
+        'wrist', 'train', 0.6, 0.9, 'rad', 'it comes down leaning, upright as the fingers close'
     ),
     # opening
     'loose': _kind(
@@ -385,7 +385,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'paw': _kind(
         'collision',
-        'test',
+        'train',
         0.05,
         0.12,
         'm',
@@ -470,7 +470,12 @@ FAULTS: Mapping[str, FaultKind] = {
         'share that lacks of the top speed of every arm joint; the grippers are in time',
     ),
     'waggle': _kind(
-        'speed', 'test', 0.1, 0.12, 'm', 'once lifted, it waves what it holds to and fro, this far'
+        'speed',
+        'train',
+        0.1,
+        0.12,
+        'm',
+        'once lifted, it waves what it holds to and fro, this far',
     ),
     # joint
     'zero': _kind(
@@ -517,7 +522,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'ratchet': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.1,
         0.5,
         '',
@@ -585,7 +590,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'nibble': _kind(
         'regrasp',
-        'test',
+        'train',
         0.06,
         0.1,
         'm',
