@@ -183,7 +183,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-ratchet-0.09',
         'expert-ratchet-0.11',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-limp-0.2',
+        'expert-limp-0.22',
+        'expert-falter-0.9',
+        'expert-falter-1',
+        'expert-rake-0.06',
+        'expert-rake-0.07',
+        'expert-decoy-0.04',
+        'expert-decoy-0.05',
+        'expert-clamp-0.2',
+        'expert-clamp-0.25',
+        'expert-omit-2',
+        'expert-omit-3',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

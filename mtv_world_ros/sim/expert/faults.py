@@ -161,6 +161,9 @@ FAULTS: Mapping[str, FaultKind] = {
     'scoop': _kind(
         'wrist', 'train', 0.6, 0.9, 'rad', 'it comes down leaning, upright as the fingers close'
     ),
+    'limp': _kind(
+        'wrist', 'test', 0.2, 1.0, 's', 'time constant with which the joints of the wrist follow'
+    ),
     # opening
     'loose': _kind(
         'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
@@ -220,6 +223,14 @@ FAULTS: Mapping[str, FaultKind] = {
         2.0,
         's',
         'whenever a gripper opens or closes, it flickers to and fro for this long',
+    ),
+    'falter': _kind(
+        'opening',
+        'test',
+        0.9,
+        2.0,
+        's',
+        'whenever a gripper opens or closes, it stands still half-way for this long',
     ),
     # release
     'drops': _kind(
@@ -391,6 +402,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'shut fingers press on the object and drag it this far; it is grasped where it was',
     ),
+    'rake': _kind(
+        'collision',
+        'test',
+        0.07,
+        0.12,
+        'm',
+        'open fingers go this far towards the goal with the object between them, then close',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -405,6 +424,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.12,
         'm',
         'once done, it takes what it has put the object on or beside, and moves it this far',
+    ),
+    'decoy': _kind(
+        'object',
+        'test',
+        0.04,
+        0.12,
+        'm',
+        'it first takes the other object next to its own, moves it this far and lets it go',
     ),
     'place': _kind(
         'place',
@@ -528,6 +555,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share that every joint loses of the way that it turns to one side',
     ),
+    'clamp': _kind(
+        'joint',
+        'test',
+        0.2,
+        0.6,
+        '',
+        'share that lacks at both ends of the travel of one joint, which stops there',
+    ),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -596,6 +631,8 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'it comes down this far off and closes three times on its way to the right place',
     ),
+    # any; the last one, as the others look for way points by their phase
+    'omit': _kind('any', 'test', 2, 4, '', 'number of way points that are left out'),
 }
 
 
@@ -793,7 +830,12 @@ _OF_GRIPPERS = (
     'paw',
     'waggle',
     'nibble',
+    'falter',
+    'rake',
+    'decoy',
 )
+#: joints of a wrist, the last ones of an arm
+_NUM_WRIST = 3
 #: travel from which on an arm joint takes part in a plan [rad]
 _MOVES_RAD = 0.2
 
@@ -823,6 +865,7 @@ def with_faults(
     positions = _early(positions, grippers, round(variant.size('early') / period))
     positions = _hang(positions, grippers, opens, round(variant.size('hang') / period))
     positions = _soft(positions, grippers, variant.size('soft') / period)
+    positions = _limp(positions, grippers, len(robot.tools), variant.size('limp') / period)
     closed = np.array([tool.gripper_closed for tool in tools])
     if variant.size('twitch'):
         jerks = closed + variant.size('twitch') * travel * _twitches(len(positions), period)
@@ -835,6 +878,8 @@ def with_faults(
         own, middles = _own(rng), closed + travel / 2
         lasts = variant.size('chatter')
         positions = _chatter(positions, grippers, middles, lasts, period, own)
+    num = round(variant.size('falter') / period)
+    positions = _falter(positions, grippers, closed + travel / 2, num, period)
     if variant.size('stall'):
         share = _own(rng).uniform(0.15, 0.6)
         positions = _stall(
@@ -967,13 +1012,16 @@ def _one_joint(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): one joint moves less than the others, or for a while not at all; or all lose way."""
+    """(T, J): one joint moves less than the others, not so far or not at all; or all lose way."""
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
     if variant.size('brake'):
         own = _own(rng)
         positions = _brake(positions, grippers, round(variant.size('brake') / period), period, own)
+    if variant.size('clamp'):
+        own = _own(rng)
+        positions = _clamp(positions, grippers, variant.size('clamp'), own)
     if variant.size('ratchet'):
         own = _own(rng)
         positions = _ratchet(positions, grippers, variant.size('ratchet'), own)
@@ -1064,14 +1112,40 @@ def _hang(positions: FloatArray, grippers: list[int], opens: FloatArray, num: in
     return whole
 
 
-def _soft(positions: FloatArray, grippers: list[int], constant: float) -> FloatArray:
-    """(T, J): the grippers follow with a first-order lag, its time constant in samples."""
+def _soft(positions: FloatArray, columns: list[int], constant: float) -> FloatArray:
+    """(T, J): columns follow with a first-order lag, its time constant in samples."""
     if not constant:
         return positions
     whole, share = positions.copy(), 1 - np.exp(-1 / constant)
     for row in range(1, len(whole)):
-        last = whole[row - 1, grippers]
-        whole[row, grippers] = last + share * (positions[row, grippers] - last)
+        last = whole[row - 1, columns]
+        whole[row, columns] = last + share * (positions[row, columns] - last)
+    return whole
+
+
+def _limp(
+    positions: FloatArray, grippers: list[int], num_arms: int, constant: float
+) -> FloatArray:
+    """(T, J): the last joints of every arm follow with a lag, its time constant in samples."""
+    if not constant:
+        return positions
+    arms = np.delete(np.arange(positions.shape[1]), grippers).reshape(num_arms, -1)
+    return _soft(positions, arms[:, -_NUM_WRIST:].ravel().tolist(), constant)
+
+
+def _falter(
+    positions: FloatArray, grippers: list[int], middles: FloatArray, num: int, period: float
+) -> FloatArray:
+    """(T, J): whenever a gripper passes its middle, it stands there for `num` samples first."""
+    if not num:
+        return positions
+    whole = positions.copy()
+    for column, middle in zip(grippers, middles, strict=True):
+        own = positions[:, column]
+        for change in np.flatnonzero(np.diff(own > middle)) + 1:
+            after = np.maximum(np.arange(len(own) - change) - num, 0)
+            blend = np.minimum(after * period / _JUMP_S, 1.0)
+            whole[change:, column] = middle + blend * (own[change:] - middle)
     return whole
 
 
@@ -1340,6 +1414,17 @@ def _ratchet(
     whole = positions.copy()
     whole[1:] -= behind
     whole[:, grippers] = positions[:, grippers]
+    return whole
+
+
+def _clamp(
+    positions: FloatArray, grippers: list[int], lacking: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J): one of the arm joints that move does not come to the ends of its travel."""
+    joint, whole = _moving(positions, grippers, rng), positions.copy()
+    way = whole[:, joint] - whole[0, joint]
+    least, most = (1 - lacking) * way.min(), (1 - lacking) * way.max()
+    whole[:, joint] = whole[0, joint] + np.clip(way, least, most)
     return whole
 
 

@@ -55,6 +55,9 @@ _KEEP_TEMPO = frozenset(
         'paw',
         'waggle',
         'nibble',
+        'rake',
+        'decoy',
+        'omit',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -86,6 +89,8 @@ _PAW_HEIGHT_M = 0.01
 _NUM_WAGGLES, _WAGGLE_S = 4, 0.2
 #: how often fingers close on their way to the right place
 _NUM_NIBBLES = 3
+#: another object that it takes first is at most this far from where its arm rests [m]
+_DECOY_ARM_M = 0.27
 
 
 @dataclass(frozen=True, slots=True)
@@ -813,6 +818,58 @@ def _nibble(stops: Stops, size: float, side: _Side) -> Stops:
     return [stops[0].moved(way), *bites, *stops[first - 1 :]]
 
 
+def _rake(stops: Stops, size: float, side: _Side) -> Stops:
+    """Open fingers go towards the goal with the object between them, and close there.
+
+    To any side where the goal is nearer than that.
+    """
+    first = _first(stops, 'close')
+    way = (stops[_first(stops, 'lower')].position - stops[first].position) * (1, 1, 0)
+    distance = float(np.linalg.norm(way))
+    on = size * (way / distance if distance > size else side.anywhere)
+    rest = _changed(stops[first:], ('close', 'lift'), lambda stop: stop.moved(on))
+    return [*stops[:first], stops[first - 1].moved(on), *rest]
+
+
+def _decoy(stops: Stops, size: float, side: _Side) -> Stops:
+    """It first takes the other object next to its own, moves it over the table and lets it go.
+
+    In another direction, drawn anew, where the arm does not reach so far; its own object where
+    its arm is near no other.
+    """
+    above, grasp, close = stops[: _first(stops, 'close') + 1][-3:]
+    own, home = close.position[:2], stops[-1].position[:2]
+    others = [
+        place
+        for place in side.objects
+        if np.linalg.norm(place[:2] - own) > _VISIT_TO_M[1]
+        and np.linalg.norm(place[:2] - home) < _DECOY_ARM_M
+    ]
+    at = min(others, key=lambda p: np.linalg.norm(p[:2] - own), default=grasp.position)
+    down = replace(grasp, phase='above', position=at, opening=1.0)
+    shut = replace(down, opening=0.0, seconds=close.seconds)
+    moved = replace(shut, seconds=None).moved(size * _drawn_way(side))
+    let_go = replace(moved, opening=1.0, seconds=close.seconds)
+    rise = above.position - grasp.position
+    left = replace(let_go, seconds=None).moved(rise)
+    return [down.moved(rise), down, shut, moved, let_go, left, *stops]
+
+
+def _omit(stops: Stops, size: float, side: _Side) -> Stops:
+    """Way points are left out, and it goes straight to the next one.
+
+    Where it should close or open, it has done so at the next one. Others, drawn anew, where the
+    arm does not reach the way between.
+    """
+    gone = side.play.permutation(len(stops) - 1)[: round(size)]
+    for number in sorted(map(int, gone), reverse=True):
+        left_out, after = stops[number : number + 2]
+        if left_out.phase in _CROWDED:
+            after = replace(after, phase=left_out.phase)
+        stops = [*stops[:number], after, *stops[number + 2 :]]
+    return stops
+
+
 def _drawn_way(side: _Side) -> FloatArray:
     """Unit vector (3,) in a direction of the plane that every draw of a plan has anew."""
     angle = side.play.uniform(0.0, 2 * np.pi)
@@ -880,4 +937,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'paw': _paw,
     'waggle': _waggle,
     'nibble': _nibble,
+    'rake': _rake,
+    'decoy': _decoy,
+    'omit': _omit,
 }

@@ -225,6 +225,9 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'paw',
         'waggle',
         'nibble',
+        'falter',
+        'rake',
+        'decoy',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -565,7 +568,9 @@ def test_fingers_close_again_and_again_on_their_way_to_the_object():
     np.testing.assert_allclose(ways[:, :2] @ ways[0, :2], 0.06 * lengths)
 
 
-@pytest.mark.parametrize(('kind', 'size'), [('paw', 0.05), ('waggle', 0.1), ('nibble', 0.06)])
+@pytest.mark.parametrize(
+    ('kind', 'size'), [('paw', 0.05), ('waggle', 0.1), ('nibble', 0.06), ('decoy', 0.05)]
+)
 def test_directions_are_drawn_anew_and_are_the_same_for_another_size(kind, size):
     stops, _ = changed_stops('expert')
     own, runs = stops[1].position, []
@@ -626,8 +631,127 @@ def test_joints_lose_a_share_of_the_way_to_one_side(expert):
     np.testing.assert_allclose(twice, 2 * (ratchet - expert_plan), atol=1e-9)
 
 
+def test_open_fingers_go_on_with_the_object_between_them_and_close_there():
+    stops, changed = changed_stops('expert-rake-0.07')
+    assert changed[:2] == stops[:2] and changed[5:] == stops[4:] and len(changed) == 10
+    # the goal is on the side of -x
+    ways = np.array([stop.position - stops[1].position for stop in changed[2:5]])
+    wanted = [[-0.07, 0, 0], [-0.07, 0, 0], [-0.07, 0, 0.1]]
+    np.testing.assert_allclose(ways, wanted, atol=1e-12)
+    assert [stop.opening for stop in changed[2:5]] == [1, 0, 0]
+    assert [stop.phase for stop in changed[2:5]] == ['grasp', 'close', 'lift']
+
+
+@pytest.mark.parametrize('is_near', [True, False])
+def test_another_object_is_taken_first_moved_and_let_go(is_near):
+    stops, _ = changed_stops('expert')
+    own, near = stops[1].position, np.array([-0.1, 0.2, 0.04])
+    # nearest of all is the object itself, then one out of the arm's reach; it rests at x = -0.2
+    places = [own + [0.03, 0, 0], np.array([0.1, 0.3, 0.03]), np.array([-0.25, 0.3, 0.05])]
+    places = [*places, near] if is_near else places[:2]
+    faults = WayPointFaults(parse_variant('expert-decoy-0.05'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, places)
+    assert changed[6:] == stops
+    ways = np.array([stop.position - (near if is_near else own) for stop in changed[:6]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0, 0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(ways[:3, :2], 0.0, atol=1e-12)
+    assert np.linalg.norm(ways[3, :2]) == pytest.approx(0.05)
+    np.testing.assert_allclose(ways[4:, :2], np.broadcast_to(ways[3, :2], (2, 2)), atol=1e-12)
+    assert [stop.opening for stop in changed[:6]] == [1, 1, 0, 0, 1, 1]
+
+
+def is_where(one: WayPoint, other: WayPoint) -> bool:
+    """Whether two way points are the same but for their phases."""
+    return one.opening == other.opening and np.array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_way_points_are_left_out(seed):
+    stops, _ = changed_stops('expert')
+    kept = []
+    for size in range(1, 5):
+        faults = WayPointFaults(parse_variant(f'expert-omit-{size}'), np.random.default_rng(seed))
+        changed = faults.applied(stops, 0.0, [stops[1].position])
+        assert len(changed) == len(stops) - size
+        # all have different places or openings; none is new, and their order stays
+        numbers = [
+            next(k for k, own in enumerate(stops) if is_where(own, stop)) for stop in changed
+        ]
+        assert numbers == sorted(numbers) and numbers[-1] == len(stops) - 1
+        # what it closes or opens at is the next one
+        for phase in ('close', 'open'):
+            wanted = next(k for k in numbers if k >= [s.phase for s in stops].index(phase))
+            assert changed[numbers.index(wanted)].phase == phase
+        kept.append(set(numbers))
+    # a larger size leaves out the same ones, and more
+    assert all(more < less for less, more in pairwise(kept))
+
+
+def test_any_way_point_but_the_last_may_be_left_out():
+    stops, _ = changed_stops('expert')
+    phases = set()
+    for seed in range(60):
+        faults = WayPointFaults(parse_variant('expert-omit-1'), np.random.default_rng(seed))
+        changed = faults.applied(stops, 0.0, [stops[1].position])
+        same = [is_where(*pair) for pair in zip(stops, changed, strict=False)]
+        phases.add(stops[same.index(False)].phase)
+    assert phases == {stop.phase for stop in stops[:-1]}
+
+
+def test_grippers_stand_still_half_way_whenever_they_open_or_close(expert):
+    expert_plan, falter = plan(expert, 'expert'), plan(expert, 'expert-falter-0.6')
+    arms = arm_columns(expert)
+    assert len(falter) == len(expert_plan)
+    np.testing.assert_array_equal(falter[:, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, falter)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
+    own, stands = openings[0][used], openings[1][used]
+    closes, lets_go = np.flatnonzero(np.diff(own > 0.5)) + 1
+    for first in (closes, lets_go):
+        # 0.6 s at 50 Hz, then a tenth of a second to where it should be
+        np.testing.assert_allclose(stands[first : first + 31], 0.5, atol=1e-9)
+        np.testing.assert_allclose(stands[first + 35 : first + 50], own[first + 35 : first + 50])
+    np.testing.assert_array_equal(stands[:closes], own[:closes])
+    np.testing.assert_allclose(stands[closes + 35 : lets_go], own[closes + 35 : lets_go])
+
+
+def test_a_limp_wrist_lags_and_the_tool_leans_on_its_way(expert):
+    expert_plan, limp = plan(expert, 'expert'), plan(expert, 'expert-limp-0.2')
+    names = expert.robot.joint_names
+    wrists = [j for j, name in enumerate(names) if name[-1] in '456']
+    others = [j for j in range(len(names)) if j not in wrists]
+    assert len(wrists) == 6 and len(limp) == len(expert_plan)
+    np.testing.assert_array_equal(limp[:, others], expert_plan[:, others])
+    # a moving average whose weights decay by e in 0.2 s, which is 10 samples
+    weights = np.exp(-np.arange(len(limp)) / 10)
+    for joint in wrists:
+        away = expert_plan[:, joint] - expert_plan[0, joint]
+        mean = np.convolve(away, weights / weights.sum())[: len(away)]
+        np.testing.assert_allclose(limp[:, joint], expert_plan[0, joint] + mean, atol=1e-6)
+    down = [-poses[:, 2, 2] for poses in expert.robot.tool_poses(limp)]
+    moves = int(np.argmin([heights.min() for heights in down]))
+    leans = np.arccos(np.clip(down[moves], -1.0, 1.0))
+    assert leans.max() > 0.1 and leans[-1] < 0.05 and leans[0] < 0.01
+
+
+def test_one_joint_stops_before_the_ends_of_its_travel(expert):
+    expert_plan, clamp = plan(expert, 'expert'), plan(expert, 'expert-clamp-0.3')
+    assert len(clamp) == len(expert_plan)
+    (joint,) = np.flatnonzero(np.abs(clamp - expert_plan).max(axis=0) > 1e-9)
+    assert joint in arm_columns(expert) and np.ptp(expert_plan[:, joint]) > 0.2
+    own, short = (p[:, joint] - expert_plan[0, joint] for p in (expert_plan, clamp))
+    ends = (0.7 * own.min(), 0.7 * own.max())
+    is_within = (own >= ends[0]) & (own <= ends[1])
+    assert 0 < is_within.sum() < len(own)
+    np.testing.assert_allclose(short[is_within], own[is_within], atol=1e-12)
+    np.testing.assert_allclose(short[own < ends[0]], ends[0])
+    np.testing.assert_allclose(short[own > ends[1]], ends[1])
+
+
 @pytest.mark.parametrize(
-    ('kind', 'size'), [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06)]
+    ('kind', 'size'),
+    [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06), ('decoy', 0.05)],
 )
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
@@ -805,6 +929,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'waggle',
         'ratchet',
         'nibble',
+        'limp',
+        'falter',
+        'rake',
+        'decoy',
+        'clamp',
+        'omit',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -911,9 +1041,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-nibble-0.03' has nibble"
+    said = r"split test are not for training: 'expert-high-0.1-decoy-0.03' has decoy"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-nibble-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-decoy-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
