@@ -128,7 +128,7 @@ def _topic_entry(topic: TopicRecord) -> dict[str, Any]:
     }
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
     """Writes repeated values in full: rosbag2's reader gets no anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:

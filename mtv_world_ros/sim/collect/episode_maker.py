@@ -76,7 +76,7 @@ class CollectConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spent:
-    """CPU time that one episode took, dropped attempts included [s], and its frames."""
+    """Time that one episode took, dropped attempts included [s], and its frames."""
 
     physics_s: float
     rendering_s: float
@@ -172,7 +172,7 @@ class EpisodeMaker:
         return parse_variant(job.policy) if job.policy else None
 
     def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
-        started = time.process_time()
+        started = time.perf_counter()
         extra = {'attempt': str(attempt), 'index': str(job.index), **dict(job.more)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
@@ -183,7 +183,7 @@ class EpisodeMaker:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:
             raise SimulatorError(f"cannot write '{job.path}': {error}; {GO_ON}") from error
-        return time.process_time() - started
+        return time.perf_counter() - started
 
 
 def cameras_of(seed: int, config: CollectConfig) -> RandomizationConfig:

@@ -92,8 +92,8 @@ class Take:
         moved: role -> distance of the object from its start at the end [m].
         missed: role of the object that the gripper is to miss; None = none.
         any_outcome: the policy has faults, and what comes of them is as wanted.
-        physics_s: CPU time of planning and physics.
-        rendering_s: CPU time of building the scene and rendering.
+        physics_s: time of planning and physics.
+        rendering_s: time of building the scene and rendering.
         object_poses: (T, O, 4, 4) T_base_object [m].
     """
 
@@ -148,16 +148,16 @@ def simulate(
         SimulatorError: the expert cannot reach a way point.
         PolicyError: the variant finds no plan.
     """
-    started = time.process_time()
+    started = time.perf_counter()
     first = sim.reset(seed, task)
-    rendering = time.process_time() - started
+    rendering = time.perf_counter() - started
     if variant is None:
         commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
     else:
         policy = ScriptedPolicy(variant, expert, task, sim.scene)
         policy.reset(seed=seed)
         commands = policy.plan
-    planning = time.process_time() - started - rendering
+    planning = time.perf_counter() - started - rendering
     take = carry_out(sim, task, commands, first, config)
     return replace(
         take,
@@ -184,7 +184,7 @@ def carry_out(
         first: what the simulator returned.
         config: how it is sampled.
     """
-    started, rendering = time.process_time(), 0.0
+    started, rendering = time.perf_counter(), 0.0
     commands = as_published(commands, config)
     observations, measured = [first], [sim.positions()]
     last = len(commands.times) - 1
@@ -194,9 +194,9 @@ def carry_out(
         sim.advance(commands.positions[min(k, last)])
         measured.append(sim.positions())
         if k == config.frame_at(len(observations)):
-            before = time.process_time()
+            before = time.perf_counter()
             observations.append(sim.observe(rendering=config.pictures == 'all'))
-            rendering += time.process_time() - before
+            rendering += time.perf_counter() - before
     situation = sim.situation()
     ever, final = ever_and_final(task.succeeds(situation))
     return Take(
@@ -209,7 +209,7 @@ def carry_out(
             role: float(np.linalg.norm(centres[-1] - centres[0]))
             for role, centres in situation.positions.items()
         },
-        physics_s=time.process_time() - started - rendering,
+        physics_s=time.perf_counter() - started - rendering,
         rendering_s=rendering,
         object_poses=sim.seen_poses(),
     )
