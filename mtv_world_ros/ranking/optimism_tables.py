@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from mtv_world_ros.documents import DASH, Table
@@ -40,9 +40,10 @@ def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
 
 def _overall(by_model: Mapping[str, Optimism]) -> Table:
     first = next(iter(by_model.values()))
+    heads = _heads(list(by_model)) if len(by_model) > 1 else [JUDGES['imagined']]
     columns = {
-        (_short(name) if len(by_model) > 1 else JUDGES['imagined']): found.scores('imagined')
-        for name, found in by_model.items()
+        head: found.scores('imagined')
+        for head, found in zip(heads, by_model.values(), strict=True)
     }
     columns |= {JUDGES[judge]: first.scores(judge) for judge in JUDGES if judge != 'imagined'}
     rows = [
@@ -76,9 +77,14 @@ def _by_kind(name: str, found: Optimism) -> Table:
     return Table(caption=caption, head=head, rows=rows)
 
 
-def _short(name: str) -> str:
-    """The end of a checkpoint's path, for the head of a column."""
-    return name if len(name) <= _NAME_LENGTH else f'…{name[1 - _NAME_LENGTH :]}'
+def _heads(names: Sequence[str]) -> list[str]:
+    """The ends of checkpoints' paths as heads of columns, without the folders in which all end."""
+    parts = [name.rstrip('/').split('/') for name in names]
+    while min(map(len, parts)) > 1 and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
+    ends = ['/'.join(part) for part in parts]
+    ends = [end if len(end) <= _NAME_LENGTH else f'…{end[1 - _NAME_LENGTH :]}' for end in ends]
+    return ends if len(set(ends)) == len(ends) else [f'{n} {end}' for n, end in enumerate(ends, 1)]
 
 
 def _cell(score: Score) -> str:

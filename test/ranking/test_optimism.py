@@ -79,6 +79,25 @@ def test_tables_fit_a_console(optimism):
     assert optimism_tables({}) == []
 
 
+@pytest.mark.parametrize(
+    ('names', 'heads'),
+    [
+        (('/data/somebody/new', 'bundled'), ['…ata/somebody/new', 'bundled']),
+        (('new/resource/checkpoint', 'old/resource/checkpoint'), ['new', 'old']),
+        (('/a/much/longer/path/w', '/b/much/longer/path/w'), ['/a', '/b']),
+        (('/one/longer/path/w', '/two/longer/path/v'), ['…ne/longer/path/w', '…wo/longer/path/v']),
+        (('/a/run/longer/path/w', '/b/run/longer/path/w/'), ['/a', '/b']),
+        (
+            ('/one_of_two_long_names', '/two_of_two_long_names'),
+            ['1 …f_two_long_names', '2 …f_two_long_names'],
+        ),
+    ],
+)
+def test_checkpoints_of_one_name_keep_a_column_each(optimism, names, heads):
+    overall = optimism_tables(dict.fromkeys(names, optimism))[0]
+    assert list(overall.head[1:3]) == heads and len(overall.head) == 5
+
+
 def test_areas_agree_with_the_plain_one_and_scenes_are_left_out_whole():
     rng = np.random.default_rng(0)
     said, real = rng.integers(0, 5, 40) / 4, rng.uniform(size=40) < 0.4
