@@ -13,7 +13,7 @@ Shape letters: B batch, O objects, A tools, T steps, D width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
@@ -142,11 +142,35 @@ class _Extents:
         return (mean + (two_cos * (a - c) + two_sin * (b - d)) / 2 + four).clamp(min=0.0) / 2
 
 
-def _mlp(*widths: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for number, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
-        layers += [nn.Linear(a, b)] + ([nn.SiLU()] if number < len(widths) - 2 else [])
-    return nn.Sequential(*layers)
+class _Perceptron(nn.Sequential):
+    """Layers whose input comes in parts that broadcast: each is multiplied before it is spread.
+
+    Args:
+        widths: of the input, the layers, the output.
+    """
+
+    def __init__(self, *widths: int) -> None:
+        layers: list[nn.Module] = []
+        for number, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
+            layers += [nn.Linear(a, b)] + ([nn.SiLU()] if number < len(widths) - 2 else [])
+        super().__init__(*layers)
+        self.product: Callable[..., Tensor] = F.linear
+
+    def forward(self, *parts: Tensor) -> Tensor:
+        """Returns (..., D) of parts (..., D') whose columns lie side by side."""
+        first, *rest = self
+        columns = [part.shape[-1] for part in parts]
+        weights = torch.split(first.get_parameter('weight'), columns, dim=-1)
+        x = self.product(parts[0], weights[0], first.bias)
+        for part, weight in zip(parts[1:], weights[1:], strict=True):
+            x = x + self.product(part, weight)
+        for layer in rest:
+            x = (
+                layer(x)
+                if isinstance(layer, nn.SiLU)
+                else self.product(x, layer.weight, layer.bias)
+            )
+        return x
 
 
 class ObjectMotionNetwork(nn.Module):
@@ -181,19 +205,19 @@ class ObjectMotionNetwork(nn.Module):
         }
         self.width, self.hidden, self.fingertips = width, hidden, fingertips
         self.yielding = yielding
-        self.shape = _mlp(num_features + 1, width, _SHAPE)
+        self.shape = _Perceptron(num_features + 1, width, _SHAPE)
         # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
         # clearances now and next
         given = 22 + 2 * _NUM_TOOL_CLEARANCES
         tips = _NUM_FINGERTIP_HEIGHTS if fingertips else 0
-        self.tool_edge = _mlp(given + _SHAPE + hidden + tips, width, width, width)
+        self.tool_edge = _Perceptron(given + _SHAPE + hidden + tips, width, width, width)
         # offset (3) | velocities (6) | rotation of the other (6) | clearances
         given = 15 + _NUM_OBJECT_CLEARANCES
-        self.object_edge = _mlp(given + 2 * _SHAPE + hidden, width, width)
+        self.object_edge = _Perceptron(given + 2 * _SHAPE + hidden, width, width)
         self.gate = nn.Linear(width, 1)
         self.push = nn.Linear(width, 6)
         # height, clearance over the table, velocity, spin, rotation
-        self.node = _mlp(2 + 3 + 3 + 6 + _SHAPE + hidden + 2 * width, width, width)
+        self.node = _Perceptron(2 + 3 + 3 + 6 + _SHAPE + hidden + 2 * width, width, width)
         self.free = nn.Linear(width, 6)
         self.stay = nn.Linear(width, 1)
         self.memory = nn.GRUCell(width, hidden)
@@ -412,33 +436,35 @@ class ObjectMotionNetwork(nn.Module):
         """Messages (B, O, D), logits of being carried (B, O, A), pushes (B, O, 6)."""
         before, here, after = tools
         seen = [_local(tool, now.points) * _SCALE for tool in (here, after, before)]
-        count, num_tools = now.points.shape[1], here.shape[1]
         turned = here[:, None, :, :3, :3].mT @ now.rotations[:, :, None]
-        apart = gaps.transpose(1, 2)[:, None].expand(-1, count, -1, -1) * _SCALE
         way = torch.einsum('baji,baj->bai', here[..., :3, :3], (after - here)[..., :3, 3])
-        tool = torch.cat([here[:, :, 2:3, 3], way], dim=-1) * _SCALE
+        apart = gaps.transpose(1, 2)  # (B, A, 3)
+        tool = torch.cat([apart, here[:, :, 2:3, 3], way], dim=-1) * _SCALE
         own = torch.cat([extents.shape, now.hidden], dim=-1)
-        inputs = [
+        pairs = [
             # far away is far away
             *(value.clamp(-4, 4) for value in seen),
             turned[..., :2].flatten(-2),
-            apart,
-            tool[:, None].expand(-1, count, -1, -1),
+        ]
+        near = [
             _tool_clearances(here, gaps[:, 1], extents, now),
             _tool_clearances(after, gaps[:, 2], extents, now),
-            own[:, :, None].expand(-1, -1, num_tools, -1),
         ]
+        parts = [torch.cat(pairs, -1), tool[:, None], torch.cat(near, -1), own[:, :, None]]
         if self.fingertips:
-            inputs += [
+            heights = [
                 _fingertip_heights(here, gaps[:, 1], extents, now),
                 _fingertip_heights(after, gaps[:, 2], extents, now),
             ]
-        edge = self.tool_edge(torch.cat(inputs, dim=-1))
+            parts.append(torch.cat(heights, -1))
+        edge = self.tool_edge(*parts)
         push = self.push(edge)
         frame = here[:, None, :, :3, :3]
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
         if self.yielding:
-            ways = _ways_out(after, gaps[:, 2], self.fingers / _SCALE, extents, now)
+            fingers = self.fingers.view(-1, 2) / _SCALE  # of stacked networks each has its own
+            fingers = fingers.repeat_interleave(len(gaps) // len(fingers), 0)
+            ways = _ways_out(after, gaps[:, 2], fingers, extents, now)
             shares = (_YIELDS_GAIN * self.yields(edge)).tanh()
             linear = linear + (shares[..., None] * ways).sum(-2)
         angular = (frame @ push[..., 3:, None])[..., 0]
@@ -460,13 +486,12 @@ class ObjectMotionNetwork(nn.Module):
             ],
             dim=-1,
         )
-        inputs = [
+        edge = self.object_edge(
             (offset * _SCALE).clamp(-6, 6),
-            other[:, None].expand(-1, count, -1, -1),
+            other[:, None],
             _object_clearances(offset, extents, now),
-            own[:, :, None].expand(-1, -1, count, -1),
-        ]
-        edge = self.object_edge(torch.cat(inputs, dim=-1))
+            own[:, :, None],
+        )
         pairs = present[:, None] & ~torch.eye(count, dtype=torch.bool, device=offset.device)
         heard = (edge * pairs[..., None]).sum(2)
         if not self.yielding:
@@ -532,14 +557,15 @@ def _ways_out(
     """(B, O, A, 3, 3) how far an object would have to go so that no finger is in its place [m].
 
     Out of the nearer finger: away from the tool, across the fingers' travel, towards the tool.
-    `fingers` (2,) are thickness and half the breadth of a finger [m].
+    `fingers` (B, 2) are thickness and half the breadth of a finger [m].
     """
     x, y, across, along = _seen_from(tools, extents, now)
     gap = gaps[:, None]
     to_x, to_y = tools[:, None, :, :3, :2].unbind(-1)
+    thickness, breadth = fingers[:, None, None].unbind(-1)
     depths = [
-        (gap + fingers[0] + along - y.abs(), y.sign(), to_y),
-        (fingers[1] + across - x.abs(), x.sign(), to_x),
+        (gap + thickness + along - y.abs(), y.sign(), to_y),
+        (breadth + across - x.abs(), x.sign(), to_x),
         (y.abs() + along - gap, -y.sign(), to_y),
     ]
     rows = [(d.clamp(0.0, _FARTHEST_OUT_M) * sign)[..., None] * way for d, sign, way in depths]

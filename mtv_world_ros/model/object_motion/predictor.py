@@ -33,6 +33,7 @@ from mtv_world_ros.model.object_motion.network import (
     Scene,
     STEP_S,
 )
+from mtv_world_ros.model.object_motion.stacked import stacked
 from mtv_world_ros.model.tensor_files import disk_errors
 
 #: standard deviations of where masks have an object, and of how large (relative)
@@ -63,7 +64,7 @@ class ObjectMotionPredictor:
     """Finds objects in a frame; `TrackedObjects` says where they go.
 
     Several networks share the motions that are foreseen, since they err in different places: the
-    mean of their verdicts tells more than each alone.
+    mean of their verdicts tells more than each alone. They compute as one, `network`.
 
     Args:
         members: the first says what is expected.
@@ -75,9 +76,9 @@ class ObjectMotionPredictor:
     def __init__(
         self, members: Sequence[Member], robot: RobotModel, num_disturbed: int = 12
     ) -> None:
-        for member in members:
-            member.network.eval()
         self.members, self.robot = tuple(members), robot
+        networks = [member.network.eval() for member in members]
+        self.network = networks[0] if len(networks) == 1 else stacked(networks)
         rng = np.random.default_rng(0)
         self._places = rng.normal(0.0, _PLACE_ERROR_M, (1 + num_disturbed, _MAX_OBJECTS, 3))
         self._scales = rng.normal(1.0, _SIZE_ERROR, (1 + num_disturbed, _MAX_OBJECTS, 1, 1))
@@ -144,13 +145,13 @@ class TrackedObjects:
         model: says where they go.
         reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
         features: (O, V, F) of `object_shapes`.
-        before: of each member, when it was last asked; empty = nothing has moved yet.
+        before: when they were last asked; None = nothing has moved yet.
     """
 
     model: ObjectMotionPredictor
     reference: FloatArray
     features: FloatArray
-    before: tuple[_Before, ...] = ()
+    before: _Before | None = None
 
     @property
     def step_s(self) -> float:
@@ -183,52 +184,84 @@ class TrackedObjects:
         places, features = self.model.disturbed(
             np.where(known[:, None], self.reference, 0.0), self.features
         )
-        first = self.before[0].steps if self.before else 0
+        first = self.before.steps if self.before else 0
         count = (len(positions) - 1) // self.commands_a_step
         errors = self.model.errors(first, count, known.size)
-        points, rotations, thens = [], [], []
-        followed: dict[int, tuple[FloatArray, FloatArray, ArmState | None]] = {}
-        for number, rows in enumerate(self.model.shares):
-            member, robot = self.model.members[number], self.model.robot
-            last = self.before[number] if self.before else None
-            response = id(member.response)  # members share it
-            if response not in followed:
-                followed[response] = _tools(member, robot, positions, last, self.commands_a_step)
-            tools, gaps, arms = followed[response]
-            scene = Scene(
-                points=_tensor(places[rows]),
-                features=_tensor(features[rows]),
-                present=torch.from_numpy(known).expand(len(rows), -1),
-                tools=_tensor(tools).expand(len(rows), -1, -1, -1, -1),
-                gaps=_tensor(gaps).expand(len(rows), -1, -1),
+        tools, gaps, arms = self._tools(positions)
+        # a part of the batch each, of the same size; what fills it up is left out again
+        most = max(map(len, self.model.shares))
+        rows = np.stack([np.resize(share, most) for share in self.model.shares])
+        kept = np.concatenate([np.arange(most) < len(share) for share in self.model.shares])
+        rows = rows.ravel()
+        scene = Scene(
+            points=_tensor(places[rows]),
+            features=_tensor(features[rows]),
+            present=torch.from_numpy(known).expand(len(rows), -1),
+            tools=_tensor(tools).repeat_interleave(most, 0),
+            gaps=_tensor(gaps).repeat_interleave(most, 0),
+        )
+        with torch.inference_mode():
+            motion, memory = self.model.network.roll(
+                scene,
+                self.before and self.before.memory,
+                skip=1,
+                errors=_tensor(errors[rows]),
             )
-            with torch.inference_mode():
-                motion, memory = member.network.roll(
-                    scene, last and last.memory, skip=1, errors=_tensor(errors[rows])
-                )
-            ways = motion.points.double().numpy() - places[rows, None]
-            points += list(np.where(known[:, None], self.reference + ways, np.nan))
-            rotations += list(motion.rotations.double().numpy())
-            thens.append(
-                _Before(
-                    memory=memory, tools=tools[-2], gaps=gaps[-2], arms=arms, steps=first + count
-                )
-            )
+        ways = motion.points.double().numpy() - places[rows, None]
+        points = np.where(known[:, None], self.reference + ways, np.nan)[kept]
+        rotations = motion.rotations.double().numpy()[kept]
+        before = _Before(
+            memory=memory, tools=tools[:, -2], gaps=gaps[:, -2], arms=arms, steps=first + count
+        )
         moved = tuple(
             ObjectMotion(reference=self.reference, points=way, rotations=turns)
             for way, turns in zip(points, rotations, strict=True)
         )
-        return moved, replace(self, before=tuple(thens))
+        return moved, replace(self, before=before)
+
+    def _tools(
+        self, positions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[ArmState | None, ...]]:
+        """Tools (M, T + 2, A, 4, 4) and gaps (M, T + 2, A) of M members, and their arms' states.
+
+        Row 0 is one step before.
+        """
+        robot, every = self.model.robot, self.commands_a_step
+        gaps = robot.finger_gaps(positions[::every])
+        rows, arms = [], []
+        followed: dict[int, tuple[FloatArray, ArmState | None]] = {}
+        for number, member in enumerate(self.model.members):
+            response = member.response
+            if id(response) not in followed:  # members share it
+                last = self.before.arms[number] if self.before else None
+                where, state = (
+                    (positions, None)
+                    if response is None
+                    else response.follow(robot, positions, last)
+                )
+                followed[id(response)] = robot.tool_poses(where[::every]), state
+            tools, state = followed[id(response)]
+            rows.append(tools.transpose(1, 0, 2, 3))
+            arms.append(state)
+        tools, gaps = np.stack(rows), np.stack([gaps] * len(rows))
+        before = (tools[:, 0], gaps[:, 0])
+        if self.before:
+            before = (self.before.tools, self.before.gaps)
+        return (
+            np.concatenate([before[0][:, None], tools], axis=1),
+            np.concatenate([before[1][:, None], gaps], axis=1),
+            tuple(arms),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Before:
-    """What a member goes on from.
+    """What the motions go on from.
 
     Attributes:
-        memory: of the network.
-        tools: (A, 4, 4) T_base_tool one step before.
-        gaps: (A,) one step before [m].
+        memory: of the networks.
+        tools: (M, A, 4, 4) T_base_tool of each member one step before.
+        gaps: (M, A) one step before [m].
         arms: where the arms really are by now, with a response.
         steps: since the objects were found.
     """
@@ -236,24 +269,8 @@ class _Before:
     memory: Memory
     tools: FloatArray
     gaps: FloatArray
-    arms: ArmState | None
+    arms: tuple[ArmState | None, ...]
     steps: int
-
-
-def _tools(
-    member: Member, robot: RobotModel, positions: FloatArray, last: _Before | None, every: int
-) -> tuple[FloatArray, FloatArray, ArmState | None]:
-    """Tools (T + 2, A, 4, 4) and gaps (T + 2, A) as a member is given them; row 0 one step before.
-
-    And the state of the arms.
-    """
-    followed, arms = positions, None
-    if member.response is not None:
-        followed, arms = member.response.follow(robot, positions, last and last.arms)
-    tools = robot.tool_poses(followed[::every]).transpose(1, 0, 2, 3)
-    gaps = robot.finger_gaps(positions[::every])
-    before = (tools[0], gaps[0]) if last is None else (last.tools, last.gaps)
-    return np.concatenate([before[0][None], tools]), np.concatenate([before[1][None], gaps]), arms
 
 
 def _tensor(values: FloatArray) -> Tensor:

@@ -22,18 +22,24 @@ from mtv_world_ros.model.object_motion.predictor import (
     save_network,
     TrackedObjects,
 )
+from mtv_world_ros.model.object_motion.stacked import stacked
 
 STEPS = 12
 
 
-@pytest.fixture
-def network() -> ObjectMotionNetwork:
-    torch.manual_seed(0)
-    network = ObjectMotionNetwork(width=32, hidden=16)
-    with torch.no_grad():  # an untrained one would hold everything still
+def lively(seed: int, width: int = 32, hidden: int = 16, **more: bool) -> ObjectMotionNetwork:
+    """An untrained network that moves objects: as it is made it would hold everything still."""
+    torch.manual_seed(seed)
+    network = ObjectMotionNetwork(width=width, hidden=hidden, **more)
+    with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     return network.eval()
+
+
+@pytest.fixture
+def network() -> ObjectMotionNetwork:
+    return lively(0)
 
 
 def scene(num_objects: int, present: int) -> Scene:
@@ -67,6 +73,31 @@ def test_two_calls_one_after_the_other_are_one_call(network):
     torch.testing.assert_close(second.rotations, whole.rotations[:, 5:])
 
 
+@pytest.mark.parametrize(
+    'more', [[{}, {}], [{'fingertips': True, 'yielding': True}] * 3, [{}, {'yielding': True}]]
+)
+def test_stacked_networks_compute_what_each_computes(more):
+    networks = [lively(k, width=32 + 8 * k * (k > 1), **own) for k, own in enumerate(more)]
+    given = scene(3, 3)
+    names = ('points', 'features', 'present', 'tools', 'gaps')
+    parts = [  # each has scenes of its own
+        replace(given, **{name: getattr(given, name).repeat_interleave(2, 0) for name in names})
+        for _ in networks
+    ]
+    parts = [replace(part, points=part.points + 0.01 * k) for k, part in enumerate(parts)]
+    whole = replace(
+        given, **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    )
+    with torch.inference_mode():
+        wanted = [network(part) for network, part in zip(networks, parts, strict=True)]
+        found = stacked(networks)(whole)
+    for name in ('points', 'rotations', 'held', 'spread'):
+        torch.testing.assert_close(
+            getattr(found, name), torch.cat([getattr(motion, name) for motion in wanted])
+        )
+    assert (wanted[0].points[0, -1] - wanted[1].points[0, -1]).abs().max() > 1e-3
+
+
 @pytest.mark.parametrize(('width', 'hidden'), [(32, 16), (48, 20)])
 def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
     network, width, hidden
@@ -81,7 +112,7 @@ def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
     leaning[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
     leaning[..., :3, 3] *= 0.1  # further away than 3 cm heights are cut off
     heard: list[torch.Tensor] = []
-    wider.tool_edge.register_forward_pre_hook(lambda _, args: heard.append(args[0][..., -8:]))
+    wider.tool_edge.register_forward_pre_hook(lambda _, args: heard.append(args[-1]))
     wider(
         replace(
             given,
