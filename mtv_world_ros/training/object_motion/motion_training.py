@@ -5,17 +5,19 @@ Shape letters: B batch, T steps, O objects.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import copy
 from dataclasses import dataclass, fields
 from functools import partial
 import math
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
-from torch import nn, Tensor
+from torch import Tensor
 import torch.nn.functional as F
+from torch.optim import _muon
 from tqdm import tqdm
 
 from mtv_world_ros.errors import MtvWorldError, TrainingError
@@ -201,7 +203,8 @@ def _losses(
     shares = np.array([len(pool) for pool in pools]) / len(tracks)
     _multiply_in(network, config.dtype)
     if config.compile:
-        network.step = torch.compile(network.step)
+        # once for each number of objects: what is compiled for any is slow
+        network.step = torch.compile(network.step, dynamic=False)
     passes = _Passes(network)
     for step in range(config.steps):
         for optimizer in optimizers:
@@ -223,13 +226,13 @@ def _multiply_in(network: ObjectMotionNetwork, dtype: torch.dtype) -> None:
     """Lets layers over pairs and nodes multiply in a number format; what comes out is float32."""
     if dtype == torch.float32:
         return
-    for layer in (*network.tool_edge, *network.object_edge, *network.node):
-        if isinstance(layer, nn.Linear):
-            layer.forward = partial(_product, layer, dtype)  # type: ignore[method-assign]
+    for layers in (network.tool_edge, network.object_edge, network.node):
+        layers.product = partial(_product, dtype)
 
 
-def _product(layer: nn.Linear, dtype: torch.dtype, x: Tensor) -> Tensor:
-    return F.linear(x.to(dtype), layer.weight.to(dtype), layer.bias.to(dtype)).float()
+def _product(dtype: torch.dtype, x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    given = (value if value is None else value.to(dtype) for value in (x, weight, bias))
+    return F.linear(*given).float()
 
 
 class _Passes:
@@ -313,9 +316,38 @@ def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.O
         is_matrix = parameter.ndim == 2 and len(parameter) >= _LEAST_ROWS
         (weights if is_matrix else others).append(parameter)
     return [
-        torch.optim.Muon(weights, lr=rate, weight_decay=1e-4, adjust_lr_fn='match_rms_adamw'),
+        _Muon(weights, lr=rate, weight_decay=1e-4, adjust_lr_fn='match_rms_adamw'),
         torch.optim.AdamW(others, lr=rate, betas=(0.9, 0.99), weight_decay=1e-4),
     ]
+
+
+class _Muon(torch.optim.Muon):
+    """Multiplies in float32: torch's multiplies in bfloat16, slowly where a processor lacks it."""
+
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Does a step."""
+        with mock.patch.object(_muon, '_zeropower_via_newtonschulz', orthogonalized):
+            return super().step(closure)
+
+
+def orthogonalized(
+    gradient: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float
+) -> Tensor:
+    """Returns about U V^T of a matrix U S V^T, by Newton-Schulz iterations (Jordan et al. 2024).
+
+    Args:
+        gradient: (N, M).
+        coefficients: of x, x^3 and x^5.
+        steps: iterations.
+        eps: least norm to divide by.
+    """
+    a, b, c = coefficients
+    x = gradient.T if gradient.shape[0] > gradient.shape[1] else gradient
+    x = x / x.norm().clamp(min=eps)
+    for _ in range(steps):
+        square = x @ x.T
+        x = torch.addmm(x, torch.addmm(square, square, square, beta=b, alpha=c), x, beta=a)
+    return x.T if gradient.shape[0] > gradient.shape[1] else x
 
 
 def _save(
