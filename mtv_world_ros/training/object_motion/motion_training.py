@@ -231,8 +231,8 @@ def _multiply_in(network: ObjectMotionNetwork, dtype: torch.dtype) -> None:
 
 
 def _product(dtype: torch.dtype, x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    given = (value if value is None else value.to(dtype) for value in (x, weight, bias))
-    return F.linear(*given).float()
+    bias = None if bias is None else bias.to(dtype)
+    return F.linear(x.to(dtype), weight.to(dtype), bias).float()
 
 
 class _Passes:

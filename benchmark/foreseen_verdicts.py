@@ -1,0 +1,269 @@
+"""How well do object motion networks tell success alone, without a picture? To choose networks by.
+
+    mtv-world collect --task all --episodes 24 --faults calibrate --seed 1391 --pictures first --out data/left
+    python benchmark/foreseen_verdicts.py data/left bundled runs/a+runs/b --repeats 360 --workers 2
+
+Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
+checkpoint or of several folders joined by `+`, 13 motions in all. `share` is how many of them
+succeed; a share of half or more is a success. Beside it stands the rule that imagines nothing: an
+object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
+Wilson of shares, jackknife of AUROC, bootstrap of differences, over episodes. What is chosen by
+this must not be measured by it: kinds of the split `test` are refused.
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from page import parse_arguments, publish, table
+import torch
+
+from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fingerprint
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.recording import stitched_commands
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.evaluation.metrics.statistics import wilson
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.resample import resample
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
+from mtv_world_ros.model.object_motion.network import STEP_S
+from mtv_world_ros.model.object_motion.predictor import (
+    load_predictor,
+    ObjectMotionPredictor,
+    TrackedObjects,
+)
+from mtv_world_ros.ranking.no_picture_rule import carried, Thing
+from mtv_world_ros.ranking.optimism import area_interval
+from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
+from mtv_world_ros.success.foreseen import ForeseenMotions
+from mtv_world_ros.success.task import ever_and_final, load_tasks, match_task, TaskSpec
+from mtv_world_ros.training.object_motion.tracks import object_tracks
+
+VIEWS = ('low', 'high')
+RULE = 'no pictures, no networks: the rule'
+HEAD = ('judged by', 'n', 'right', 'AUROC', 'false success', 'false failure', 'Brier of the share')
+_DRAWS = 2000
+
+
+def more(parser: argparse.ArgumentParser) -> None:
+    """Adds options."""
+    parser.add_argument('dataset', type=Path)
+    parser.add_argument('networks', nargs='+', help='checkpoints; DIR+DIR = their networks')
+    parser.add_argument('--workers', type=int, default=1, help='processes')
+
+
+def load(names: str) -> ObjectMotionPredictor:
+    """Returns the networks of one or several checkpoints, or of what `train-motion` wrote."""
+    folders = [checkpoint_path(name) for name in names.split('+')]
+    robot = checkpoint_robot('bundled')
+    found = [load_predictor(folder / OBJECT_MOTION_FOLDER, robot) for folder in folders]
+    return ObjectMotionPredictor([member for one in found for member in one.members], robot)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """An episode as it is judged.
+
+    Attributes:
+        success: how it really ended.
+        task: what is asked.
+        bound: placeholder -> name of its object.
+        names: of O objects.
+        reference: (O, 3) where the first frame's masks have them [m], NaN = not in two views.
+        features: (O, V, F) of `object_shapes`.
+        positions: (N, J) commanded, `PERIOD_S` apart [rad or m].
+    """
+
+    success: bool
+    task: TaskSpec
+    bound: dict[str, str]
+    names: tuple[str, ...]
+    reference: FloatArray
+    features: FloatArray
+    positions: FloatArray
+
+
+def read_plan(path: Path, robot: RobotModel) -> Plan | None:
+    """Reads an episode; None = its task is not known, or an object of it not seen."""
+    episode = read_episode(path, views=VIEWS)
+    found = match_task(load_tasks(share_path('config', 'tasks')), episode.info.instruction)
+    states = episode.joint_states
+    if found is None or states is None or episode.masks is None:
+        return None
+    track = object_tracks(path, robot, VIEWS)[0]
+    reference = np.where(track.known[0][:, None], track.points[0], np.nan)
+    names = tuple(episode.info.objects)
+    if not np.isfinite(reference[[names.index(name) for name in found[1].values()]]).all():
+        return None
+    columns = [states.joint_names.index(name) for name in robot.joint_names]
+    stamp = int(episode.masks[VIEWS[0]].stamps_ns[0])
+    rows = round(STEP_S / PERIOD_S) * (len(track.points) - 1) + 1
+    return Plan(
+        success=episode.info.outcome == 'success',
+        task=found[0],
+        bound=found[1],
+        names=names,
+        reference=reference,
+        features=track.features,
+        positions=resample(
+            stitched_commands(episode, robot, stamp),
+            states.positions[0][columns],
+            np.arange(rows) * PERIOD_S,
+        ),
+    )
+
+
+def share_foreseen(plan: Plan, predictor: ObjectMotionPredictor) -> float | None:
+    """Returns which share of the motions of a plan succeeds; None = they do not tell."""
+    tracked = TrackedObjects(model=predictor, reference=plan.reference, features=plan.features)
+    motions, _ = tracked.advance(plan.positions)
+    foreseen = ForeseenMotions(
+        names=plan.names,
+        points=np.stack([motion.points for motion in motions]),
+        rotations=np.stack([motion.rotations for motion in motions]),
+        sizes=tracked.sizes,
+        openings=predictor.robot.gripper_openings(plan.positions[:: tracked.commands_a_step]),
+    )
+    succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(plan.reference, np.nan))
+    return None if succeeded is None else float(np.mean(succeeded))
+
+
+def ruled(plan: Plan, predictor: ObjectMotionPredictor) -> float:
+    """Returns whether a plan succeeds by the rule, which is given the same places and sizes."""
+    tracked = TrackedObjects(model=predictor, reference=plan.reference, features=plan.features)
+    items = {role: plan.names.index(name) for role, name in plan.bound.items()}
+    roles = {
+        role: Thing(
+            name=plan.names[item],
+            centre=plan.reference[item],
+            size=np.array(plan.task.sizes_m.get(role) or tracked.sizes[item]),
+            is_rim_held=plan.names[item].split()[-1] in plan.task.rims,
+        )
+        for role, item in items.items()
+    }
+    poses = carried(predictor.robot, plan.positions, roles)
+    return float(ever_and_final(plan.task.holds(poses, poses.openings))[1])
+
+
+def judged(path: Path, networks: Sequence[str]) -> tuple[bool, list[float]] | None:
+    """Returns an outcome, and what the rule and the networks say; None = one cannot tell.
+
+    Args:
+        path: of an episode.
+        networks: see `load`.
+    """
+    torch.set_num_threads(1)
+    if not _LOADED:
+        _LOADED.update({names: load(names) for names in networks})
+    first, *_ = _LOADED.values()
+    plan = read_plan(path, first.robot)
+    if plan is None:
+        return None
+    said = [share_foreseen(plan, predictor) for predictor in _LOADED.values()]
+    known = [share for share in said if share is not None]
+    return (plan.success, [ruled(plan, first), *known]) if len(known) == len(said) else None
+
+
+#: in a worker: the networks by their names
+_LOADED: dict[str, ObjectMotionPredictor] = {}
+
+
+def scores(said: FloatArray, real: BoolArray) -> dict[str, float]:
+    """Returns what can be said of shares (N,) against outcomes (N,)."""
+    called = said >= 0.5
+    return {
+        'right': float(np.mean(called == real)),
+        'AUROC': area_interval([said], real, [('', k) for k in range(len(real))])[0],
+        'false success': float(np.mean(called[~real])),
+        'false failure': float(np.mean(~called[real])),
+        'Brier': float(np.mean((said - real) ** 2)),
+    }
+
+
+def row(name: str, said: FloatArray, real: BoolArray) -> list[str]:
+    """Returns a row of the table, with intervals."""
+    found, called = scores(said, real), said >= 0.5
+    _, area = area_interval([said], real, [('', k) for k in range(len(real))])
+    intervals = {
+        'right': wilson(float((called == real).sum()), len(real)),
+        'AUROC': area,
+        'false success': wilson(float(called[~real].sum()), float((~real).sum())),
+        'false failure': wilson(float((~called[real]).sum()), float(real.sum())),
+    }
+    cells = [f'{found[key]:.3f} [{low:.3f}, {high:.3f}]' for key, (low, high) in intervals.items()]
+    return [name, str(len(real)), *cells, f'{found["Brier"]:.4f}']
+
+
+def difference(name: str, first: FloatArray, said: FloatArray, real: BoolArray, seed: int) -> str:
+    """Returns a line: how much others differ from the first, over the same episodes."""
+    rng, drawn = np.random.default_rng(seed), []
+    for _ in range(_DRAWS):
+        rows = rng.integers(0, len(real), len(real))
+        if real[rows].all() or not real[rows].any():
+            continue
+        one, other = scores(first[rows], real[rows]), scores(said[rows], real[rows])
+        drawn.append([other[key] - one[key] for key in one])
+    low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
+    one, other = scores(first, real), scores(said, real)
+    parts = [
+        f'{key} {other[key] - one[key]:+.3f} [{a:+.3f}, {b:+.3f}]'
+        for key, a, b in zip(one, low, high, strict=True)
+    ]
+    return f'- `{name}` less the first: {"; ".join(parts)}.'
+
+
+def outcomes(
+    paths: Sequence[Path], networks: Sequence[str], workers: int
+) -> list[tuple[bool, list[float]]]:
+    """Returns what `judged` says of all episodes that it can judge."""
+    judge = partial(judged, networks=networks)
+    with ProcessPoolExecutor(workers, get_context('spawn')) as pool:
+        return [found for found in pool.map(judge, paths, chunksize=4) if found is not None]
+
+
+def main() -> None:
+    """Prints a row for the rule and each choice of networks, and writes them as a page."""
+    options = parse_arguments(__doc__, 360, more)
+    paths = list_episodes(options.dataset)
+    refuse_test_kinds(paths, 'the choice of networks')
+    count = min(options.repeats, len(paths))
+    paths = [paths[k] for k in np.linspace(0, len(paths), count, False).astype(int)]
+    found = outcomes(paths, options.networks, options.workers)
+    if len({real for real, _ in found}) < 2:
+        raise MtvWorldError(f"'{options.dataset}' needs episodes that succeed and that fail")
+    real = np.array([outcome for outcome, _ in found])
+    columns = np.array([said for _, said in found]).T
+    judges = dict(zip((RULE, *options.networks), columns, strict=True))
+    lines = [
+        difference(name, judges[options.networks[0]], judges[name], real, options.seed)
+        for name in options.networks[1:]
+    ]
+    publish(
+        'foreseen_verdicts',
+        'What object motion networks tell without a picture',
+        f'python benchmark/foreseen_verdicts.py DIR ..., {fingerprint("bundled")}',
+        '\n\n'.join(
+            [
+                (__doc__ or '').split('\n' * 2)[-1],
+                f'{len(real)} episodes of {count}, of which {real.sum()} really succeed.',
+                table(HEAD, [row(name, said, real) for name, said in judges.items()]),
+                '\n'.join(lines),
+            ]
+        ),
+        options,
+        f'{options.workers} processes',
+    )
+
+
+if __name__ == '__main__':
+    main()
