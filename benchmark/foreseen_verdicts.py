@@ -118,7 +118,7 @@ def read_plan(path: Path, robot: RobotModel) -> Plan | None:
         positions=resample(
             stitched_commands(episode, robot, stamp),
             states.positions[0][columns],
-            np.arange(rows) * PERIOD_S,
+            np.arange(rows, dtype=np.float64) * PERIOD_S,
         ),
     )
 
