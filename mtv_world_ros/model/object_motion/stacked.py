@@ -45,10 +45,10 @@ def stacked(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
 
 def multiplied(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Returns (B, ..., D') of x (B, ..., D), weights (M, D', D) and biases (M, D')."""
-    rows = x.reshape(len(weight), -1, x.shape[-1])
-    if bias is None:
-        return (rows @ weight.mT).view(*x.shape[:-1], -1)
-    return torch.baddbmm(bias[:, None], rows, weight.mT).view(*x.shape[:-1], -1)
+    count, width, given = weight.shape
+    rows = x.reshape(count, x.shape[:-1].numel() // count, given)  # may be none
+    out = rows @ weight.mT if bias is None else torch.baddbmm(bias[:, None], rows, weight.mT)
+    return out.view(*x.shape[:-1], width)
 
 
 class _Linear(nn.Module):

@@ -96,6 +96,8 @@ def test_stacked_networks_compute_what_each_computes(more):
             getattr(found, name), torch.cat([getattr(motion, name) for motion in wanted])
         )
     assert (wanted[0].points[0, -1] - wanted[1].points[0, -1]).abs().max() > 1e-3
+    none = replace(whole, **{name: getattr(whole, name)[:, :0] for name in names[:3]})
+    assert stacked(networks)(none).points.shape == (2 * len(networks), STEPS + 1, 0, 3)
 
 
 @pytest.mark.parametrize(('width', 'hidden'), [(32, 16), (48, 20)])
