@@ -31,6 +31,7 @@ from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.metrics.statistics import wilson
+from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot import RobotModel
@@ -183,7 +184,7 @@ def scores(said: FloatArray, real: BoolArray) -> dict[str, float]:
     called = said >= 0.5
     return {
         'right': float(np.mean(called == real)),
-        'AUROC': area_interval([said], real, [('', k) for k in range(len(real))])[0],
+        'AUROC': area_under_roc(said, real) or 0.0,
         'false success': float(np.mean(called[~real])),
         'false failure': float(np.mean(~called[real])),
         'Brier': float(np.mean((said - real) ** 2)),
