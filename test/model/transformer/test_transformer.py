@@ -7,6 +7,7 @@ from small_transformer import build, inputs, PATCH, SMALL
 import torch
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.transformer.stem import _attend
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
 
@@ -78,3 +79,12 @@ def test_copied_patches_come_from_the_views_own_reference() -> None:
     copied = decoder.copy(torch.randn(8, 16, 8, 8), keys, values)
     torch.testing.assert_close(copied[:4], torch.ones_like(copied[:4]))
     torch.testing.assert_close(copied[4:], torch.full_like(copied[4:], 2.0))
+
+
+@pytest.mark.parametrize('width', [12, 32, 48])
+def test_the_attention_of_copies_is_that_of_the_formula(width: int) -> None:
+    torch.manual_seed(0)
+    q, k = torch.randn(2, 2, 30, 32), torch.randn(2, 2, 20, 32)
+    v = torch.randn(2, 1, 20, width).expand(-1, 2, -1, -1)
+    wanted = (q @ k.transpose(2, 3) / 32**0.5).softmax(dim=-1) @ v
+    torch.testing.assert_close(_attend(q, k, v), wanted, rtol=1e-4, atol=1e-5)
