@@ -105,6 +105,40 @@ class Memory:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Where the objects really go, and when a motion in training goes on from there.
+
+    Attributes:
+        points: (B, T + 1, O, 3) [m].
+        rotations: (B, T + 1, O, 3, 3) from the start.
+        forced: (B, T) bool, steps that start from the truth.
+        lost_m: (B,) an object further than this from the truth is lost: it goes on from the truth,
+            as fast as it really is [m].
+    """
+
+    points: Tensor
+    rotations: Tensor
+    forced: Tensor
+    lost_m: Tensor
+
+    def put_right(self, now: Memory, step: int) -> Memory:
+        """Returns the objects as a step starts, put where they really are if they must be."""
+        points, rotations = self.points[:, step], self.rotations[:, step]
+        off = (now.points - points).norm(dim=-1, keepdim=True)  # (B, O, 1)
+        lost = off > self.lost_m[:, None, None]
+        known = lost | self.forced[:, step][:, None, None]
+        before = max(step - 1, 0)
+        way = points - self.points[:, before]
+        turn = _vector(rotations @ self.rotations[:, before].mT)
+        return replace(
+            now,
+            points=torch.where(known, points, now.points),
+            rotations=torch.where(known[..., None], rotations, now.rotations),
+            velocity=torch.where(lost, torch.cat([way, turn], dim=-1), now.velocity),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Extents:
     """Sizes of objects as their masks show them, at the start.
 
@@ -272,20 +306,14 @@ class ObjectMotionNetwork(nn.Module):
                 value[kept[:, None], torch.tensor(_kept(columns))] = old[name]
         return wider
 
-    def forward(
-        self,
-        scene: Scene,
-        truth: tuple[Tensor, Tensor] | None = None,
-        forced: Tensor | None = None,
-    ) -> Motion:
+    def forward(self, scene: Scene, truth: Truth | None = None) -> Motion:
         """Returns the motion over T steps.
 
         Args:
             scene: what is given.
-            truth: (B, T + 1, O, 3) points and (B, T + 1, O, 3, 3) rotations, for training.
-            forced: (B, T) bool, steps that start from the truth; needs `truth`.
+            truth: for training.
         """
-        return self.roll(scene, truth=truth, forced=forced)[0]
+        return self.roll(scene, truth=truth)[0]
 
     def roll(
         self,
@@ -293,8 +321,7 @@ class ObjectMotionNetwork(nn.Module):
         memory: Memory | None = None,
         *,
         skip: int = 0,
-        truth: tuple[Tensor, Tensor] | None = None,
-        forced: Tensor | None = None,
+        truth: Truth | None = None,
         errors: Tensor | None = None,
     ) -> tuple[Motion, Memory]:
         """Returns the motion and what the next call is given.
@@ -304,7 +331,6 @@ class ObjectMotionNetwork(nn.Module):
             memory: of the call before, of which this one goes on; None = it begins.
             skip: rows of the tools that only show what was before: 1 where `memory` is given.
             truth: see `forward`.
-            forced: see `forward`.
             errors: (B, T, O, 3) standard normal numbers: by how many of the errors that the
                 network expects of each step it errs along x, along y and in the yaw; None = a
                 motion without them. What falls or is pushed may then end anywhere that it might.
@@ -314,13 +340,8 @@ class ObjectMotionNetwork(nn.Module):
         track = [now]
         tools, gaps = (torch.cat([rows[:, :1], rows], 1) for rows in (scene.tools, scene.gaps))
         for step in range(skip, scene.tools.shape[1] - 1):
-            if truth is not None and forced is not None:
-                known = forced[:, step][:, None, None]
-                now = replace(
-                    now,
-                    points=torch.where(known, truth[0][:, step], now.points),
-                    rotations=torch.where(known[..., None], truth[1][:, step], now.rotations),
-                )
+            if truth is not None:
+                now = truth.put_right(now, step)
             rows = slice(step, step + 3)  # the step before, this one, the next
             moved, turned, held, hidden, more = self.step(
                 tools[:, rows],

@@ -25,7 +25,7 @@ from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
+from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Truth
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 from mtv_world_ros.training.object_motion.windows import Batch, pools_of, TrackPool
@@ -61,7 +61,12 @@ class MotionTraining:
         batch_size: B, windows a step.
         learning_rate: largest; it warms up over 100 steps and falls as a cosine.
         forced_share: share of the training in which fewer and fewer steps start from the truth;
-            after it windows run free from their first step.
+            after it objects run free from the first step of their window.
+        lost_m: but one that is further than this from the truth is lost, and goes on from there
+            [m]: what comes after a wrong contact teaches little else; in the first `lost_share` of
+            the training, since a network that never bears the consequences takes too much for a
+            success.
+        lost_share: see `lost_m`.
         seed: of weights and windows.
         compile: with torch.compile, which needs a C++ compiler and is 1.8 times as fast.
         device: to train on; on a GPU a step's passes are captured and replayed.
@@ -76,6 +81,8 @@ class MotionTraining:
     batch_size: int = 64
     learning_rate: float = 2e-3
     forced_share: float = 0.35
+    lost_m: float = 0.02
+    lost_share: float = 0.55
     seed: int = 0
     compile: bool = False
     device: str = 'cpu'
@@ -211,7 +218,10 @@ def _losses(
             for group in optimizer.param_groups:
                 group['lr'] = _rate(step, config)
         batch = pools[int(rng.choice(len(pools), p=shares))].draw(config.batch_size, rng)
-        loss = passes(batch, _forced(step / config.steps, config, batch, rng))
+        progress = step / config.steps
+        loss = passes(
+            batch, _forced(progress, config, batch, rng), _lost_m(progress, config, batch)
+        )
         if not math.isfinite(loss.item()):
             raise TrainingError(f'the loss is {loss.item()} at step {step}; lower --learning-rate')
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -250,14 +260,14 @@ class _Passes:
         self._parameters = list(network.parameters())
         self._captured: dict[torch.Size, _Captured] = {}
 
-    def __call__(self, batch: Batch, forced: Tensor) -> Tensor:
+    def __call__(self, batch: Batch, forced: Tensor, lost_m: Tensor) -> Tensor:
         if not batch.points.is_cuda:
-            return self._run(batch, forced)
+            return self._run(batch, forced, lost_m)
         size = batch.points.shape
         if size not in self._captured:
-            self._captured[size] = self._capture(batch, forced)
+            self._captured[size] = self._capture(batch, forced, lost_m)
         captured = self._captured[size]
-        for own, new in zip(captured.given, _tensors(batch, forced), strict=True):
+        for own, new in zip(captured.given, _tensors(batch, forced, lost_m), strict=True):
             own.copy_(new)
         with torch.cuda.device(batch.points.device):
             captured.graph.replay()
@@ -265,31 +275,31 @@ class _Passes:
             parameter.grad = gradient
         return captured.loss
 
-    def _run(self, batch: Batch, forced: Tensor) -> Tensor:
-        loss = _loss(self._network(batch.scene, (batch.points, batch.rotations), forced), batch)
+    def _run(self, batch: Batch, forced: Tensor, lost_m: Tensor) -> Tensor:
+        truth = Truth(points=batch.points, rotations=batch.rotations, forced=forced, lost_m=lost_m)
+        loss = _loss(self._network(batch.scene, truth), batch)
         gradients = torch.autograd.grad(loss, self._parameters)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         return loss.detach()
 
-    def _capture(self, batch: Batch, forced: Tensor) -> _Captured:
+    def _capture(self, batch: Batch, forced: Tensor, lost_m: Tensor) -> _Captured:
         with torch.cuda.device(batch.points.device):
-            return self._capture_here(batch, forced)
+            return self._capture_here(batch, forced, lost_m)
 
-    def _capture_here(self, batch: Batch, forced: Tensor) -> _Captured:
+    def _capture_here(self, batch: Batch, forced: Tensor, lost_m: Tensor) -> _Captured:
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
             for _ in range(3):  # compiles, and lets libraries set up
-                self._run(batch, forced)
+                self._run(batch, forced, lost_m)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            loss = self._run(batch, forced)
+            loss = self._run(batch, forced, lost_m)
         gradients = [parameter.grad for parameter in self._parameters]
-        return _Captured(
-            graph=graph, given=_tensors(batch, forced), loss=loss, gradients=gradients
-        )
+        given = _tensors(batch, forced, lost_m)
+        return _Captured(graph=graph, given=given, loss=loss, gradients=gradients)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,10 +312,10 @@ class _Captured:
     gradients: list[Tensor | None]
 
 
-def _tensors(batch: Batch, forced: Tensor) -> list[Tensor]:
+def _tensors(batch: Batch, forced: Tensor, lost_m: Tensor) -> list[Tensor]:
     scene = [getattr(batch.scene, field.name) for field in fields(batch.scene)]
     rest = [getattr(batch, field.name) for field in fields(batch) if field.name != 'scene']
-    return [*scene, *rest, forced]
+    return [*scene, *rest, forced, lost_m]
 
 
 def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.Optimizer]:
@@ -403,6 +413,12 @@ def _forced(
         forced[:] = False
     forced[:, 0] = True
     return torch.from_numpy(forced).to(batch.points.device)
+
+
+def _lost_m(progress: float, config: MotionTraining, batch: Batch) -> Tensor:
+    """(B,) from where on an object is lost [m]: at last nowhere."""
+    lost_m = config.lost_m if progress < config.lost_share else math.inf
+    return batch.points.new_full((len(batch.points),), lost_m)
 
 
 def _squared_angle(first: Tensor, second: Tensor) -> Tensor:

@@ -17,7 +17,13 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork
+from mtv_world_ros.model.object_motion.network import (
+    _rotation,
+    Memory,
+    Motion,
+    ObjectMotionNetwork,
+    Truth,
+)
 from mtv_world_ros.model.object_motion.predictor import load_network, load_predictor, save_network
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
@@ -90,9 +96,14 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
     errors = []
     for track in tracks:
         batch = TrackPool([track]).whole(0)
-        forced = torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1]
+        truth = Truth(
+            points=batch.points,
+            rotations=batch.rotations,
+            forced=torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1],
+            lost_m=torch.tensor([torch.inf]),
+        )
         with torch.inference_mode():
-            motion = network(batch.scene, (batch.points, batch.rotations), forced)
+            motion = network(batch.scene, truth)
         moves = batch.points.diff(dim=1).norm(dim=-1) > 1e-3
         errors.append((motion.points - batch.points).norm(dim=-1)[:, 1:][moves].mean())
     return float(torch.stack(errors).nanmean())
@@ -238,6 +249,52 @@ def test_muon_steps_along_the_nearest_orthogonal_matrix_in_float32(shape):
     assert off.abs().max() < 1e-4 and (sizes.diagonal() / sizes.diagonal().mean()).min() > 0.6
 
 
+def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
+    torch.manual_seed(0)
+    points = 0.1 * torch.randn(2, 4, 3, 3)
+    turn = torch.tensor([0.0, 0.0, 0.3])
+    rotations = torch.stack([_rotation(step * turn) for step in range(4)])
+    rotations = rotations[None, :, None].expand(2, 4, 3, 3, 3)
+    forced = torch.zeros(2, 3, dtype=torch.bool)
+    truth = Truth(
+        points=points, rotations=rotations, forced=forced, lost_m=torch.tensor([0.02, torch.inf])
+    )
+    off = torch.zeros(2, 3, 3)
+    off[:, 1, 0] = 0.03
+    off[:, 2, 0] = 0.01
+    now = Memory(
+        points=points[:, 2] + off,
+        rotations=torch.eye(3).expand(2, 3, 3, 3),
+        velocity=torch.ones(2, 3, 6),
+        hidden=torch.ones(2, 3, 5),
+        held=torch.zeros(2, 3, 1),
+        spread=torch.zeros(2, 3),
+    )
+    right = truth.put_right(now, 2)
+    lost = torch.tensor([[False, True, False], [False, False, False]])
+    assert torch.equal(right.points[~lost], now.points[~lost])
+    assert torch.equal(right.velocity[~lost], now.velocity[~lost])
+    assert torch.equal(right.points[lost], points[:, 2][lost])
+    assert torch.equal(right.rotations[lost][0], rotations[0, 2, 1])
+    way = torch.cat([points[0, 2, 1] - points[0, 1, 1], turn])
+    torch.testing.assert_close(right.velocity[lost][0], way, rtol=0.02, atol=1e-6)
+    assert torch.equal(right.hidden, now.hidden)
+    # one that starts from the truth keeps its own speed
+    forced[:, 2] = True
+    right = truth.put_right(now, 2)
+    assert torch.equal(right.points, points[:, 2])
+    assert torch.equal(right.velocity[~lost], now.velocity[~lost])
+
+
+def test_lost_objects_are_put_right_in_the_first_part_of_the_training_only(episodes, robot):
+    tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
+    batch = pools_of(tracks, 'cpu')[0].draw(3, np.random.default_rng(0))
+    config = MotionTraining(lost_m=0.015, lost_share=0.4)
+    for progress, wanted in ((0.0, 0.015), (0.39, 0.015), (0.41, math.inf)):
+        found = motion_training._lost_m(progress, config, batch)
+        assert found.tolist() == pytest.approx([wanted] * 3)
+
+
 @pytest.mark.gpu
 def test_captured_passes_give_the_loss_and_gradients_of_plain_ones(episodes, robot):
     tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
@@ -256,7 +313,8 @@ def test_captured_passes_give_the_loss_and_gradients_of_plain_ones(episodes, rob
             batch = one.draw(8, np.random.default_rng(seed))
             forced = torch.zeros(8, windows.WINDOW, dtype=torch.bool, device=batch.points.device)
             forced[:, 0] = True
-            losses.append(run(batch, forced).item())
+            lost_m = torch.full((8,), 0.02, device=batch.points.device)
+            losses.append(run(batch, forced, lost_m).item())
         assert losses[1] == pytest.approx(losses[0], rel=1e-3)
         for wanted, found in zip(plain.parameters(), quick.parameters(), strict=True):
             torch.testing.assert_close(found.grad.cpu(), wanted.grad, rtol=0.01, atol=1e-3)
