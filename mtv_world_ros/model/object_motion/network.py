@@ -456,36 +456,32 @@ class ObjectMotionNetwork(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Messages (B, O, D), logits of being carried (B, O, A), pushes (B, O, 6)."""
         before, here, after = tools
-        seen = [_local(tool, now.points) * _SCALE for tool in (here, after, before)]
+        count = here.shape[1]
+        both, opened = torch.cat([here, after], 1), gaps[:, 1:].flatten(1)
+        places = _local(torch.cat([both, before], 1), now.points)
+        seen = _seen_from(both, places[:, :, : 2 * count], extents)
+        near = [_tool_clearances(both, opened, seen, extents, now)]
+        if self.fingertips:
+            near.append(_fingertip_heights(both, opened, extents, now))
         turned = here[:, None, :, :3, :3].mT @ now.rotations[:, :, None]
         way = torch.einsum('baji,baj->bai', here[..., :3, :3], (after - here)[..., :3, 3])
         apart = gaps.transpose(1, 2)  # (B, A, 3)
         tool = torch.cat([apart, here[:, :, 2:3, 3], way], dim=-1) * _SCALE
         own = torch.cat([extents.shape, now.hidden], dim=-1)
-        pairs = [
-            # far away is far away
-            *(value.clamp(-4, 4) for value in seen),
-            turned[..., :2].flatten(-2),
-        ]
-        near = [
-            _tool_clearances(here, gaps[:, 1], extents, now),
-            _tool_clearances(after, gaps[:, 2], extents, now),
-        ]
-        parts = [torch.cat(pairs, -1), tool[:, None], torch.cat(near, -1), own[:, :, None]]
-        if self.fingertips:
-            heights = [
-                _fingertip_heights(here, gaps[:, 1], extents, now),
-                _fingertip_heights(after, gaps[:, 2], extents, now),
-            ]
-            parts.append(torch.cat(heights, -1))
-        edge = self.tool_edge(*parts)
+        # far away is far away
+        pairs = [_beside((places * _SCALE).clamp(-4, 4), count), turned[..., :2].flatten(-2)]
+        clearances, *heights = (_beside(value, count) for value in near)
+        edge = self.tool_edge(
+            torch.cat(pairs, -1), tool[:, None], clearances, own[:, :, None], *heights
+        )
         push = self.push(edge)
         frame = here[:, None, :, :3, :3]
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
         if self.yielding:
             fingers = self.fingers.view(-1, 2) / _SCALE  # of stacked networks each has its own
             fingers = fingers.repeat_interleave(len(gaps) // len(fingers), 0)
-            ways = _ways_out(after, gaps[:, 2], fingers, extents, now)
+            later = [value[..., count:] for value in seen]
+            ways = _ways_out(after, gaps[:, 2], fingers, later)
             shares = (_YIELDS_GAIN * self.yields(edge)).tanh()
             linear = linear + (shares[..., None] * ways).sum(-2)
         angular = (frame @ push[..., 3:, None])[..., 0]
@@ -538,26 +534,36 @@ def _near(clearance: Tensor) -> Tensor:
     return (clearance * _NEAR).clamp(-3, 3)
 
 
+def _beside(values: Tensor, count: int) -> Tensor:
+    """(B, O, A, K * F) of values (B, O, K * A, F) of `count` A tools at K times."""
+    return values.unflatten(2, (-1, count)).transpose(2, 3).flatten(3)
+
+
 def _seen_from(
-    tools: Tensor, extents: _Extents, now: Memory
+    tools: Tensor, places: Tensor, extents: _Extents
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(B, O, A) where objects are along x and y of tools (B, A, 4, 4), and half as wide [m]."""
-    x, y, _ = _local(tools, now.points).unbind(-1)
-    frame = tools[:, None, :, :2, :2].expand(-1, now.points.shape[1], -1, -1, -1)
+    """(B, O, A) where objects are along x and y of tools (B, A, 4, 4), and half as wide [m].
+
+    `places` (B, O, A, 3) are those of the objects in the tools' frames.
+    """
+    x, y, _ = places.unbind(-1)
+    frame = tools[:, None, :, :2, :2].expand(-1, places.shape[1], -1, -1, -1)
     directions = F.normalize(frame, dim=-2, eps=1e-4)  # of the tool's x and y in the plane
-    across = extents.half_width(directions[..., 0])
-    along = extents.half_width(directions[..., 1])
+    widths = extents.half_width(directions.mT.flatten(2, 3))
+    across, along = widths.unflatten(2, (-1, 2)).unbind(-1)
     return x, y, across, along
 
 
-def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory) -> Tensor:
+def _tool_clearances(
+    tools: Tensor, gaps: Tensor, seen: Sequence[Tensor], extents: _Extents, now: Memory
+) -> Tensor:
     """(B, O, A, 7) of tools (B, A, 4, 4) with fingers `gaps` (B, A) away.
 
     By how much the object reaches past the inside of either finger, and how far it is from the
     fingers' outside; how far it is from them across their travel; how much wider it is than the
     fingers are apart; how far tips are above its top and above its bottom.
     """
-    x, y, across, along = _seen_from(tools, extents, now)
+    x, y, across, along = seen
     gap = gaps[:, None]
     above = tools[:, None, :, 2, 3] - now.points[..., None, 2]
     rows = [
@@ -572,18 +578,16 @@ def _tool_clearances(tools: Tensor, gaps: Tensor, extents: _Extents, now: Memory
     return _near(torch.stack(rows, -1))
 
 
-def _ways_out(
-    tools: Tensor, gaps: Tensor, fingers: Tensor, extents: _Extents, now: Memory
-) -> Tensor:
+def _ways_out(tools: Tensor, gaps: Tensor, fingers: Tensor, seen: Sequence[Tensor]) -> Tensor:
     """(B, O, A, 3, 3) how far an object would have to go so that no finger is in its place [m].
 
     Out of the nearer finger: away from the tool, across the fingers' travel, towards the tool.
     `fingers` (B, 2) are thickness and half the breadth of a finger [m].
     """
-    x, y, across, along = _seen_from(tools, extents, now)
+    x, y, across, along = seen
     gap = gaps[:, None]
-    to_x, to_y = tools[:, None, :, :3, :2].unbind(-1)
     thickness, breadth = fingers[:, None, None].unbind(-1)
+    to_x, to_y = tools[:, None, :, :3, :2].unbind(-1)
     depths = [
         (gap + thickness + along - y.abs(), y.sign(), to_y),
         (breadth + across - x.abs(), x.sign(), to_x),

@@ -79,6 +79,8 @@ def test_two_calls_one_after_the_other_are_one_call(network):
 def test_stacked_networks_compute_what_each_computes(more):
     networks = [lively(k, width=32 + 8 * k * (k > 1), **own) for k, own in enumerate(more)]
     given = scene(3, 3)
+    # fingers as far apart as an object is wide: then their thickness counts
+    given = replace(given, gaps=0.08 * given.gaps)
     names = ('points', 'features', 'present', 'tools', 'gaps')
     parts = [  # each has scenes of its own
         replace(given, **{name: getattr(given, name).repeat_interleave(2, 0) for name in names})
@@ -92,9 +94,9 @@ def test_stacked_networks_compute_what_each_computes(more):
         wanted = [network(part) for network, part in zip(networks, parts, strict=True)]
         found = stacked(networks)(whole)
     for name in ('points', 'rotations', 'held', 'spread'):
-        torch.testing.assert_close(
-            getattr(found, name), torch.cat([getattr(motion, name) for motion in wanted])
-        )
+        every = torch.cat([getattr(motion, name) for motion in wanted])
+        # what is rounded otherwise grows from contact to contact
+        torch.testing.assert_close(getattr(found, name), every, rtol=1e-3, atol=1e-4)
     assert (wanted[0].points[0, -1] - wanted[1].points[0, -1]).abs().max() > 1e-3
     none = replace(whole, **{name: getattr(whole, name)[:, :0] for name in names[:3]})
     assert stacked(networks)(none).points.shape == (2 * len(networks), STEPS + 1, 0, 3)
