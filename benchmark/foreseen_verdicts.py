@@ -48,7 +48,7 @@ from mtv_world_ros.ranking.optimism import area_interval
 from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.task import ever_and_final, load_tasks, match_task, TaskSpec
-from mtv_world_ros.training.object_motion.tracks import object_tracks
+from mtv_world_ros.training.object_motion.tracks import tracks_of
 
 VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'
@@ -101,7 +101,7 @@ def read_plan(path: Path, robot: RobotModel) -> Plan | None:
     states = episode.joint_states
     if found is None or states is None or episode.masks is None:
         return None
-    track = object_tracks(path, robot, VIEWS)[0]
+    track = tracks_of(episode, robot, VIEWS)[0]
     reference = np.where(track.known[0][:, None], track.points[0], np.nan)
     names = tuple(episode.info.objects)
     if not np.isfinite(reference[[names.index(name) for name in found[1].values()]]).all():

@@ -57,12 +57,24 @@ def object_tracks(
     num_starts: int = 1,
     response: ArmResponse | None = None,
 ) -> list[ObjectTracks]:
-    """Reads an episode: from its first frame on, and from later ones that have masks.
+    """Reads an episode; see `tracks_of`."""
+    episode = read_episode(path, views=tuple(views))
+    return tracks_of(episode, robot, views, num_starts, response)
+
+
+def tracks_of(
+    episode: Episode,
+    robot: RobotModel,
+    views: Sequence[str],
+    num_starts: int = 1,
+    response: ArmResponse | None = None,
+) -> list[ObjectTracks]:
+    """Returns the tracks of an episode: from its first frame on, and from later ones with masks.
 
     Where the objects are is taken from its `/object_poses`, or else from its masks.
 
     Args:
-        path: of the episode.
+        episode: as read with these views.
         robot: whose commands it has.
         views: whose masks are used.
         num_starts: frames to begin with at most, spread evenly over those that have masks.
@@ -72,7 +84,7 @@ def object_tracks(
         EpisodeError: it lacks masks in the first frame, joint states or commands, or no object is
             seen by two views.
     """
-    episode = read_episode(path, views=tuple(views))
+    path = episode.info.path
     states = episode.joint_states
     if episode.masks is None or states is None or not episode.trajectories:
         raise EpisodeError(f"'{path}' has no object masks, joint states or commands")
