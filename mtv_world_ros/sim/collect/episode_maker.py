@@ -129,10 +129,15 @@ class EpisodeMaker:
                     )
             finally:
                 sim.close()
+        episode = f"episode {job.index} of task '{job.task}' (seed {job.seed})"
+        if job.policy:
+            raise SimulatorError(
+                f"{episode}: policy '{job.policy}' cannot be carried out in any of "
+                f'{len(attempts)} scenes; leave it, or the task, out (--policies, --task)'
+            )
         raise SimulatorError(
-            f"episode {job.index} of task '{job.task}' (seed {job.seed}) was "
-            f'{"no clean miss" if job.miss else "no success"} in '
-            f'{self._config.record.max_attempts} attempts; see sim/expert/expert.py'
+            f'{episode} was {"no clean miss" if job.miss else "no success"} in {len(attempts)} '
+            'attempts; see sim/expert/expert.py'
         )
 
     def boundary_search(self) -> BoundarySearch:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 import math
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -25,7 +26,7 @@ from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.network import Motion, ObjectMotionNetwork, Truth
+from mtv_world_ros.model.object_motion.network import Memory, Motion, ObjectMotionNetwork, Truth
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 from mtv_world_ros.training.object_motion.windows import Batch, pools_of, TrackPool
@@ -48,6 +49,9 @@ _WAY_M, _NEAR_M, _SLIP = 0.005, 0.15, 0.35
 _STANDS_M, _GOES_M, _RIGHT_M = 0.001, 0.004, 0.015
 #: what a turn of a tool counts as a way [m / rad]
 _LEVER_M = 0.05
+#: gradients keep this share of their size from one step to the step before: through tens of steps
+#: of contact they grow at random, and drown what can be learned
+_KEPT = 0.9
 #: an object has moved if it went further than this [m]
 _MOVED_M = 0.01
 
@@ -230,6 +234,20 @@ def _losses(
                 optimizer.step()
         averaged.update_parameters(network)
         yield loss.item()
+
+
+def _damped(step: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a network's step through which gradients shrink on their way back."""
+
+    def kept(value: Tensor) -> Tensor:
+        return value.detach().lerp(value, _KEPT)
+
+    def run(tools: Tensor, gaps: Tensor, present: Tensor, extents: Any, now: Memory) -> Any:
+        names = ('points', 'rotations', 'velocity', 'hidden')
+        now = replace(now, **{name: kept(getattr(now, name)) for name in names})
+        return step(tools, gaps, present, extents, now)
+
+    return run
 
 
 def _multiply_in(network: ObjectMotionNetwork, dtype: torch.dtype) -> None:

@@ -19,7 +19,7 @@ from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.sim.collect.collect_dataset import collect, locked
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.record import true_poses
+from mtv_world_ros.sim.collect.record import RecordConfig, true_poses
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
 from mtv_world_ros.success.task import ever_and_final
@@ -90,6 +90,16 @@ def test_policies_take_turns_and_whatever_comes_of_it_is_kept(tmp_path):
     assert 'a grasp misses' not in text
     with pytest.raises(SimulatorError, match='another seed|configuration'):
         _collect(tmp_path)
+
+
+def test_a_policy_that_no_scene_allows_is_named(tmp_path, opengl):
+    # the height from which it would drop is out of reach there
+    config = replace(
+        SMALL, policies=('expert-drop_high-0.04',), record=RecordConfig(max_attempts=2)
+    )
+    match = r"'collect_toy'.*'expert-drop_high-0.04' cannot be carried out in any of 2 scenes"
+    with pytest.raises(SimulatorError, match=match):
+        collect('collect_toy', 1, SEED, tmp_path, config=config, progress=False)
 
 
 def test_unknown_policy_is_refused_before_anything_is_made(tmp_path, capsys):

@@ -295,6 +295,26 @@ def test_lost_objects_are_put_right_in_the_first_part_of_the_training_only(episo
         assert found.tolist() == pytest.approx([wanted] * 3)
 
 
+def test_gradients_shrink_from_step_to_step(episodes, robot):
+    tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
+    batch = pools_of(tracks, 'cpu')[0].draw(3, np.random.default_rng(0))
+    torch.manual_seed(0)
+    network = ObjectMotionNetwork(width=24, hidden=8)
+    plain, seen = network.step, []
+    network.step = motion_training._damped(plain)
+    damped = []
+    for step in (plain, network.step):
+        network.step = step
+        scene = replace(batch.scene, points=batch.scene.points.clone().requires_grad_())
+        motion = network(scene)
+        (gradient,) = torch.autograd.grad(motion.points[:, 4, :, 2].sum(), scene.points)
+        damped.append(gradient[..., 2])
+        seen.append(motion.points)
+    assert torch.equal(seen[0], seen[1])
+    # an untrained network leaves everything where it is: the gradient goes through four steps
+    torch.testing.assert_close(damped[1], motion_training._KEPT**4 * damped[0], rtol=0.05, atol=0)
+
+
 @pytest.mark.gpu
 def test_captured_passes_give_the_loss_and_gradients_of_plain_ones(episodes, robot):
     tracks = [object_tracks(path, robot, VIEWS)[0] for path in episodes]
