@@ -47,7 +47,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='N',
         help='also begin in mid-episode: at N frames of those that have masks, spread evenly',
     )
-    parser.add_argument('--steps', type=int, default=4000)
+    parser.add_argument(
+        '--steps', type=int, default=4000, help='0 = the mean of the weights of --init, as it is'
+    )
     parser.add_argument('--batch-size', type=int, default=64)
     parser.add_argument('--learning-rate', type=float, default=2e-3)
     parser.add_argument(

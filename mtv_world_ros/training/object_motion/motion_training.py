@@ -61,7 +61,7 @@ class MotionTraining:
     """How the network is trained.
 
     Attributes:
-        steps: of the optimizer.
+        steps: of the optimizer; 0 = what it goes on from is written as it is.
         batch_size: B, windows a step.
         learning_rate: largest; it warms up over 100 steps and falls as a cosine.
         forced_share: share of the training in which fewer and fewer steps start from the truth;
@@ -161,11 +161,11 @@ def train_motion(
         for loss in bar:
             losses.append(loss)
             bar.set_postfix(loss=f'{np.mean(losses[-50:]):.3f}')
-            if len(losses) % _SAVE_EVERY == 0 or len(losses) == config.steps:
+            if len(losses) % _SAVE_EVERY == 0:
                 _save(_network_of(averaged), folder, losses, response)
     except KeyboardInterrupt:
         tqdm.write(f'stopped after {len(losses)} of {config.steps} steps')
-        _save(_network_of(averaged), folder, losses, response)
+    _save(_network_of(averaged), folder, losses, response)
     return _network_of(averaged).cpu().eval()
 
 

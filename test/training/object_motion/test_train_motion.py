@@ -171,6 +171,15 @@ def test_the_mean_of_networks_has_the_mean_of_their_weights():
         mean_network([first, ObjectMotionNetwork(width=16, hidden=8)])
 
 
+def test_without_a_step_the_mean_is_written_as_it_is(episodes, robot, tmp_path):
+    tracks = [object_tracks(episodes[0], robot, VIEWS)[0]]
+    mean = ObjectMotionNetwork(width=24, hidden=8, fingertips=True, yielding=True)
+    train_motion(tracks, tmp_path, MotionTraining(steps=0), init=mean)
+    loaded = load_network(tmp_path / 'object_motion').state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in mean.state_dict().items())
+    assert (tmp_path / 'motion.csv').read_text() == 'step,loss\n'
+
+
 def test_siblings_share_a_batch_and_count_for_more_where_they_part(episodes, robot, monkeypatch):
     (track,) = object_tracks(episodes[0], robot, VIEWS)
     assert track.scene == ''
