@@ -140,9 +140,9 @@ def _attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     weights, and takes a quarter of the time on a CPU.
     """
     wide = max(q.shape[-1], v.shape[-1])
-    padded = [F.pad(x.to(v.dtype), (0, wide - x.shape[-1])) for x in (q, k, v)]
-    out = F.scaled_dot_product_attention(*padded, scale=q.shape[-1] ** -0.5)
-    return out[..., : v.shape[-1]]
+    scale, width = q.shape[-1] ** -0.5, v.shape[-1]
+    q, k, v = (F.pad(x.to(v.dtype), (0, wide - x.shape[-1])) for x in (q, k, v))
+    return F.scaled_dot_product_attention(q, k, v, scale=scale)[..., :width]
 
 
 def _fourier_places(h: int, w: int, like: Tensor) -> Tensor:
