@@ -111,6 +111,7 @@ class Truth:
     Attributes:
         points: (B, T + 1, O, 3) [m].
         rotations: (B, T + 1, O, 3, 3) from the start.
+        known: (B, T + 1, O) bool; what is hidden is left where the motion has it.
         forced: (B, T) bool, steps that start from the truth.
         lost_m: (B,) an object further than this from the truth is lost: it goes on from the truth,
             as fast as it really is [m].
@@ -118,16 +119,17 @@ class Truth:
 
     points: Tensor
     rotations: Tensor
+    known: Tensor
     forced: Tensor
     lost_m: Tensor
 
     def put_right(self, now: Memory, step: int) -> Memory:
         """Returns the objects as a step starts, put where they really are if they must be."""
-        points, rotations = self.points[:, step], self.rotations[:, step]
-        off = (now.points - points).norm(dim=-1, keepdim=True)  # (B, O, 1)
-        lost = off > self.lost_m[:, None, None]
-        known = lost | self.forced[:, step][:, None, None]
-        before = max(step - 1, 0)
+        points, rotations, before = self.points[:, step], self.rotations[:, step], max(step - 1, 0)
+        seen = (self.known[:, step] & self.known[:, before])[..., None]  # (B, O, 1)
+        off = (now.points - points).norm(dim=-1, keepdim=True)
+        lost = seen & (off > self.lost_m[:, None, None])
+        known = lost | (seen & self.forced[:, step][:, None, None])
         way = points - self.points[:, before]
         turn = _vector(rotations @ self.rotations[:, before].mT)
         return replace(
@@ -586,8 +588,8 @@ def _ways_out(tools: Tensor, gaps: Tensor, fingers: Tensor, seen: Sequence[Tenso
     """
     x, y, across, along = seen
     gap = gaps[:, None]
-    thickness, breadth = fingers[:, None, None].unbind(-1)
     to_x, to_y = tools[:, None, :, :3, :2].unbind(-1)
+    thickness, breadth = fingers[:, None, None].unbind(-1)
     depths = [
         (gap + thickness + along - y.abs(), y.sign(), to_y),
         (breadth + across - x.abs(), x.sign(), to_x),

@@ -294,7 +294,13 @@ class _Passes:
         return captured.loss
 
     def _run(self, batch: Batch, forced: Tensor, lost_m: Tensor) -> Tensor:
-        truth = Truth(points=batch.points, rotations=batch.rotations, forced=forced, lost_m=lost_m)
+        truth = Truth(
+            points=batch.points,
+            rotations=batch.rotations,
+            known=batch.known,
+            forced=forced,
+            lost_m=lost_m,
+        )
         loss = _loss(self._network(batch.scene, truth), batch)
         gradients = torch.autograd.grad(loss, self._parameters)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):

@@ -99,6 +99,7 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
         truth = Truth(
             points=batch.points,
             rotations=batch.rotations,
+            known=batch.known,
             forced=torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1],
             lost_m=torch.tensor([torch.inf]),
         )
@@ -265,8 +266,13 @@ def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
     rotations = torch.stack([_rotation(step * turn) for step in range(4)])
     rotations = rotations[None, :, None].expand(2, 4, 3, 3, 3)
     forced = torch.zeros(2, 3, dtype=torch.bool)
+    known = torch.ones(2, 4, 3, dtype=torch.bool)
     truth = Truth(
-        points=points, rotations=rotations, forced=forced, lost_m=torch.tensor([0.02, torch.inf])
+        points=points,
+        rotations=rotations,
+        known=known,
+        forced=forced,
+        lost_m=torch.tensor([0.02, torch.inf]),
     )
     off = torch.zeros(2, 3, 3)
     off[:, 1, 0] = 0.03
@@ -293,6 +299,10 @@ def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
     right = truth.put_right(now, 2)
     assert torch.equal(right.points, points[:, 2])
     assert torch.equal(right.velocity[~lost], now.velocity[~lost])
+    # nobody knows where something hidden is
+    known[:, 2] = False
+    right = truth.put_right(now, 2)
+    assert torch.equal(right.points, now.points) and torch.equal(right.velocity, now.velocity)
 
 
 def test_lost_objects_are_put_right_in_the_first_part_of_the_training_only(episodes, robot):
