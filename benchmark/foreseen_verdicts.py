@@ -43,11 +43,11 @@ from mtv_world_ros.model.object_motion.predictor import (
     ObjectMotionPredictor,
     TrackedObjects,
 )
-from mtv_world_ros.ranking.no_picture_rule import carried, Thing
+from mtv_world_ros.ranking.no_picture_rule import is_done, Thing
 from mtv_world_ros.ranking.optimism import area_interval
 from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 from mtv_world_ros.success.foreseen import ForeseenMotions
-from mtv_world_ros.success.task import ever_and_final, load_tasks, match_task, TaskSpec
+from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.training.object_motion.tracks import tracks_of
 
 VIEWS = ('low', 'high')
@@ -142,18 +142,11 @@ def share_foreseen(plan: Plan, predictor: ObjectMotionPredictor) -> float | None
 def ruled(plan: Plan, predictor: ObjectMotionPredictor) -> float:
     """Returns whether a plan succeeds by the rule, which is given the same places and sizes."""
     tracked = TrackedObjects(model=predictor, reference=plan.reference, features=plan.features)
-    items = {role: plan.names.index(name) for role, name in plan.bound.items()}
-    roles = {
-        role: Thing(
-            name=plan.names[item],
-            centre=plan.reference[item],
-            size=np.array(plan.task.sizes_m.get(role) or tracked.sizes[item]),
-            is_rim_held=plan.names[item].split()[-1] in plan.task.rims,
-        )
-        for role, item in items.items()
+    things = {
+        name: Thing(name=name, centre=centre, size=size)
+        for name, centre, size in zip(plan.names, plan.reference, tracked.sizes, strict=True)
     }
-    poses = carried(predictor.robot, plan.positions, roles)
-    return float(ever_and_final(plan.task.holds(poses, poses.openings))[1])
+    return float(is_done(plan.task, plan.bound, things, predictor.robot, plan.positions))
 
 
 def judged(path: Path, networks: Sequence[str]) -> tuple[bool, list[float]] | None:

@@ -19,7 +19,7 @@ from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.success.situation import CannotTell, TruePoses
-from mtv_world_ros.success.task import ever_and_final, match_task
+from mtv_world_ros.success.task import ever_and_final, match_task, TaskSpec
 
 #: a tool that closes this near to an object's centre, in the plane and in height, takes it [m]
 REACH_M, REACH_HEIGHT_M = 0.02, 0.03
@@ -89,6 +89,28 @@ def judge_without_pictures(episode: ImaginedEpisode, commands: FloatArray) -> bo
     missing = [name for name in bound.values() if name not in things]
     if missing:
         raise CannotTell(f"'{missing[0]}' is not seen in two views of the first frame")
+    return is_done(task, bound, things, pipeline.robot, commands)
+
+
+def is_done(
+    task: TaskSpec,
+    bound: Mapping[str, str],
+    things: Mapping[str, Thing],
+    robot: RobotModel,
+    commands: FloatArray,
+) -> bool:
+    """Returns whether the task is done at the end, by the rule.
+
+    Args:
+        task: whose relations judge.
+        bound: placeholder -> name of its object.
+        things: where these objects are at first, by name.
+        robot: whose joints are commanded.
+        commands: (C, J) joint positions at the simulator's control rate [rad or m].
+
+    Raises:
+        CannotTell: a relation asks for what poses do not tell.
+    """
     roles = {
         role: replace(
             things[name],
@@ -97,7 +119,7 @@ def judge_without_pictures(episode: ImaginedEpisode, commands: FloatArray) -> bo
         )
         for role, name in bound.items()
     }
-    poses = carried(pipeline.robot, commands, roles)
+    poses = carried(robot, commands, roles)
     return ever_and_final(task.holds(poses, poses.openings))[1]
 
 
