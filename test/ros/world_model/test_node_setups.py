@@ -143,8 +143,15 @@ def test_qos_overrides_and_latched_instruction(start, new_client, ros):
         ),
         'the instruction to be latched',
     )
-    ended = client.imagine_one()
-    assert ended['instruction'] == 'stack the green block on the pink block'
+
+    def is_seen():
+        """A camera goes on sending: what is sent with best effort may be lost."""
+        client.send_scene()
+        return client.diagnostic_values().get('image_age_s.low', 'nan') != 'nan'
+
+    client.wait(is_seen, 'an image of the low camera')
+    ended = client.imagine_one(scene='sent')
+    assert ended.get('instruction') == 'stack the green block on the pink block', ended
 
 
 @pytest.mark.parametrize(
