@@ -5,6 +5,9 @@ own frame, how far the fingers are apart, by how much they overlap it) and of ev
 and decides how far it goes along with which tool. It is translation-invariant in the plane by
 construction. Overlaps are computed from the widths and heights of the masks, not learned: so a
 grasp that fails for a reason that training never showed is still a matter of the same few numbers.
+Contact works both ways: a hand that comes down on an object is stopped by it, and what it holds is
+pressed on what lies below. So tools have a state as well: how far they are off the way on which
+nothing would touch them.
 
 Interaction networks: Battaglia et al. 2016; their use as simulators: Sanchez-Gonzalez et al. 2020.
 
@@ -41,6 +44,8 @@ _NUM_WAYS_OUT, _FARTHEST_OUT_M, _FINGER_M = 3, 0.05, 0.01
 _YIELDS_GAIN = 8.0
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
+#: numbers that say how far a tool is off its way
+_NUM_OFF = 7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +56,7 @@ class Scene:
         points: (B, O, 3) where the objects are at first [m].
         features: (B, O, V, F) of `object_shapes`.
         present: (B, O) bool, False where the batch is padded.
-        tools: (B, T + 1, A, 4, 4) T_base_tool as commanded.
+        tools: (B, T + 1, A, 4, 4) T_base_tool where nothing is touched.
         gaps: (B, T + 1, A) from a tool to each of its fingers, as commanded [m].
     """
 
@@ -75,12 +80,14 @@ class Motion:
         rotations: (B, T + 1, O, 3, 3) from the start.
         held: (B, T + 1, O, A) share of the motion that each tool gives.
         spread: (B, T + 1, O) expected error of `points` [m], as learned.
+        off: (B, T + 1, A, 7) of the tools, see `off_way`.
     """
 
     points: Tensor
     rotations: Tensor
     held: Tensor
     spread: Tensor
+    off: Tensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +101,8 @@ class Memory:
         hidden: (B, O, H).
         held: (B, O, A), see `Motion`.
         spread: (B, O), see `Motion`.
+        off: (B, A, 7), see `Motion`; and one step before.
+        off_before: see `off`.
     """
 
     points: Tensor
@@ -102,6 +111,8 @@ class Memory:
     hidden: Tensor
     held: Tensor
     spread: Tensor
+    off: Tensor
+    off_before: Tensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,6 +126,7 @@ class Truth:
         forced: (B, T) bool, steps that start from the truth.
         lost_m: (B,) an object further than this from the truth is lost: it goes on from the truth,
             as fast as it really is [m].
+        off: (B, T + 1, A, 7) of the tools, see `off_way`.
     """
 
     points: Tensor
@@ -122,6 +134,7 @@ class Truth:
     known: Tensor
     forced: Tensor
     lost_m: Tensor
+    off: Tensor
 
     def put_right(self, now: Memory, step: int) -> Memory:
         """Returns the objects as a step starts, put where they really are if they must be."""
@@ -132,11 +145,14 @@ class Truth:
         known = lost | (seen & self.forced[:, step][:, None, None])
         way = points - self.points[:, before]
         turn = _vector(rotations @ self.rotations[:, before].mT)
+        told = (self.forced[:, step] | lost.any(1)[:, 0])[:, None, None]  # where tools are
         return replace(
             now,
             points=torch.where(known, points, now.points),
             rotations=torch.where(known[..., None], rotations, now.rotations),
             velocity=torch.where(lost, torch.cat([way, turn], dim=-1), now.velocity),
+            off=torch.where(told, self.off[:, step], now.off),
+            off_before=torch.where(told, self.off[:, before], now.off_before),
         )
 
 
@@ -178,7 +194,7 @@ class _Extents:
         return (mean + (two_cos * (a - c) + two_sin * (b - d)) / 2 + four).clamp(min=0.0) / 2
 
 
-class _Perceptron(nn.Sequential):
+class Perceptron(nn.Sequential):
     """Layers whose input comes in parts that broadcast: each is multiplied before it is spread.
 
     Args:
@@ -220,6 +236,7 @@ class ObjectMotionNetwork(nn.Module):
             differs where a tool leans.
         yielding: it may move an object just as far as a finger, or another object, would reach
             into it.
+        touching: tools are pushed off their way by what they touch.
     """
 
     def __init__(
@@ -230,6 +247,7 @@ class ObjectMotionNetwork(nn.Module):
         *,
         fingertips: bool = False,
         yielding: bool = False,
+        touching: bool = False,
     ) -> None:
         super().__init__()
         self.config = {
@@ -238,22 +256,23 @@ class ObjectMotionNetwork(nn.Module):
             'hidden': hidden,
             'fingertips': fingertips,
             'yielding': yielding,
+            'touching': touching,
         }
         self.width, self.hidden, self.fingertips = width, hidden, fingertips
-        self.yielding = yielding
-        self.shape = _Perceptron(num_features + 1, width, _SHAPE)
+        self.yielding, self.touching = yielding, touching
+        self.shape = Perceptron(num_features + 1, width, _SHAPE)
         # r now, next, before (9) | rotation in the tool (6) | gaps (3) | tool: height, way (4) |
         # clearances now and next
         given = 22 + 2 * _NUM_TOOL_CLEARANCES
-        tips = _NUM_FINGERTIP_HEIGHTS if fingertips else 0
-        self.tool_edge = _Perceptron(given + _SHAPE + hidden + tips, width, width, width)
+        tips = _NUM_FINGERTIP_HEIGHTS * fingertips + _NUM_OFF * touching
+        self.tool_edge = Perceptron(given + _SHAPE + hidden + tips, width, width, width)
         # offset (3) | velocities (6) | rotation of the other (6) | clearances
         given = 15 + _NUM_OBJECT_CLEARANCES
-        self.object_edge = _Perceptron(given + 2 * _SHAPE + hidden, width, width)
+        self.object_edge = Perceptron(given + 2 * _SHAPE + hidden, width, width)
         self.gate = nn.Linear(width, 1)
         self.push = nn.Linear(width, 6)
         # height, clearance over the table, velocity, spin, rotation
-        self.node = _Perceptron(2 + 3 + 3 + 6 + _SHAPE + hidden + 2 * width, width, width)
+        self.node = Perceptron(2 + 3 + 3 + 6 + _SHAPE + hidden + 2 * width, width, width)
         self.free = nn.Linear(width, 6)
         self.stay = nn.Linear(width, 1)
         self.memory = nn.GRUCell(width, hidden)
@@ -264,6 +283,11 @@ class ObjectMotionNetwork(nn.Module):
             self.fingers = nn.Parameter(torch.full((2,), _FINGER_M * _SCALE))
             self.gives_way = nn.Linear(width, 1)
             still += [self.yields, self.gives_way]
+        if touching:
+            # messages, what is held | tool: gaps, height, way | off
+            self.tool_node = Perceptron(2 * width + 7 + _NUM_OFF, width, width)
+            self.off = nn.Linear(width, _NUM_OFF)
+            still.append(self.off)
         for layer in still:
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -271,7 +295,7 @@ class ObjectMotionNetwork(nn.Module):
         nn.init.constant_(self.scale.bias, -6.0)
 
     def widened(self, width: int, hidden: int) -> ObjectMotionNetwork:
-        """Returns a wider one, with fingertips and yielding, that computes the same and can learn.
+        """Returns a wider one, with all that networks have by now: it computes the same at first.
 
         What is new hears everything and is not listened to at first (Net2Net: Chen et al. 2016).
 
@@ -284,14 +308,21 @@ class ObjectMotionNetwork(nn.Module):
                 f'shrink to {width} and {hidden}'
             )
         wider = ObjectMotionNetwork(
-            self.config['num_features'], width, hidden, fingertips=True, yielding=True
+            self.config['num_features'],
+            width,
+            hidden,
+            fingertips=True,
+            yielding=True,
+            touching=True,
         )
         w, h = (self.width, width), (self.hidden, hidden)
-        tips = (_NUM_FINGERTIP_HEIGHTS if self.fingertips else 0, _NUM_FINGERTIP_HEIGHTS)
+        tips = (_NUM_FINGERTIP_HEIGHTS * self.fingertips, _NUM_FINGERTIP_HEIGHTS)
+        off = (_NUM_OFF * self.touching, _NUM_OFF)
         old, new = self.state_dict(), wider.state_dict()
-        known = old['tool_edge.0.weight'].shape[1] - h[0] - tips[0]
+        known = old['tool_edge.0.weight'].shape[1] - h[0] - tips[0] - off[0]
         blocks = {  # of the columns, (old, new), in the order in which `step` gives them
-            'tool_edge.0.weight': [(known, known), h, tips],
+            'tool_edge.0.weight': [(known, known), h, tips, off],
+            'tool_node.0.weight': [w, w, (7 + _NUM_OFF, 7 + _NUM_OFF)],
             'node.0.weight': [(14 + _SHAPE, 14 + _SHAPE), h, w, w],
         }
         for name, value in new.items():
@@ -345,7 +376,7 @@ class ObjectMotionNetwork(nn.Module):
             if truth is not None:
                 now = truth.put_right(now, step)
             rows = slice(step, step + 3)  # the step before, this one, the next
-            moved, turned, held, hidden, more = self.step(
+            moved, turned, held, hidden, more, off = self.step(
                 tools[:, rows],
                 gaps[:, rows],
                 scene.present,
@@ -363,9 +394,11 @@ class ObjectMotionNetwork(nn.Module):
                 hidden=hidden,
                 held=held,
                 spread=now.spread + more,
+                off=off,
+                off_before=now.off,
             )
             track.append(now)
-        names = ('points', 'rotations', 'held', 'spread')
+        names = ('points', 'rotations', 'held', 'spread', 'off')
         rows_of = {name: torch.stack([getattr(m, name) for m in track], 1) for name in names}
         return Motion(**rows_of), now
 
@@ -395,19 +428,25 @@ class ObjectMotionNetwork(nn.Module):
             hidden=points.new_zeros(batch, objects, self.hidden),
             held=points.new_zeros(batch, objects, scene.tools.shape[2]),
             spread=points.new_zeros(batch, objects),
+            off=(off := points.new_zeros(batch, scene.tools.shape[2], _NUM_OFF)),
+            off_before=off,
         )
 
     def step(
         self, tools: Tensor, gaps: Tensor, present: Tensor, extents: _Extents, now: Memory
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """One step, from the tools (B, 3, A, 4, 4) and gaps (B, 3, A) before, now and after.
 
         `extents` are turned as the objects are now.
 
-        Returns points, rotations, shares of the tools, memory, and what is added to the spread.
+        Returns points, rotations, shares of the tools, memory, what is added to the spread, and
+        how far the tools are off their way.
         """
+        aimed = tools[:, 2]
+        if self.touching:  # as if nothing changed
+            tools = tools @ _pose(torch.stack([now.off_before, now.off, now.off], 1))
         before, here, after = tools.unbind(1)
-        heard, gates, pushed = self._from_tools(gaps, extents, now, (before, here, after))
+        edge, tool, seen = self._from_tools(gaps, extents, now, (before, here, after))
         told, shares = self._from_objects(present, extents, now)
         height = now.points[..., 2]
         node = self.node(
@@ -420,7 +459,7 @@ class ObjectMotionNetwork(nn.Module):
                     now.rotations[..., :2].flatten(-2),
                     extents.shape,
                     now.hidden,
-                    heard,
+                    edge.sum(2),
                     told,
                 ],
                 dim=-1,
@@ -429,8 +468,17 @@ class ObjectMotionNetwork(nn.Module):
         hidden = self.memory(node.flatten(0, 1), now.hidden.flatten(0, 1)).unflatten(
             0, now.hidden.shape[:2]
         )
-        weights = torch.cat([gates, self.stay(node)], dim=-1).softmax(dim=-1)
+        weights = torch.cat([self.gate(edge)[..., 0], self.stay(node)], dim=-1).softmax(dim=-1)
         held = weights[..., :-1]
+        off = now.off
+        if self.touching:
+            is_there = present[..., None, None]
+            held_node = held[..., None] * node[:, :, None]
+            heard = [(value * is_there).sum(1) for value in (edge, held_node)]
+            off = _unscaled(self.off(self.tool_node(*heard, tool, _scaled(now.off))))
+            after = aimed @ _pose(off)
+            seen = _seen_from(after, _local(after, now.points), extents)
+        pushed = self._pushed(edge, here, after, gaps[:, 2], seen)
         carry = after @ _inverse(here)  # (B, A, 4, 4)
         there = torch.einsum('baij,boj->boai', carry[..., :3, :3], now.points)
         there = there + carry[:, None, :, :3, 3]
@@ -447,7 +495,7 @@ class ObjectMotionNetwork(nn.Module):
         turn = (held[..., None] * spin[:, None]).sum(2) + pushed[..., 3:] + free[..., 3:]
         turned = _rotation(turn) @ now.rotations
         more = F.softplus(self.scale(node.detach())[..., 0]) / _SCALE
-        return moved, turned, held, hidden, more
+        return moved, turned, held, hidden, more, off
 
     def _from_tools(
         self,
@@ -455,8 +503,8 @@ class ObjectMotionNetwork(nn.Module):
         extents: _Extents,
         now: Memory,
         tools: tuple[Tensor, Tensor, Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Messages (B, O, D), logits of being carried (B, O, A), pushes (B, O, 6)."""
+    ) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
+        """Messages (B, O, A, D), tools (B, A, 7), and how the next ones see the objects."""
         before, here, after = tools
         count = here.shape[1]
         both, opened = torch.cat([here, after], 1), gaps[:, 1:].flatten(1)
@@ -473,21 +521,26 @@ class ObjectMotionNetwork(nn.Module):
         # far away is far away
         pairs = [_beside((places * _SCALE).clamp(-4, 4), count), turned[..., :2].flatten(-2)]
         clearances, *heights = (_beside(value, count) for value in near)
+        off = [_scaled(now.off)[:, None]] if self.touching else []
         edge = self.tool_edge(
-            torch.cat(pairs, -1), tool[:, None], clearances, own[:, :, None], *heights
+            torch.cat(pairs, -1), tool[:, None], clearances, own[:, :, None], *heights, *off
         )
+        return edge, tool, [value[..., count:] for value in seen]
+
+    def _pushed(
+        self, edge: Tensor, here: Tensor, after: Tensor, gaps: Tensor, seen: Sequence[Tensor]
+    ) -> Tensor:
+        """(B, O, 6) way [m] and turn [rad] that tools give objects beside what they carry."""
         push = self.push(edge)
         frame = here[:, None, :, :3, :3]
         linear = (frame @ push[..., :3, None])[..., 0] / _SCALE
         if self.yielding:
             fingers = self.fingers.view(-1, 2) / _SCALE  # of stacked networks each has its own
             fingers = fingers.repeat_interleave(len(gaps) // len(fingers), 0)
-            later = [value[..., count:] for value in seen]
-            ways = _ways_out(after, gaps[:, 2], fingers, later)
             shares = (_YIELDS_GAIN * self.yields(edge)).tanh()
-            linear = linear + (shares[..., None] * ways).sum(-2)
+            linear = linear + (shares[..., None] * _ways_out(after, gaps, fingers, seen)).sum(-2)
         angular = (frame @ push[..., 3:, None])[..., 0]
-        return edge.sum(2), self.gate(edge)[..., 0], torch.cat([linear, angular], -1).sum(2)
+        return torch.cat([linear, angular], -1).sum(2)
 
     def _from_objects(
         self, present: Tensor, extents: _Extents, now: Memory
@@ -524,6 +577,44 @@ def _erring(moved: Tensor, turned: Tensor, more: Tensor, errors: Tensor) -> tupl
     plane = F.pad(size * errors[..., :2], (0, 1))
     yaw = F.pad(size * errors[..., 2:] * _SCALE, (2, 0))
     return moved + plane, _rotation(yaw) @ turned
+
+
+def off_way(
+    tools: Tensor, gaps: Tensor, free_tools: Tensor, free_gaps: Tensor
+) -> Tensor:
+    """Returns (..., A, 7) how far tools are off where they would be if they touched nothing.
+
+    In the frame of the latter: offset [m], rotation vector [rad], and how much further each finger
+    is from the tool [m].
+
+    Args:
+        tools: (..., A, 4, 4) T_base_tool as they are.
+        gaps: (..., A) to their fingers [m].
+        free_tools: (..., A, 4, 4) where nothing is touched.
+        free_gaps: (..., A) as commanded [m].
+    """
+    pose = _inverse(free_tools) @ tools
+    sine = _vector(pose[..., :3, :3])  # times the axis
+    norm = sine.norm(dim=-1, keepdim=True)
+    cosine = (pose[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    turn = sine * torch.where(norm > 1e-6, torch.atan2(norm, cosine) / norm.clamp(min=1e-6), 1.0)
+    return torch.cat([pose[..., :3, 3], turn, (gaps - free_gaps)[..., None]], -1)
+
+
+def _pose(off: Tensor) -> Tensor:
+    """(..., 4, 4) of (..., 7), see `off_way`."""
+    rows = torch.cat([_rotation(off[..., 3:6]), off[..., :3, None]], -1)
+    last = torch.zeros_like(rows[..., :1, :])
+    last[..., 3] = 1
+    return torch.cat([rows, last], -2)
+
+
+def _scaled(off: Tensor) -> Tensor:
+    return torch.cat([off[..., :3] * _SCALE, off[..., 3:6], off[..., 6:] * _SCALE], -1)
+
+
+def _unscaled(off: Tensor) -> Tensor:
+    return torch.cat([off[..., :3] / _SCALE, off[..., 3:6], off[..., 6:] / _SCALE], -1)
 
 
 def _kept(blocks: Sequence[tuple[int, int]]) -> list[int]:

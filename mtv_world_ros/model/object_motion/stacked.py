@@ -14,7 +14,7 @@ import copy
 import torch
 from torch import nn, Tensor
 
-from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
+from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork, Perceptron
 
 
 def stacked(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
@@ -36,8 +36,9 @@ def stacked(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
             one.set_submodule(name, _Linear(parts))
         elif isinstance(module, nn.GRUCell):
             one.set_submodule(name, _Cell(parts))
-    for layers in (one.shape, one.tool_edge, one.object_edge, one.node):
-        layers.product = multiplied
+    for layers in one.modules():
+        if isinstance(layers, Perceptron):
+            layers.product = multiplied
     if one.yielding:
         one.fingers = nn.Parameter(torch.stack([network.fingers for network in networks]))
     return one.eval()

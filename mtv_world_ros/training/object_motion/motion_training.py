@@ -26,7 +26,13 @@ from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.network import Memory, Motion, ObjectMotionNetwork, Truth
+from mtv_world_ros.model.object_motion.network import (
+    Memory,
+    Motion,
+    ObjectMotionNetwork,
+    off_way,
+    Truth,
+)
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
 from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
 from mtv_world_ros.training.object_motion.windows import Batch, pools_of, TrackPool
@@ -189,7 +195,9 @@ def _network(
 ) -> ObjectMotionNetwork:
     if init is None:
         width, hidden = config.width or _WIDTH, config.hidden or _HIDDEN
-        return ObjectMotionNetwork(count, width, hidden, fingertips=True, yielding=True)
+        return ObjectMotionNetwork(
+            count, width, hidden, fingertips=True, yielding=True, touching=True
+        )
     try:
         return init.widened(config.width or init.width, config.hidden or init.hidden)
     except ValueError as error:
@@ -243,7 +251,7 @@ def _damped(step: Callable[..., Any]) -> Callable[..., Any]:
         return value.detach().lerp(value, _KEPT)
 
     def run(tools: Tensor, gaps: Tensor, present: Tensor, extents: Any, now: Memory) -> Any:
-        names = ('points', 'rotations', 'velocity', 'hidden')
+        names = ('points', 'rotations', 'velocity', 'hidden', 'off', 'off_before')
         now = replace(now, **{name: kept(getattr(now, name)) for name in names})
         return step(tools, gaps, present, extents, now)
 
@@ -300,6 +308,7 @@ class _Passes:
             known=batch.known,
             forced=forced,
             lost_m=lost_m,
+            off=_off_way(batch),
         )
         loss = _loss(self._network(batch.scene, truth), batch)
         gradients = torch.autograd.grad(loss, self._parameters)
@@ -445,6 +454,11 @@ def _lost_m(progress: float, config: MotionTraining, batch: Batch) -> Tensor:
     return batch.points.new_full((len(batch.points),), lost_m)
 
 
+def _off_way(batch: Batch) -> Tensor:
+    """(B, T + 1, A, 7) of the tools as they really are."""
+    return off_way(batch.tools, batch.gaps, batch.scene.tools, batch.scene.gaps)
+
+
 def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
     """(...) of rotations (..., 3, 3), while it is small [rad^2]."""
     return 3 - (first.mT @ second).diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -452,7 +466,7 @@ def _squared_angle(first: Tensor, second: Tensor) -> Tensor:
 
 def _carried(batch: Batch) -> tuple[Tensor, Tensor]:
     """(B, T, O, A) whether a tool carries an object in a step, and whether that is known."""
-    rotations, places = batch.scene.tools[..., :3, :3], batch.scene.tools[..., :3, 3]
+    rotations, places = batch.tools[..., :3, :3], batch.tools[..., :3, 3]
     offset = batch.points[:, :, :, None] - places[:, :, None]
     local = torch.einsum('btaji,btoaj->btoai', rotations, offset)
     turn = _squared_angle(rotations[:, 1:], rotations[:, :-1]).clamp(min=0).sqrt()
@@ -480,6 +494,11 @@ def _loss(motion: Motion, batch: Batch) -> Tensor:
         1.0 + 3.0 * moved + 4.0 * batch.parted
     )
     loss = ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()
+    # what stops a tool, and what it holds, show in how far it is off its way
+    off, really_off = (torch.split(x, [3, 3, 1], -1) for x in (motion.off, _off_way(batch)))
+    for mine, real, weight in zip(off, really_off, (1e4, _TURN, 1e4), strict=True):
+        tool = F.huber_loss(mine, real, reduction='none', delta=0.01 if weight > _TURN else 0.3)
+        loss = loss + weight * tool.sum(-1).mean()
     # else it would move what is held by pushing it, which does not turn it
     carried, asked = _carried(batch)
     asked &= ((error < _RIGHT_M) & batch.known & batch.scene.present[:, None])[:, 1:, :, None]

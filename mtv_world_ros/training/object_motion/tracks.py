@@ -31,8 +31,10 @@ class ObjectTracks:
 
     Attributes:
         features: (O, V, F) of `object_shapes`.
-        tools: (T + 1, A, 4, 4) T_base_tool as expected of the commands.
+        tools: (T + 1, A, 4, 4) T_base_tool as expected of the commands if nothing is touched.
         gaps: (T + 1, A) from a tool to its fingers, as commanded [m].
+        recorded_tools: (T + 1, A, 4, 4) where they really were.
+        recorded_gaps: (T + 1, A) likewise.
         points: (T + 1, O, 3) [m], from where the first frame's masks have the objects.
         rotations: (T + 1, O, 3, 3) from the start.
         known: (T + 1, O) bool.
@@ -43,6 +45,8 @@ class ObjectTracks:
     features: FloatArray
     tools: FloatArray
     gaps: FloatArray
+    recorded_tools: FloatArray
+    recorded_gaps: FloatArray
     points: FloatArray
     rotations: FloatArray
     known: BoolArray
@@ -98,6 +102,10 @@ def tracks_of(
     positions = resample(commands, states.positions[0][columns], times)
     expected = positions if response is None else response.follow(robot, positions)[0]
     times, positions, expected = (rows[::every] for rows in (times, positions, expected))
+    stamps_ns = stamps[0] + times * 1e9
+    recorded = np.stack(
+        [np.interp(stamps_ns, states.stamps_ns, states.positions[:, c]) for c in columns], -1
+    )
     cameras = [episode.cameras[view] for view in views]
     recording = _Recording(
         episode=episode,
@@ -106,7 +114,9 @@ def tracks_of(
         poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
         tools=robot.tool_poses(expected).transpose(1, 0, 2, 3),
         gaps=robot.finger_gaps(positions),
-        stamps_ns=stamps[0] + times * 1e9,
+        recorded_tools=robot.tool_poses(recorded).transpose(1, 0, 2, 3),
+        recorded_gaps=robot.finger_gaps(recorded),
+        stamps_ns=stamps_ns,
     )
     # the last second shows nothing new
     frames = np.flatnonzero(stamps - stamps[0] < (count - 10) * STEP_S * 1e9)
@@ -128,6 +138,8 @@ class _Recording:
         poses: (V, T + 1, 4, 4) T_base_camera.
         tools: see `ObjectTracks`.
         gaps: see `ObjectTracks`.
+        recorded_tools: see `ObjectTracks`.
+        recorded_gaps: see `ObjectTracks`.
         stamps_ns: (T + 1,).
     """
 
@@ -137,6 +149,8 @@ class _Recording:
     poses: FloatArray
     tools: FloatArray
     gaps: FloatArray
+    recorded_tools: FloatArray
+    recorded_gaps: FloatArray
     stamps_ns: FloatArray
 
     def tracks_from(self, frame: int) -> ObjectTracks:
@@ -150,6 +164,8 @@ class _Recording:
             features=object_shapes(seen, start, self.cameras, list(self.poses[:, row])),
             tools=self.tools[row:],
             gaps=self.gaps[row:],
+            recorded_tools=self.recorded_tools[row:],
+            recorded_gaps=self.recorded_gaps[row:],
             points=np.nan_to_num(points),
             rotations=rotations,
             known=known & np.isfinite(start).all(-1),

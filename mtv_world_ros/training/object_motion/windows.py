@@ -29,6 +29,8 @@ _SHAPE_NOISE = 0.02
 _PARTED_M = 0.01
 #: of batches, the share drawn as groups of siblings, and the most siblings of a group
 _SIBLINGS_SHARE, _GROUP = 0.15, 4
+#: rows of tracks that have no object
+_OF_TOOLS = ('tools', 'gaps', 'recorded_tools', 'recorded_gaps')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +44,8 @@ class Batch:
         known: (B, T + 1, O) bool.
         turns_known: (B,) bool, see `ObjectTracks`.
         parted: (B, T + 1, O) bool, where a sibling of the batch has the object elsewhere.
+        tools: (B, T + 1, A, 4, 4) T_base_tool as they really are.
+        gaps: (B, T + 1, A) likewise [m].
     """
 
     scene: Scene
@@ -50,6 +54,8 @@ class Batch:
     known: Tensor
     turns_known: Tensor
     parted: Tensor
+    tools: Tensor
+    gaps: Tensor
 
 
 class TrackPool:
@@ -67,7 +73,7 @@ class TrackPool:
             name: torch.from_numpy(
                 np.concatenate([_single(getattr(track, name)) for track in tracks])
             ).to(device)
-            for name in ('tools', 'gaps', 'points', 'rotations', 'known')
+            for name in (*_OF_TOOLS, 'points', 'rotations', 'known')
         }
         self._features = torch.from_numpy(
             np.stack([_single(track.features) for track in tracks])
@@ -145,7 +151,7 @@ class TrackPool:
 
         def of(name: str, at: Tensor) -> Tensor:
             values = self._rows[name][at]
-            if name in ('tools', 'gaps'):
+            if name in _OF_TOOLS:
                 return values
             extra = values.ndim - at.ndim - 1
             index = picked.view(len(tracks), *[1] * (at.ndim - 1), -1, *[1] * extra)
@@ -167,6 +173,8 @@ class TrackPool:
             known=of('known', rows),
             turns_known=self._turns_known[chosen],
             parted=_parted(self._rows['points'][rows], groups, picked),
+            tools=of('recorded_tools', rows),
+            gaps=of('recorded_gaps', rows),
         )
 
 
@@ -237,13 +245,20 @@ def _turned(batch: Batch, rng: np.random.Generator) -> Batch:
     if mirrored:
         widths = widths[..., [0, 3, 2, 1]]
     widths = torch.roll(widths, turns % 4, -1)
-    tools = scene.tools.clone()
-    tools[..., :3, :3] = both @ scene.tools[..., :3, :3] @ mirror
-    tools[..., :3, 3] = scene.tools[..., :3, 3] @ both.T
     features = torch.cat([widths, heights, scene.features[..., 6:] @ both.T], -1)
+
+    def turned(tools: Tensor) -> Tensor:
+        tools = tools.clone()
+        tools[..., :3, 3] = tools[..., :3, 3] @ both.T
+        tools[..., :3, :3] = both @ tools[..., :3, :3] @ mirror
+        return tools
+
     return replace(
         batch,
-        scene=replace(scene, points=scene.points @ both.T, features=features, tools=tools),
+        scene=replace(
+            scene, points=scene.points @ both.T, features=features, tools=turned(scene.tools)
+        ),
         points=batch.points @ both.T,
         rotations=both @ batch.rotations @ both.T,
+        tools=turned(batch.tools),
     )

@@ -12,7 +12,13 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork, Scene
+from mtv_world_ros.model.object_motion.network import (
+    _pose,
+    _rotation,
+    ObjectMotionNetwork,
+    off_way,
+    Scene,
+)
 from mtv_world_ros.model.object_motion.predictor import (
     add_members,
     load_network,
@@ -68,8 +74,9 @@ def scene(num_objects: int, present: int) -> Scene:
     )
 
 
-def test_two_calls_one_after_the_other_are_one_call(network):
-    given = scene(3, 3)
+@pytest.mark.parametrize('touching', [False, True])
+def test_two_calls_one_after_the_other_are_one_call(touching):
+    network, given = lively(0, touching=touching), scene(3, 3)
     with torch.inference_mode():
         whole = network(given)
         part = replace(given, tools=given.tools[:, :6], gaps=given.gaps[:, :6])
@@ -82,7 +89,7 @@ def test_two_calls_one_after_the_other_are_one_call(network):
 
 
 @pytest.mark.parametrize(
-    'more', [[{}, {}], [{'fingertips': True, 'yielding': True}] * 3, [{}, {'yielding': True}]]
+    'more', [[{}, {}], [{'fingertips': True, 'yielding': True, 'touching': True}] * 3, [{}, {'yielding': True}]]
 )
 def test_stacked_networks_compute_what_each_computes(more, double):
     networks = [lively(k, width=32 + 8 * k * (k > 1), **own) for k, own in enumerate(more)]
@@ -101,7 +108,7 @@ def test_stacked_networks_compute_what_each_computes(more, double):
     with torch.inference_mode():
         wanted = [network(part) for network, part in zip(networks, parts, strict=True)]
         found = stacked(networks)(whole)
-    for name in ('points', 'rotations', 'held', 'spread'):
+    for name in ('points', 'rotations', 'held', 'spread', 'off'):
         torch.testing.assert_close(
             getattr(found, name), torch.cat([getattr(motion, name) for motion in wanted])
         )
@@ -118,13 +125,13 @@ def test_a_wider_network_computes_the_same_at_first_and_hears_the_fingertips(
     wider = network.widened(width, hidden).widened(width + 8, hidden).eval()
     with torch.inference_mode():
         before, after = network(given), wider(given)
-    for name in ('points', 'rotations', 'held', 'spread'):
+    for name in ('points', 'rotations', 'held', 'spread', 'off'):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     leaning = given.tools.clone()
     leaning[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
     leaning[..., :3, 3] *= 0.1  # further away than 3 cm heights are cut off
     heard: list[torch.Tensor] = []
-    wider.tool_edge.register_forward_pre_hook(lambda _, args: heard.append(args[-1]))
+    wider.tool_edge.register_forward_pre_hook(lambda _, args: heard.append(args[-2]))
     wider(
         replace(
             given,
@@ -175,6 +182,34 @@ def test_an_object_yields_just_as_far_as_another_would_reach_into_it():
     torch.testing.assert_close(after, expected)
 
 
+def test_what_stops_a_tool_stops_what_it_carries():
+    network = ObjectMotionNetwork(width=16, hidden=8, touching=True).eval()
+    given, points = beside_fingers([(0.0, 0.0)], 0.02, torch.eye(3))
+    tools = given.tools.repeat(1, 2, 1, 1, 1)[:, :3].clone()
+    tools[0, 1:, 0, 2, 3] = torch.tensor([-0.05, -0.03])  # down by 5 cm, and up by 2 cm
+    given = replace(given, tools=tools, gaps=torch.full((1, 3, 1), 0.02))
+    with torch.inference_mode():
+        network.gate.bias[:] = 20.0  # it holds the object
+        free = network(given)
+        network.off.bias[2] = 0.04 * 20  # something stops it 4 cm above where it is to go
+        stopped = network(given)
+    torch.testing.assert_close(free.points[0, :, 0, 2], torch.tensor([0.02, -0.03, -0.01]))
+    torch.testing.assert_close(stopped.points[0, :, 0, 2], torch.tensor([0.02, 0.01, 0.03]))
+    torch.testing.assert_close(stopped.off[0, :, 0, 2], torch.tensor([0.0, 0.04, 0.04]))
+
+
+def test_how_far_a_tool_is_off_its_way_leads_back_to_it():
+    generator = torch.Generator().manual_seed(3)
+    free = torch.eye(4, dtype=torch.float64).repeat(5, 2, 1, 1)
+    free[..., :3, :3] = _rotation(torch.randn(5, 2, 3, generator=generator).double())
+    free[..., :3, 3] = torch.randn(5, 2, 3, generator=generator)
+    off = torch.randn(5, 2, 7, generator=generator).double()
+    off[0] = 0.0
+    gaps = torch.full((5, 2), 0.03, dtype=torch.float64)
+    found = off_way(free @ _pose(off), gaps + off[..., 6], free, gaps)
+    torch.testing.assert_close(found, off)
+
+
 def beside_fingers(places, gap: float, turn: torch.Tensor) -> tuple[Scene, torch.Tensor]:
     """Objects 4 cm wide at places in a tool's frame, whose shut fingers open; their points."""
     tools = torch.eye(4).repeat(1, 2, 1, 1, 1)
@@ -190,8 +225,9 @@ def beside_fingers(places, gap: float, turn: torch.Tensor) -> tuple[Scene, torch
     return scene, points
 
 
-def test_padding_changes_nothing_and_rotations_stay_rotations(network):
-    given = scene(2, 2)
+@pytest.mark.parametrize('touching', [False, True])
+def test_padding_changes_nothing_and_rotations_stay_rotations(touching):
+    network, given = lively(0, touching=touching), scene(2, 2)
     padded = replace(
         given,
         points=torch.cat([given.points, torch.zeros(1, 1, 3)], 1),

@@ -77,6 +77,10 @@ def test_tracks_are_the_recorded_poses_from_where_the_masks_have_the_objects(epi
     assert np.linalg.norm(track.points[0] - true[0], axis=-1).max() < 0.015
     np.testing.assert_allclose(track.points - track.points[0], true - true[0], atol=1e-6)
     assert track.tools.shape[:2] == (len(track.points), 2)
+    # before anything happens, tools are where they are commanded
+    np.testing.assert_allclose(track.recorded_tools[0], track.tools[0], atol=2e-3)
+    assert track.recorded_tools.shape == track.tools.shape
+    np.testing.assert_allclose(track.recorded_gaps, track.gaps, atol=0.02)
 
 
 def test_without_recorded_poses_the_masks_tell(robot):
@@ -87,8 +91,9 @@ def test_without_recorded_poses_the_masks_tell(robot):
     np.testing.assert_allclose(later.tools, track.tools[-len(later.tools) :])
     assert not track.turns_known and track.known.any(axis=0).all()
     assert np.isfinite(track.points).all()
-    # the demo stacks a block: something rises by more than its own height
+    # the demo stacks a block: something rises by more than its own height, between the fingers
     assert (track.points[..., 2].max(0) - track.points[0, :, 2]).max() > 0.03
+    assert (track.recorded_gaps - track.gaps).max() > 0.015
 
 
 def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) -> float:
@@ -102,6 +107,7 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
             known=batch.known,
             forced=torch.ones(batch.points.shape[:2], dtype=torch.bool)[:, :-1],
             lost_m=torch.tensor([torch.inf]),
+            off=motion_training._off_way(batch),
         )
         with torch.inference_mode():
             motion = network(batch.scene, truth)
@@ -174,7 +180,9 @@ def test_the_mean_of_networks_has_the_mean_of_their_weights():
 
 def test_without_a_step_the_mean_is_written_as_it_is(episodes, robot, tmp_path):
     tracks = [object_tracks(episodes[0], robot, VIEWS)[0]]
-    mean = ObjectMotionNetwork(width=24, hidden=8, fingertips=True, yielding=True)
+    mean = ObjectMotionNetwork(
+        width=24, hidden=8, fingertips=True, yielding=True, touching=True
+    )
     train_motion(tracks, tmp_path, MotionTraining(steps=0), init=mean)
     loaded = load_network(tmp_path / 'object_motion').state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in mean.state_dict().items())
@@ -273,17 +281,20 @@ def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
         known=known,
         forced=forced,
         lost_m=torch.tensor([0.02, torch.inf]),
+        off=torch.arange(8.0).view(2, 4, 1, 1).expand(2, 4, 1, 7),
     )
-    off = torch.zeros(2, 3, 3)
-    off[:, 1, 0] = 0.03
-    off[:, 2, 0] = 0.01
+    aside = torch.zeros(2, 3, 3)
+    aside[:, 1, 0] = 0.03
+    aside[:, 2, 0] = 0.01
     now = Memory(
-        points=points[:, 2] + off,
+        points=points[:, 2] + aside,
         rotations=torch.eye(3).expand(2, 3, 3, 3),
         velocity=torch.ones(2, 3, 6),
         hidden=torch.ones(2, 3, 5),
         held=torch.zeros(2, 3, 1),
         spread=torch.zeros(2, 3),
+        off=torch.full((2, 1, 7), -1.0),
+        off_before=torch.full((2, 1, 7), -2.0),
     )
     right = truth.put_right(now, 2)
     lost = torch.tensor([[False, True, False], [False, False, False]])
@@ -294,11 +305,14 @@ def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
     way = torch.cat([points[0, 2, 1] - points[0, 1, 1], turn])
     torch.testing.assert_close(right.velocity[lost][0], way, rtol=0.02, atol=1e-6)
     assert torch.equal(right.hidden, now.hidden)
+    # where something is lost, tools are put right as well
+    assert right.off[:, 0, 0].tolist() == [2, -1] and right.off_before[:, 0, 0].tolist() == [1, -2]
     # one that starts from the truth keeps its own speed
     forced[:, 2] = True
     right = truth.put_right(now, 2)
     assert torch.equal(right.points, points[:, 2])
     assert torch.equal(right.velocity[~lost], now.velocity[~lost])
+    assert right.off[:, 0, 0].tolist() == [2, 6] and right.off_before[:, 0, 0].tolist() == [1, 5]
     # nobody knows where something hidden is
     known[:, 2] = False
     right = truth.put_right(now, 2)
@@ -398,7 +412,13 @@ def test_an_imagined_grasp_that_fails_costs_what_a_missed_one_costs(episodes, ro
     def cost(imagined, real):
         spread = torch.full(real.shape[:3], 0.01)
         held = torch.zeros(*real.shape[:3], 2)
-        motion = Motion(points=imagined, rotations=turns, held=held, spread=spread)
+        motion = Motion(
+            points=imagined,
+            rotations=turns,
+            held=held,
+            spread=spread,
+            off=motion_training._off_way(stays),
+        )
         return motion_training._loss(motion, replace(stays, points=real, rotations=turns)).item()
 
     assert cost(carried, still) == pytest.approx(cost(still, carried), rel=1e-5)
@@ -418,6 +438,7 @@ def test_a_swing_that_is_missed_costs_what_a_wrong_place_costs(episodes, robot):
             rotations=real.rotations @ turn,
             held=held,
             spread=torch.full(real.points.shape[:3], 0.01),
+            off=motion_training._off_way(real),
         )
         return motion_training._loss(motion, real).item()
 
@@ -433,8 +454,43 @@ def test_what_follows_a_tool_is_carried_and_what_stays_is_not(episodes, robot):
     points = torch.zeros(1, 9, 3, 3)
     points[0, :, 0, 2] = 0.01 * torch.arange(9)
     points[0, :, 2, 0] = 0.5
-    scene = replace(real.scene, tools=tools)
-    carried, asked = motion_training._carried(replace(real, scene=scene, points=points))
+    carried, asked = motion_training._carried(replace(real, tools=tools, points=points))
     assert carried[0, :, 0, 0].all() and not carried[0, :, 1:].any()
     assert asked[0, :, :2, 0].all()  # the third object is far away
     assert not asked[0, :, 2].any() and not asked[..., 1].any()
+
+
+def test_turned_and_mirrored_tools_are_off_their_way_as_they_were(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    batch = TrackPool([track]).whole(0)
+    wanted, rng = motion_training._off_way(batch), np.random.default_rng(0)
+    found = [motion_training._off_way(windows._turned(batch, rng)) for _ in range(12)]
+    # mirrored, what is across the fingers' travel is to the other side, and turns about the
+    # other two axes are the other way round
+    mirror = torch.tensor([-1.0, 1, 1, 1, -1, -1, 1])
+    same = [(off - wanted).abs().max() < 1e-5 for off in found]
+    mirrored = [(off - wanted * mirror).abs().max() < 1e-5 for off in found]
+    assert any(same) and any(mirrored)
+    assert all(a or b for a, b in zip(same, mirrored, strict=True))
+
+
+def test_a_tool_that_is_not_expected_to_be_stopped_costs(episodes, robot):
+    (track,) = object_tracks(episodes[0], robot, VIEWS)
+    real = TrackPool([track]).whole(0)
+
+    def cost(**wrong: float) -> float:
+        off = motion_training._off_way(real).clone()
+        for column, by in wrong.items():
+            off[..., int(column[1:])] += by
+        motion = Motion(
+            points=real.points,
+            rotations=real.rotations,
+            held=torch.zeros(*real.points.shape[:3], 2),
+            spread=torch.full(real.points.shape[:3], 0.01),
+            off=off,
+        )
+        return motion_training._loss(motion, real).item()
+
+    assert cost(_2=0.01) == pytest.approx(cost() + 0.5, rel=1e-4)  # half a square, of 1 cm
+    assert cost(_6=0.01) == pytest.approx(cost() + 0.5, rel=1e-4)
+    assert cost(_4=0.1) == pytest.approx(cost() + 0.1, rel=1e-4)
