@@ -579,9 +579,7 @@ def _erring(moved: Tensor, turned: Tensor, more: Tensor, errors: Tensor) -> tupl
     return moved + plane, _rotation(yaw) @ turned
 
 
-def off_way(
-    tools: Tensor, gaps: Tensor, free_tools: Tensor, free_gaps: Tensor
-) -> Tensor:
+def off_way(tools: Tensor, gaps: Tensor, free_tools: Tensor, free_gaps: Tensor) -> Tensor:
     """Returns (..., A, 7) how far tools are off where they would be if they touched nothing.
 
     In the frame of the latter: offset [m], rotation vector [rad], and how much further each finger

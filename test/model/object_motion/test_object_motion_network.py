@@ -88,9 +88,10 @@ def test_two_calls_one_after_the_other_are_one_call(touching):
     torch.testing.assert_close(second.rotations, whole.rotations[:, 5:])
 
 
-@pytest.mark.parametrize(
-    'more', [[{}, {}], [{'fingertips': True, 'yielding': True, 'touching': True}] * 3, [{}, {'yielding': True}]]
-)
+ALL = {'fingertips': True, 'yielding': True, 'touching': True}
+
+
+@pytest.mark.parametrize('more', [[{}, {}], [ALL] * 3, [{}, {'yielding': True}]])
 def test_stacked_networks_compute_what_each_computes(more, double):
     networks = [lively(k, width=32 + 8 * k * (k > 1), **own) for k, own in enumerate(more)]
     given = scene(3, 3)

@@ -180,9 +180,7 @@ def test_the_mean_of_networks_has_the_mean_of_their_weights():
 
 def test_without_a_step_the_mean_is_written_as_it_is(episodes, robot, tmp_path):
     tracks = [object_tracks(episodes[0], robot, VIEWS)[0]]
-    mean = ObjectMotionNetwork(
-        width=24, hidden=8, fingertips=True, yielding=True, touching=True
-    )
+    mean = ObjectMotionNetwork(width=24, hidden=8, fingertips=True, yielding=True, touching=True)
     train_motion(tracks, tmp_path, MotionTraining(steps=0), init=mean)
     loaded = load_network(tmp_path / 'object_motion').state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in mean.state_dict().items())
