@@ -40,7 +40,7 @@ _EXPECTED, _LARGEST_ERROR_M = 0.8, 0.05
 #: ways of an object out of a finger; the longest [m]; thickness and half the breadth of a finger
 #: before they are learned [m]
 _NUM_WAYS_OUT, _FARTHEST_OUT_M, _FINGER_M = 3, 0.05, 0.01
-#: how much faster than the rest of the network it learns how much of a way is gone
+#: how much faster than the rest of the network it learns how much of a way is gone, or is not
 _YIELDS_GAIN = 8.0
 #: numbers that describe an object's shape, as learned
 _SHAPE = 32
@@ -286,7 +286,7 @@ class ObjectMotionNetwork(nn.Module):
         if touching:
             # messages, what is held | tool: gaps, height, way | off
             self.tool_node = Perceptron(2 * width + 7 + _NUM_OFF, width, width)
-            self.off = nn.Linear(width, _NUM_OFF)
+            self.off = nn.Linear(width, 3 * _NUM_OFF)
             still.append(self.off)
         for layer in still:
             nn.init.zeros_(layer.weight)
@@ -475,7 +475,9 @@ class ObjectMotionNetwork(nn.Module):
             is_there = present[..., None, None]
             held_node = held[..., None] * node[:, :, None]
             heard = [(value * is_there).sum(1) for value in (edge, held_node)]
-            off = _unscaled(self.off(self.tool_node(*heard, tool, _scaled(now.off))))
+            apart = now.off[..., 6] + gaps[:, 1]
+            stopped = off_way(here, apart, aimed, gaps[:, 2])
+            off = self._next_off(self.tool_node(*heard, tool, _scaled(now.off)), stopped, now.off)
             after = aimed @ _pose(off)
             seen = _seen_from(after, _local(after, now.points), extents)
         pushed = self._pushed(edge, here, after, gaps[:, 2], seen)
@@ -526,6 +528,12 @@ class ObjectMotionNetwork(nn.Module):
             torch.cat(pairs, -1), tool[:, None], clearances, own[:, :, None], *heights, *off
         )
         return edge, tool, [value[..., count:] for value in seen]
+
+    def _next_off(self, node: Tensor, stopped: Tensor, now: Tensor) -> Tensor:
+        """(B, A, 7) of tools: shares of that if they stop, and of that now, and what is added."""
+        more, stops, stays = self.off(node).chunk(3, dim=-1)
+        stops, stays = ((_YIELDS_GAIN * share).tanh() for share in (stops, stays))
+        return _unscaled(more) + stops * stopped + stays * now
 
     def _pushed(
         self, edge: Tensor, here: Tensor, after: Tensor, gaps: Tensor, seen: Sequence[Tensor]

@@ -58,6 +58,8 @@ _LEVER_M = 0.05
 #: gradients keep this share of their size from one step to the step before: through tens of steps
 #: of contact they grow at random, and drown what can be learned
 _KEPT = 0.9
+#: weight of how far tools are off their way, as that of objects
+_STOPPED = 3.0
 #: an object has moved if it went further than this [m]
 _MOVED_M = 0.01
 
@@ -498,7 +500,7 @@ def _loss(motion: Motion, batch: Batch) -> Tensor:
     off, really_off = (torch.split(x, [3, 3, 1], -1) for x in (motion.off, _off_way(batch)))
     for mine, real, weight in zip(off, really_off, (1e4, _TURN, 1e4), strict=True):
         tool = F.huber_loss(mine, real, reduction='none', delta=0.01 if weight > _TURN else 0.3)
-        loss = loss + weight * tool.sum(-1).mean()
+        loss = loss + _STOPPED * weight * tool.sum(-1).mean()
     # else it would move what is held by pushing it, which does not turn it
     carried, asked = _carried(batch)
     asked &= ((error < _RIGHT_M) & batch.known & batch.scene.present[:, None])[:, 1:, :, None]

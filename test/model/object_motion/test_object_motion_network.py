@@ -193,10 +193,15 @@ def test_what_stops_a_tool_stops_what_it_carries():
         network.gate.bias[:] = 20.0  # it holds the object
         free = network(given)
         network.off.bias[2] = 0.04 * 20  # something stops it 4 cm above where it is to go
+        above = network(given)
+        network.off.bias[:] = 0.0
+        network.off.bias[7:14] = 20.0  # something stops it where it is
         stopped = network(given)
     torch.testing.assert_close(free.points[0, :, 0, 2], torch.tensor([0.02, -0.03, -0.01]))
-    torch.testing.assert_close(stopped.points[0, :, 0, 2], torch.tensor([0.02, 0.01, 0.03]))
-    torch.testing.assert_close(stopped.off[0, :, 0, 2], torch.tensor([0.0, 0.04, 0.04]))
+    torch.testing.assert_close(above.points[0, :, 0, 2], torch.tensor([0.02, 0.01, 0.03]))
+    torch.testing.assert_close(above.off[0, :, 0, 2], torch.tensor([0.0, 0.04, 0.04]))
+    torch.testing.assert_close(stopped.points[0, :, 0, 2], torch.tensor([0.02, 0.02, 0.02]))
+    torch.testing.assert_close(stopped.off[0, :, 0, 2], torch.tensor([0.0, 0.05, 0.03]))
 
 
 def test_how_far_a_tool_is_off_its_way_leads_back_to_it():

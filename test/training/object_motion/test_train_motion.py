@@ -489,6 +489,6 @@ def test_a_tool_that_is_not_expected_to_be_stopped_costs(episodes, robot):
         )
         return motion_training._loss(motion, real).item()
 
-    assert cost(_2=0.01) == pytest.approx(cost() + 0.5, rel=1e-4)  # half a square, of 1 cm
-    assert cost(_6=0.01) == pytest.approx(cost() + 0.5, rel=1e-4)
-    assert cost(_4=0.1) == pytest.approx(cost() + 0.1, rel=1e-4)
+    assert cost(_2=0.01) == pytest.approx(cost() + 1.5, rel=1e-4)  # half a square, of 1 cm
+    assert cost(_6=0.01) == pytest.approx(cost() + 1.5, rel=1e-4)
+    assert cost(_4=0.1) == pytest.approx(cost() + 0.3, rel=1e-4)
