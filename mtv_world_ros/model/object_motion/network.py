@@ -125,7 +125,7 @@ class Truth:
         known: (B, T + 1, O) bool; what is hidden is left where the motion has it.
         forced: (B, T) bool, steps that start from the truth.
         lost_m: (B,) an object further than this from the truth is lost: it goes on from the truth,
-            as fast as it really is [m].
+            as fast as it really is [m]; so do tools, and all tools where an object is lost.
         off: (B, T + 1, A, 7) of the tools, see `off_way`.
     """
 
@@ -140,12 +140,14 @@ class Truth:
         """Returns the objects as a step starts, put where they really are if they must be."""
         points, rotations, before = self.points[:, step], self.rotations[:, step], max(step - 1, 0)
         seen = (self.known[:, step] & self.known[:, before])[..., None]  # (B, O, 1)
-        off = (now.points - points).norm(dim=-1, keepdim=True)
-        lost = seen & (off > self.lost_m[:, None, None])
+        away = (now.points - points).norm(dim=-1, keepdim=True)
+        lost = seen & (away > self.lost_m[:, None, None])
         known = lost | (seen & self.forced[:, step][:, None, None])
         way = points - self.points[:, before]
         turn = _vector(rotations @ self.rotations[:, before].mT)
-        told = (self.forced[:, step] | lost.any(1)[:, 0])[:, None, None]  # where tools are
+        off = (now.off - self.off[:, step])[..., :3].norm(dim=-1, keepdim=True)  # (B, A, 1)
+        told = (self.forced[:, step] | lost.any(1)[:, 0])[:, None, None]
+        told = told | (off > self.lost_m[:, None, None])
         return replace(
             now,
             points=torch.where(known, points, now.points),
@@ -530,10 +532,11 @@ class ObjectMotionNetwork(nn.Module):
         return edge, tool, [value[..., count:] for value in seen]
 
     def _next_off(self, node: Tensor, stopped: Tensor, now: Tensor) -> Tensor:
-        """(B, A, 7) of tools: shares of that if they stop, and of that now, and what is added."""
-        more, stops, stays = self.off(node).chunk(3, dim=-1)
-        stops, stays = ((_YIELDS_GAIN * share).tanh() for share in (stops, stays))
-        return _unscaled(more) + stops * stopped + stays * now
+        """(B, A, 7) of tools: a share of that if they stop, or of that now, and what is added."""
+        more, share, stops = self.off(node).chunk(3, dim=-1)
+        # never more than either, else it would grow from step to step
+        kept = now.lerp(stopped, (_YIELDS_GAIN * stops).sigmoid())
+        return _unscaled(more) + (_YIELDS_GAIN * share).tanh() * kept
 
     def _pushed(
         self, edge: Tensor, here: Tensor, after: Tensor, gaps: Tensor, seen: Sequence[Tensor]

@@ -195,7 +195,7 @@ def test_what_stops_a_tool_stops_what_it_carries():
         network.off.bias[2] = 0.04 * 20  # something stops it 4 cm above where it is to go
         above = network(given)
         network.off.bias[:] = 0.0
-        network.off.bias[7:14] = 20.0  # something stops it where it is
+        network.off.bias[7:] = 20.0  # something stops it where it is
         stopped = network(given)
     torch.testing.assert_close(free.points[0, :, 0, 2], torch.tensor([0.02, -0.03, -0.01]))
     torch.testing.assert_close(above.points[0, :, 0, 2], torch.tensor([0.02, 0.01, 0.03]))

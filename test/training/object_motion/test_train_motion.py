@@ -305,6 +305,11 @@ def test_a_lost_object_goes_on_from_the_truth_as_fast_as_it_really_is():
     assert torch.equal(right.hidden, now.hidden)
     # where something is lost, tools are put right as well
     assert right.off[:, 0, 0].tolist() == [2, -1] and right.off_before[:, 0, 0].tolist() == [1, -2]
+    # so are tools that are lost themselves
+    alone = replace(truth, points=now.points[:, None].expand_as(points))
+    assert alone.put_right(now, 2).off[:, 0, 0].tolist() == [2, -1]
+    near = replace(now, off=truth.off[:, 2] + 0.01)
+    assert torch.equal(alone.put_right(near, 2).off, near.off)
     # one that starts from the truth keeps its own speed
     forced[:, 2] = True
     right = truth.put_right(now, 2)
