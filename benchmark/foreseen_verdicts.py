@@ -8,7 +8,8 @@ checkpoint or of several folders joined by `+`, 13 motions in all. `share` is ho
 succeed; a share of half or more is a success. Beside it stands the rule that imagines nothing: an
 object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
 Wilson of shares, jackknife of AUROC, bootstrap of differences, over episodes. What is chosen by
-this must not be measured by it: kinds of the split `test` are refused.
+this must not be measured by it: kinds of the split `test` are refused. With `--recorded-arms` the
+networks and the rule are told where the arms really went, which nobody knows ahead: what that costs.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -61,14 +62,23 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('dataset', type=Path)
     parser.add_argument('networks', nargs='+', help='checkpoints; DIR+DIR = their networks')
     parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument('--recorded-arms', action='store_true', help='not as commanded')
 
 
-def load(names: str) -> ObjectMotionPredictor:
-    """Returns the networks of one or several checkpoints, or of what `train-motion` wrote."""
+def load(names: str, recorded_arms: bool = False) -> ObjectMotionPredictor:
+    """Returns the networks of one or several checkpoints, or of what `train-motion` wrote.
+
+    Args:
+        names: folders joined by `+`.
+        recorded_arms: arms are where they are said to be, they need not follow.
+    """
     folders = [checkpoint_path(name) for name in names.split('+')]
     robot = checkpoint_robot('bundled')
     found = [load_predictor(folder / OBJECT_MOTION_FOLDER, robot) for folder in folders]
-    return ObjectMotionPredictor([member for one in found for member in one.members], robot)
+    members = [member for one in found for member in one.members]
+    if recorded_arms:
+        members = [replace(member, response=None) for member in members]
+    return ObjectMotionPredictor(members, robot)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +92,7 @@ class Plan:
         names: of O objects.
         reference: (O, 3) where the first frame's masks have them [m], NaN = not in two views.
         features: (O, V, F) of `object_shapes`.
-        positions: (N, J) commanded, `PERIOD_S` apart [rad or m].
+        positions: (N, J) commanded, `PERIOD_S` apart [rad or m]; or the arms' as recorded.
     """
 
     success: bool
@@ -94,7 +104,7 @@ class Plan:
     positions: FloatArray
 
 
-def read_plan(path: Path, robot: RobotModel) -> Plan | None:
+def read_plan(path: Path, robot: RobotModel, recorded_arms: bool = False) -> Plan | None:
     """Reads an episode; None = its task is not known, or an object of it not seen."""
     episode = read_episode(path, views=VIEWS)
     found = match_task(load_tasks(share_path('config', 'tasks')), episode.info.instruction)
@@ -109,6 +119,16 @@ def read_plan(path: Path, robot: RobotModel) -> Plan | None:
     columns = [states.joint_names.index(name) for name in robot.joint_names]
     stamp = int(episode.masks[VIEWS[0]].stamps_ns[0])
     rows = round(STEP_S / PERIOD_S) * (len(track.points) - 1) + 1
+    times = np.arange(rows, dtype=np.float64) * PERIOD_S
+    positions = resample(
+        stitched_commands(episode, robot, stamp), states.positions[0][columns], times
+    )
+    grippers = {tool.gripper_joint for tool in robot.tools}
+    for column, name in enumerate(robot.joint_names):
+        if recorded_arms and name not in grippers:
+            positions[:, column] = np.interp(
+                stamp + times * 1e9, states.stamps_ns, states.positions[:, columns[column]]
+            )
     return Plan(
         success=episode.info.outcome == 'success',
         task=found[0],
@@ -116,11 +136,7 @@ def read_plan(path: Path, robot: RobotModel) -> Plan | None:
         names=names,
         reference=reference,
         features=track.features,
-        positions=resample(
-            stitched_commands(episode, robot, stamp),
-            states.positions[0][columns],
-            np.arange(rows, dtype=np.float64) * PERIOD_S,
-        ),
+        positions=positions,
     )
 
 
@@ -149,18 +165,21 @@ def ruled(plan: Plan, predictor: ObjectMotionPredictor) -> float:
     return float(is_done(plan.task, plan.bound, things, predictor.robot, plan.positions))
 
 
-def judged(path: Path, networks: Sequence[str]) -> tuple[bool, list[float]] | None:
+def judged(
+    path: Path, networks: Sequence[str], recorded_arms: bool
+) -> tuple[bool, list[float]] | None:
     """Returns an outcome, and what the rule and the networks say; None = one cannot tell.
 
     Args:
         path: of an episode.
         networks: see `load`.
+        recorded_arms: see `load`.
     """
     torch.set_num_threads(1)
     if not _LOADED:
-        _LOADED.update({names: load(names) for names in networks})
+        _LOADED.update({names: load(names, recorded_arms) for names in networks})
     first, *_ = _LOADED.values()
-    plan = read_plan(path, first.robot)
+    plan = read_plan(path, first.robot, recorded_arms)
     if plan is None:
         return None
     said = [share_foreseen(plan, predictor) for predictor in _LOADED.values()]
@@ -217,10 +236,10 @@ def difference(name: str, first: FloatArray, said: FloatArray, real: BoolArray, 
 
 
 def outcomes(
-    paths: Sequence[Path], networks: Sequence[str], workers: int
+    paths: Sequence[Path], networks: Sequence[str], workers: int, recorded_arms: bool
 ) -> list[tuple[bool, list[float]]]:
     """Returns what `judged` says of all episodes that it can judge."""
-    judge = partial(judged, networks=networks)
+    judge = partial(judged, networks=networks, recorded_arms=recorded_arms)
     with ProcessPoolExecutor(workers, get_context('spawn')) as pool:
         return [found for found in pool.map(judge, paths, chunksize=4) if found is not None]
 
@@ -232,7 +251,7 @@ def main() -> None:
     refuse_test_kinds(paths, 'the choice of networks')
     count = min(options.repeats, len(paths))
     paths = [paths[k] for k in np.linspace(0, len(paths), count, False).astype(int)]
-    found = outcomes(paths, options.networks, options.workers)
+    found = outcomes(paths, options.networks, options.workers, options.recorded_arms)
     if len({real for real, _ in found}) < 2:
         raise MtvWorldError(f"'{options.dataset}' needs episodes that succeed and that fail")
     real = np.array([outcome for outcome, _ in found])
