@@ -46,6 +46,8 @@ _YIELDS_GAIN = 8.0
 _SHAPE = 32
 #: numbers that say how far a tool is off its way
 _NUM_OFF = 7
+#: the most of each, in 5 cm and rad
+_MOST_OFF = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -534,9 +536,10 @@ class ObjectMotionNetwork(nn.Module):
     def _next_off(self, node: Tensor, stopped: Tensor, now: Tensor) -> Tensor:
         """(B, A, 7) of tools: a share of that if they stop, or of that now, and what is added."""
         more, share, stops = self.off(node).chunk(3, dim=-1)
-        # never more than either, else it would grow from step to step
+        # never more than either, else it would grow from step to step; and arms give way at last
         kept = now.lerp(stopped, (_YIELDS_GAIN * stops).sigmoid())
-        return _unscaled(more) + (_YIELDS_GAIN * share).tanh() * kept
+        off = more + (_YIELDS_GAIN * share).tanh() * _scaled(kept)
+        return _unscaled(off.clamp(-_MOST_OFF, _MOST_OFF))
 
     def _pushed(
         self, edge: Tensor, here: Tensor, after: Tensor, gaps: Tensor, seen: Sequence[Tensor]

@@ -202,6 +202,11 @@ def test_what_stops_a_tool_stops_what_it_carries():
     torch.testing.assert_close(above.off[0, :, 0, 2], torch.tensor([0.0, 0.04, 0.04]))
     torch.testing.assert_close(stopped.points[0, :, 0, 2], torch.tensor([0.02, 0.02, 0.02]))
     torch.testing.assert_close(stopped.off[0, :, 0, 2], torch.tensor([0.0, 0.05, 0.03]))
+    tools[0, 2, 0, 2, 3] = -0.4
+    with torch.inference_mode():
+        pressed = network(replace(given, tools=tools))
+    # but an arm that is pressed on does not stay behind by more than 15 cm
+    torch.testing.assert_close(pressed.off[0, :, 0, 2], torch.tensor([0.0, 0.05, 0.15]))
 
 
 def test_how_far_a_tool_is_off_its_way_leads_back_to_it():
