@@ -298,8 +298,10 @@ class ObjectMotionNetwork(nn.Module):
         nn.init.constant_(self.stay.bias, 2.0)
         nn.init.constant_(self.scale.bias, -6.0)
 
-    def widened(self, width: int, hidden: int) -> ObjectMotionNetwork:
-        """Returns a wider one, with all that networks have by now: it computes the same at first.
+    def widened(
+        self, width: int, hidden: int, *, yielding: bool = True, touching: bool = True
+    ) -> ObjectMotionNetwork:
+        """Returns a wider one that computes the same at first, with fingertips and what is asked.
 
         What is new hears everything and is not listened to at first (Net2Net: Chen et al. 2016).
 
@@ -316,12 +318,12 @@ class ObjectMotionNetwork(nn.Module):
             width,
             hidden,
             fingertips=True,
-            yielding=True,
-            touching=True,
+            yielding=yielding or self.yielding,
+            touching=touching or self.touching,
         )
         w, h = (self.width, width), (self.hidden, hidden)
         tips = (_NUM_FINGERTIP_HEIGHTS * self.fingertips, _NUM_FINGERTIP_HEIGHTS)
-        off = (_NUM_OFF * self.touching, _NUM_OFF)
+        off = (_NUM_OFF * self.touching, _NUM_OFF * wider.touching)
         old, new = self.state_dict(), wider.state_dict()
         known = old['tool_edge.0.weight'].shape[1] - h[0] - tips[0] - off[0]
         blocks = {  # of the columns, (old, new), in the order in which `step` gives them

@@ -28,7 +28,11 @@ def stacked(networks: Sequence[ObjectMotionNetwork]) -> ObjectMotionNetwork:
     if any(network.config != networks[0].config for network in networks):
         width = max(network.width for network in networks)
         hidden = max(network.hidden for network in networks)
-        networks = [network.widened(width, hidden) for network in networks]
+        more = {
+            'yielding': any(network.yielding for network in networks),
+            'touching': any(network.touching for network in networks),
+        }
+        networks = [network.widened(width, hidden, **more) for network in networks]
     one = copy.deepcopy(networks[0])
     for name, module in networks[0].named_modules():
         parts = [network.get_submodule(name) for network in networks]

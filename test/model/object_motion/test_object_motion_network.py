@@ -91,7 +91,9 @@ def test_two_calls_one_after_the_other_are_one_call(touching):
 ALL = {'fingertips': True, 'yielding': True, 'touching': True}
 
 
-@pytest.mark.parametrize('more', [[{}, {}], [ALL] * 3, [{}, {'yielding': True}]])
+@pytest.mark.parametrize(
+    'more', [[{}, {}], [ALL] * 3, [{}, {'yielding': True}], [{'yielding': True}, ALL]]
+)
 def test_stacked_networks_compute_what_each_computes(more, double):
     networks = [lively(k, width=32 + 8 * k * (k > 1), **own) for k, own in enumerate(more)]
     given = scene(3, 3)
@@ -113,6 +115,9 @@ def test_stacked_networks_compute_what_each_computes(more, double):
         torch.testing.assert_close(
             getattr(found, name), torch.cat([getattr(motion, name) for motion in wanted])
         )
+    for ability in ('yielding', 'touching'):  # no time is spent on what none of them has
+        wants = any(getattr(network, ability) for network in networks)
+        assert getattr(stacked(networks), ability) == wants
     assert (wanted[0].points[0, -1] - wanted[1].points[0, -1]).abs().max() > 1e-3
     none = replace(whole, **{name: getattr(whole, name)[:, :0] for name in names[:3]})
     assert stacked(networks)(none).points.shape == (2 * len(networks), STEPS + 1, 0, 3)
