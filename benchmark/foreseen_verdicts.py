@@ -49,7 +49,7 @@ from mtv_world_ros.ranking.optimism import area_interval
 from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
-from mtv_world_ros.training.object_motion.tracks import tracks_of
+from mtv_world_ros.training.object_motion.tracks import recorded_positions, tracks_of
 
 VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'
@@ -123,12 +123,10 @@ def read_plan(path: Path, robot: RobotModel, recorded_arms: bool = False) -> Pla
     positions = resample(
         stitched_commands(episode, robot, stamp), states.positions[0][columns], times
     )
-    grippers = {tool.gripper_joint for tool in robot.tools}
-    for column, name in enumerate(robot.joint_names):
-        if recorded_arms and name not in grippers:
-            positions[:, column] = np.interp(
-                stamp + times * 1e9, states.stamps_ns, states.positions[:, columns[column]]
-            )
+    if recorded_arms:
+        grippers = {tool.gripper_joint for tool in robot.tools}
+        arms = [name not in grippers for name in robot.joint_names]
+        positions[:, arms] = recorded_positions(states, robot, stamp + times * 1e9)[:, arms]
     return Plan(
         success=episode.info.outcome == 'success',
         task=found[0],

@@ -498,8 +498,9 @@ def _loss(motion: Motion, batch: Batch) -> Tensor:
     loss = ((place + turn + 0.02 * doubt) * weights).sum() / weights.sum()
     # what stops a tool, and what it holds, show in how far it is off its way
     off, really_off = (torch.split(x, [3, 3, 1], -1) for x in (motion.off, _off_way(batch)))
-    for mine, real, weight in zip(off, really_off, (1e4, _TURN, 1e4), strict=True):
-        tool = F.huber_loss(mine, real, reduction='none', delta=0.01 if weight > _TURN else 0.3)
+    kinds = ((1e4, 0.01), (_TURN, 0.3), (1e4, 0.01))  # offset, turn, fingers: weight, most squared
+    for mine, real, (weight, most) in zip(off, really_off, kinds, strict=True):
+        tool = F.huber_loss(mine, real, reduction='none', delta=most)
         loss = loss + _STOPPED * weight * tool.sum(-1).mean()
     # else it would move what is held by pushing it, which does not turn it
     carried, asked = _carried(batch)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.episode import Episode, Track
+from mtv_world_ros.data.episode import Episode, JointStates, Track
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
@@ -103,9 +103,7 @@ def tracks_of(
     expected = positions if response is None else response.follow(robot, positions)[0]
     times, positions, expected = (rows[::every] for rows in (times, positions, expected))
     stamps_ns = stamps[0] + times * 1e9
-    recorded = np.stack(
-        [np.interp(stamps_ns, states.stamps_ns, states.positions[:, c]) for c in columns], -1
-    )
+    recorded = recorded_positions(states, robot, stamps_ns)
     cameras = [episode.cameras[view] for view in views]
     recording = _Recording(
         episode=episode,
@@ -125,6 +123,15 @@ def tracks_of(
     if not tracks[0].known[0].any():
         raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
     return [track for track in tracks if track.known[0].any()]
+
+
+def recorded_positions(
+    states: JointStates, robot: RobotModel, stamps_ns: FloatArray
+) -> FloatArray:
+    """Returns (T, J) where joints were at stamps (T,), in the robot's order [rad or m]."""
+    columns = [states.joint_names.index(name) for name in robot.joint_names]
+    found = [np.interp(stamps_ns, states.stamps_ns, states.positions[:, c]) for c in columns]
+    return np.stack(found, axis=-1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
