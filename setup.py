@@ -45,6 +45,7 @@ setup(
         'Jinja2>=3.1',
         'PyYAML>=6',
         'av>=18',
+        'dartpy>=6.20,<7',
         'diffusers>=0.42,<0.43',
         'lz4>=4.3',
         'mcap>=1.6',
@@ -55,6 +56,7 @@ setup(
         'pydantic>=2.10',
         'rosbags>=0.11',
         'safetensors>=0.8',
+        'scipy>=1.11',
         'simplejpeg>=1.8',
         'tokenizers>=0.22',
         'torch>=2.6',
@@ -68,7 +70,7 @@ setup(
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
         'vision': ['transformers>=5.23,<6'],
         # Intervals, fits and charts of evaluate, calibrate, rank and report; PSNR and SSIM.
-        'evaluate': ['matplotlib>=3.6', 'scipy>=1.11', 'torchmetrics>=1.8'],
+        'evaluate': ['matplotlib>=3.6', 'torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # `mtv-world view`: the Rerun viewer, native and for browsers.

@@ -4,8 +4,8 @@
     python benchmark/foreseen_verdicts.py data/left bundled runs/a+runs/b --repeats 360 --workers 2
 
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
-checkpoint or of several folders joined by `+`, 13 motions in all. `share` is how many of them
-succeed; a share of half or more is a success. Beside it stands the rule that imagines nothing: an
+checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
+first has `contact.json`. `share` is how many motions succeed; half or more is a success. Beside it stands the rule that imagines nothing: an
 object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
 Wilson of shares, jackknife of AUROC, bootstrap of differences, over episodes. What is chosen by
 this must not be measured by it: kinds of the split `test` are refused. With `--recorded-arms` the
@@ -28,28 +28,28 @@ import torch
 
 from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fingerprint
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
-from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
-from mtv_world_ros.model.object_motion.network import STEP_S
 from mtv_world_ros.model.object_motion.predictor import (
     load_predictor,
     ObjectMotionPredictor,
-    TrackedObjects,
 )
 from mtv_world_ros.ranking.no_picture_rule import is_done, Thing
 from mtv_world_ros.ranking.optimism import area_interval
 from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
-from mtv_world_ros.training.object_motion.tracks import recorded_positions, tracks_of
+from mtv_world_ros.training.object_motion.tracks import (
+    fine_commands,
+    first_frame,
+    FirstFrame,
+    recorded_positions,
+)
 
 VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'
@@ -78,7 +78,7 @@ def load(names: str, recorded_arms: bool = False) -> ObjectMotionPredictor:
     members = [member for one in found for member in one.members]
     if recorded_arms:
         members = [replace(member, response=None) for member in members]
-    return ObjectMotionPredictor(members, robot)
+    return ObjectMotionPredictor(members, robot, found[0].contact)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,8 +90,7 @@ class Plan:
         task: what is asked.
         bound: placeholder -> name of its object.
         names: of O objects.
-        reference: (O, 3) where the first frame's masks have them [m], NaN = not in two views.
-        features: (O, V, F) of `object_shapes`.
+        frame: the first.
         positions: (N, J) commanded, `PERIOD_S` apart [rad or m]; or the arms' as recorded.
     """
 
@@ -99,8 +98,7 @@ class Plan:
     task: TaskSpec
     bound: dict[str, str]
     names: tuple[str, ...]
-    reference: FloatArray
-    features: FloatArray
+    frame: FirstFrame
     positions: FloatArray
 
 
@@ -111,36 +109,30 @@ def read_plan(path: Path, robot: RobotModel, recorded_arms: bool = False) -> Pla
     states = episode.joint_states
     if found is None or states is None or episode.masks is None:
         return None
-    track = tracks_of(episode, robot, VIEWS)[0]
-    reference = np.where(track.known[0][:, None], track.points[0], np.nan)
     names = tuple(episode.info.objects)
-    if not np.isfinite(reference[[names.index(name) for name in found[1].values()]]).all():
+    frame = first_frame(episode, robot, VIEWS)
+    bound = [names.index(name) for name in found[1].values()]
+    if not np.isfinite(frame.points()[bound]).all():
         return None
-    columns = [states.joint_names.index(name) for name in robot.joint_names]
-    stamp = int(episode.masks[VIEWS[0]].stamps_ns[0])
-    rows = round(STEP_S / PERIOD_S) * (len(track.points) - 1) + 1
-    times = np.arange(rows, dtype=np.float64) * PERIOD_S
-    positions = resample(
-        stitched_commands(episode, robot, stamp), states.positions[0][columns], times
-    )
+    times, positions = fine_commands(episode, robot, VIEWS)
     if recorded_arms:
         grippers = {tool.gripper_joint for tool in robot.tools}
         arms = [name not in grippers for name in robot.joint_names]
+        stamp = int(episode.masks[VIEWS[0]].stamps_ns[0])
         positions[:, arms] = recorded_positions(states, robot, stamp + times * 1e9)[:, arms]
     return Plan(
         success=episode.info.outcome == 'success',
         task=found[0],
         bound=found[1],
         names=names,
-        reference=reference,
-        features=track.features,
+        frame=frame,
         positions=positions,
     )
 
 
 def share_foreseen(plan: Plan, predictor: ObjectMotionPredictor) -> float | None:
     """Returns which share of the motions of a plan succeeds; None = they do not tell."""
-    tracked = TrackedObjects(model=predictor, reference=plan.reference, features=plan.features)
+    tracked = predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
     motions, _ = tracked.advance(plan.positions)
     foreseen = ForeseenMotions(
         names=plan.names,
@@ -149,16 +141,16 @@ def share_foreseen(plan: Plan, predictor: ObjectMotionPredictor) -> float | None
         sizes=tracked.sizes,
         openings=predictor.robot.gripper_openings(plan.positions[:: tracked.commands_a_step]),
     )
-    succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(plan.reference, np.nan))
+    succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
     return None if succeeded is None else float(np.mean(succeeded))
 
 
 def ruled(plan: Plan, predictor: ObjectMotionPredictor) -> float:
     """Returns whether a plan succeeds by the rule, which is given the same places and sizes."""
-    tracked = TrackedObjects(model=predictor, reference=plan.reference, features=plan.features)
+    tracked = predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
     things = {
         name: Thing(name=name, centre=centre, size=size)
-        for name, centre, size in zip(plan.names, plan.reference, tracked.sizes, strict=True)
+        for name, centre, size in zip(plan.names, tracked.reference, tracked.sizes[0], strict=True)
     }
     return float(is_done(plan.task, plan.bound, things, predictor.robot, plan.positions))
 

@@ -304,7 +304,7 @@ class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
     step_s, commands_a_step = 0.1, 1
-    sizes = np.full((2, 3), 0.04)
+    sizes = np.full((1, 2, 3), 0.04)
 
     def __init__(self, log: list[int], num_steps: int = 0) -> None:
         self._log, self._num_steps = log, num_steps
@@ -429,7 +429,7 @@ class SlidingObjects:
 
     @property
     def sizes(self) -> np.ndarray:
-        return np.full((len(self.points), 3), 0.04)
+        return np.full((1, len(self.points), 3), 0.04)
 
     def advance(self, positions: np.ndarray) -> tuple[tuple[ObjectMotion], SlidingObjects]:
         steps = self.steps + np.arange(len(positions))

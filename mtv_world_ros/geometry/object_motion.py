@@ -72,7 +72,7 @@ class TrackedObjects(Protocol):
 
     @property
     def sizes(self) -> FloatArray:
-        """(O, 3) their extents, upright, as the masks show them [m]."""
+        """(K, O, 3) their extents in each of the motions, upright [m]."""
         ...
 
     def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:

@@ -29,7 +29,7 @@ class ForeseenMotions:
         names: of O objects.
         points: (K, N, O, 3) [m], NaN where not known.
         rotations: (K, N, O, 3, 3) from row 0.
-        sizes: (O, 3) extents [m].
+        sizes: (K, O, 3) extents [m].
         openings: (A, N) of the grippers, 0 closed to 1 open.
     """
 
@@ -68,7 +68,7 @@ class ForeseenMotions:
         turns = np.concatenate([turns[:1], turns])
         openings = np.concatenate([self.openings[:, :1], self.openings], axis=1)
         sizes = {
-            role: tuple(map(float, task.sizes_m.get(role) or self.sizes[item]))
+            role: tuple(map(float, task.sizes_m.get(role) or self.sizes[number, item]))
             for role, item in items.items()
         }
         poses = TruePoses(

@@ -434,6 +434,17 @@ def _read_response(data: bytes, folder: Path) -> Any:
     return load_response(_file(folder / 'arm_response.json', data).parent, robot)
 
 
+def _contacts() -> list[bytes]:
+    folder = share_path('resource', 'checkpoint', 'object_motion')
+    return [(folder / 'contact.json').read_bytes()]
+
+
+def _read_contact(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.object_motion.predictor import load_contact
+
+    return load_contact(_file(folder / 'contact.json', data).parent)
+
+
 KINDS = {
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
@@ -461,6 +472,7 @@ KINDS = {
     'weights': Kind(_weights, _read_weights),
     'object motion': Kind(_networks, _read_network),
     'arm response': Kind(_responses, _read_response),
+    'contact': Kind(_contacts, _read_contact),
     'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, _mutated_content, 0.1),
     'instruction': Kind(_instructions, _match),
     'answer, msgpack': Kind(_answers, _read_answer),

@@ -23,7 +23,7 @@ def foreseen(*ends):
     """Motions of 9 steps in which the red block ends at each of `ends`, the gripper open."""
     points = np.array([[[red, BLUE] for red in path(RED, end)] for end in ends], float)
     turns = np.broadcast_to(np.eye(3), (*points.shape, 3))
-    sizes = np.array([[0.05] * 3, [0.04] * 3])
+    sizes = np.broadcast_to([[0.05] * 3, [0.04] * 3], (len(points), 2, 3))
     openings = np.ones((2, points.shape[1]))
     return ForeseenMotions(
         names=NAMES, points=points, rotations=turns, sizes=sizes, openings=openings

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 import shutil
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors import SafetensorError
@@ -15,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.config import validated
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import whole_folder, write_json
@@ -27,6 +30,7 @@ from mtv_world_ros.model.object_motion.arm_response import (
     ArmState,
     PERIOD_S,
 )
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.network import (
     Memory,
     ObjectMotionNetwork,
@@ -36,6 +40,11 @@ from mtv_world_ros.model.object_motion.network import (
 from mtv_world_ros.model.object_motion.stacked import stacked
 from mtv_world_ros.model.tensor_files import disk_errors
 
+if TYPE_CHECKING:
+    from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
+
+#: settings of rigid bodies, beside the networks
+CONTACT_FILE = 'contact.json'
 #: standard deviations of where masks have an object, and of how large (relative)
 _PLACE_ERROR_M, _SIZE_ERROR = 0.003, 0.04
 #: objects with disturbances of their own
@@ -69,14 +78,21 @@ class ObjectMotionPredictor:
     Args:
         members: the first says what is expected.
         robot: gives tools and grippers.
+        contact: of motions of rigid bodies, foreseen beside those of the networks; None = of
+            networks alone.
         num_disturbed: motions beside the expected one, from places and sizes within the error of
             what masks tell, and with the errors that the networks expect of themselves.
     """
 
     def __init__(
-        self, members: Sequence[Member], robot: RobotModel, num_disturbed: int = 12
+        self,
+        members: Sequence[Member],
+        robot: RobotModel,
+        contact: ContactSettings | None = None,
+        num_disturbed: int = 12,
     ) -> None:
-        self.members, self.robot = tuple(members), robot
+        self.members, self.robot, self.contact = tuple(members), robot, contact
+        self.num_disturbed = num_disturbed
         networks = [member.network.eval() for member in members]
         self.network = networks[0] if len(networks) == 1 else stacked(networks)
         rng = np.random.default_rng(0)
@@ -134,7 +150,29 @@ class ObjectMotionPredictor:
         """
         points = locate_all(cameras, poses, centroids(masks))
         features = object_shapes(masks, points, cameras, poses)
-        return TrackedObjects(model=self, reference=points, features=features)
+        contact = self._solids(masks, points, cameras, poses)
+        return TrackedObjects(model=self, reference=points, features=features, contact=contact)
+
+    def _solids(
+        self,
+        masks: BoolArray,
+        points: FloatArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+    ) -> ContactMotions | None:
+        response = self.members[0].response
+        if self.contact is None:
+            return None
+        assert response is not None  # checked when it was loaded
+        from mtv_world_ros.geometry.solids import fit_solid
+        from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
+
+        table = self.contact.table_m
+        solids = [
+            fit_solid(masks[:, item], point, cameras, poses, table)
+            for item, point in enumerate(points)
+        ]
+        return ContactMotions(settings=self.contact, response=response, solids=tuple(solids))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,12 +184,14 @@ class TrackedObjects:
         reference: (O, 3) where they were found [m]; NaN = not found in two views, not tracked.
         features: (O, V, F) of `object_shapes`.
         before: when they were last asked; None = nothing has moved yet.
+        contact: the same objects as rigid bodies; None = networks alone.
     """
 
     model: ObjectMotionPredictor
     reference: FloatArray
     features: FloatArray
     before: _Before | None = None
+    contact: ContactMotions | None = None
 
     @property
     def step_s(self) -> float:
@@ -165,11 +205,16 @@ class TrackedObjects:
 
     @property
     def sizes(self) -> FloatArray:
-        """(O, 3) extents: the mean of the least widths, and twice the height of the centre [m]."""
+        """(K, O, 3) extents in each of the motions [m].
+
+        For the networks they are the mean of the least widths, and twice the height of the centre.
+        """
         widths = self.features[..., :4]
         least = np.where((widths > 0).any(-1, keepdims=True), widths, np.inf).min(1).mean(-1)
         height = 2 * np.maximum(self.reference[:, 2], _LEAST_HEIGHT_M)
-        return np.stack([least, least, height], axis=-1)
+        sizes = np.stack([least, least, height], axis=-1)
+        sizes = np.broadcast_to(sizes, (1 + self.model.num_disturbed, *sizes.shape))
+        return sizes if self.contact is None else np.concatenate([sizes, self.contact.sizes])
 
     def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of 1 + T steps, and then.
@@ -210,14 +255,22 @@ class TrackedObjects:
         ways = motion.points.double().numpy() - places[rows, None]
         points = np.where(known[:, None], self.reference + ways, np.nan)[kept]
         rotations = motion.rotations.double().numpy()[kept]
+        motions = [
+            ObjectMotion(reference=self.reference, points=way, rotations=turns)
+            for way, turns in zip(points, rotations, strict=True)
+        ]
+        contact = self.contact
+        if contact is not None:
+            robot, every = self.model.robot, self.commands_a_step
+            points, rotations, contact = contact.advance(robot, positions, every)
+            motions += [
+                ObjectMotion(reference=contact.centres, points=way, rotations=turns)
+                for way, turns in zip(points, rotations, strict=True)
+            ]
         before = _Before(
             memory=memory, tools=tools[:, -2], gaps=gaps[:, -2], arms=arms, steps=first + count
         )
-        moved = tuple(
-            ObjectMotion(reference=self.reference, points=way, rotations=turns)
-            for way, turns in zip(points, rotations, strict=True)
-        )
-        return moved, replace(self, before=before)
+        return tuple(motions), replace(self, before=before, contact=contact)
 
     def _tools(
         self, positions: FloatArray
@@ -329,6 +382,11 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
         raise CheckpointError(f"'{file}' cannot be used: {error}; train it anew") from error
 
 
+def save_contact(contact: ContactSettings, folder: Path) -> None:
+    """Writes settings of rigid bodies beside the networks of a checkpoint."""
+    write_json(folder / CONTACT_FILE, contact.model_dump(mode='json'))
+
+
 def add_members(folder: Path, others: Sequence[Path]) -> None:
     """Copies networks into the folder of another, which they foresee with from now on.
 
@@ -353,8 +411,10 @@ def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
     """Reads what `train-motion` wrote.
 
     Raises:
-        CheckpointError: see `load_network`, `load_response`.
+        CheckpointError: see `load_network`, `load_response`, `load_contact`.
+        RobotError: the robot cannot be computed as rigid bodies, which the checkpoint asks for.
     """
+    contact = load_contact(folder)
     folders = [folder, *sorted(folder.glob(f'{_MEMBER}*'))]
     members: list[Member] = []
     for each in folders:
@@ -363,7 +423,44 @@ def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
             if response and other.response and other.response.as_json() == response.as_json():
                 response = other.response
         members.append(Member(network=load_network(each), response=response))
-    return ObjectMotionPredictor(members, robot)
+    if contact is not None:
+        _check_contact(contact, robot, members[0].response, folder)
+    return ObjectMotionPredictor(members, robot, contact)
+
+
+def load_contact(folder: Path) -> ContactSettings | None:
+    """Reads settings of rigid bodies; None = motions of networks alone are foreseen.
+
+    Raises:
+        CheckpointError: the file cannot be used, or what computes rigid bodies is not installed.
+    """
+    file = folder / CONTACT_FILE
+    if not file.exists():
+        return None
+    missing = [name for name in ('dartpy', 'scipy') if find_spec(name) is None]
+    if missing:
+        raise CheckpointError(
+            f"'{file}' asks for rigid bodies; run 'pip install {' '.join(missing)}', or remove "
+            'the file to foresee by networks alone'
+        )
+    try:
+        values = read_json(file)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"'{file}' cannot be used: {error}; fit it anew") from error
+    return validated(ContactSettings, values, f"'{file}'", error=CheckpointError)
+
+
+def _check_contact(
+    contact: ContactSettings, robot: RobotModel, response: ArmResponse | None, folder: Path
+) -> None:
+    from mtv_world_ros.model.object_motion.contact_motions import check_robot
+
+    if response is None:
+        raise CheckpointError(
+            f"'{folder / CONTACT_FILE}' asks for rigid bodies, but '{_RESPONSE}' beside it is "
+            "missing; run 'mtv-world train-motion'"
+        )
+    check_robot(contact, robot, response)
 
 
 def num_features(num_views: int) -> int:

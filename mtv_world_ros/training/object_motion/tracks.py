@@ -24,6 +24,28 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.model.object_motion.network import STEP_S
 
+#: commands in a step of the network
+_EVERY = round(STEP_S / PERIOD_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstFrame:
+    """What the first masks of an episode show.
+
+    Attributes:
+        masks: (V, O, H, W).
+        cameras: V.
+        poses: V of T_base_camera (4, 4).
+    """
+
+    masks: BoolArray
+    cameras: tuple[CameraModel, ...]
+    poses: tuple[FloatArray, ...]
+
+    def points(self) -> FloatArray:
+        """Returns (O, 3) where the objects are [m], NaN = not seen by two views."""
+        return locate_all(self.cameras, self.poses, centroids(self.masks))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectTracks:
@@ -94,12 +116,8 @@ def tracks_of(
         raise EpisodeError(f"'{path}' has no object masks, joint states or commands")
     masks = {view: episode.masks[view] for view in views}
     stamps = masks[views[0]].stamps_ns
-    columns = [states.joint_names.index(name) for name in robot.joint_names]
-    commands = stitched_commands(episode, robot, int(stamps[0]))
-    count = int(_last_ns(episode, masks) / 1e9 / STEP_S + 1e-6)
-    every = round(STEP_S / PERIOD_S)
-    times = np.arange(count * every + 1, dtype=np.float64) * PERIOD_S
-    positions = resample(commands, states.positions[0][columns], times)
+    times, positions = fine_commands(episode, robot, views)
+    count, every = (len(times) - 1) // _EVERY, _EVERY
     expected = positions if response is None else response.follow(robot, positions)[0]
     times, positions, expected = (rows[::every] for rows in (times, positions, expected))
     stamps_ns = stamps[0] + times * 1e9
@@ -123,6 +141,39 @@ def tracks_of(
     if not tracks[0].known[0].any():
         raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
     return [track for track in tracks if track.known[0].any()]
+
+
+def first_frame(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FirstFrame:
+    """Returns the first masks of an episode, which has them and joint states."""
+    assert episode.masks is not None and episode.joint_states is not None
+    columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
+    joints = episode.joint_states.positions[:1, columns]
+    numbers = np.arange(len(episode.info.objects))[:, None, None] + 1
+    cameras = tuple(episode.cameras[view] for view in views)
+    return FirstFrame(
+        masks=np.stack([episode.masks[view].frames[0] == numbers for view in views]),
+        cameras=cameras,
+        poses=tuple(camera_poses(camera, robot, joints)[0] for camera in cameras),
+    )
+
+
+def fine_commands(
+    episode: Episode, robot: RobotModel, views: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Returns times (1 + T * n,) from the first masks on [s], and commands (1 + T * n, J) then.
+
+    Args:
+        episode: with masks, joint states and commands.
+        robot: gives the order of joints.
+        views: whose masks are used.
+    """
+    assert episode.masks is not None and episode.joint_states is not None
+    stamp = int(episode.masks[views[0]].stamps_ns[0])
+    count = int(_last_ns(episode, views[0]) / 1e9 / STEP_S + 1e-6)
+    times = np.arange(count * _EVERY + 1, dtype=np.float64) * PERIOD_S
+    columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
+    first = episode.joint_states.positions[0][columns]
+    return times, resample(stitched_commands(episode, robot, stamp), first, times)
 
 
 def recorded_positions(
@@ -213,7 +264,8 @@ class _Recording:
         return np.stack([ids == number for number in numbers], axis=1)
 
 
-def _last_ns(episode: Episode, masks: dict[str, Track]) -> float:
+def _last_ns(episode: Episode, view: str) -> float:
+    assert episode.masks is not None
     found = episode.object_poses
-    shown = masks[next(iter(masks))].stamps_ns
+    shown = episode.masks[view].stamps_ns
     return float((shown if found is None else found.stamps_ns)[-1] - shown[0])

@@ -323,7 +323,7 @@ def test_objects_go_on_from_chunk_to_chunk_and_unknown_ones_are_unknown(network,
     for motion in disturbed:  # of other places, told from where the object was found
         np.testing.assert_allclose(motion.points[0, 0], tracked.reference[0])
         assert np.abs(motion.points[:, 0] - whole.points[:, 0]).max() > 1e-6
-    np.testing.assert_allclose(tracked.sizes[0], [0.04, 0.04, 0.04])
+    np.testing.assert_allclose(tracked.sizes[:, 0], np.full((13, 3), 0.04))
     np.testing.assert_allclose(first.points[:, 0], whole.points[:5, 0], atol=1e-6)
     np.testing.assert_allclose(second.points[:, 0], whole.points[4:, 0], atol=1e-6)
     assert np.isnan(whole.points[:, 1]).all() and np.isfinite(whole.points[:, 0]).all()

@@ -1,0 +1,196 @@
+"""Motions of objects as rigid bodies: what a robot's commands do to the solids that masks show.
+
+Nothing here is learned from motions of objects: shapes are those of the masks, arms follow as
+`ArmResponse` found, and friction, weight and the grip of fingers are guesses that a checkpoint
+states (`contact.json`). So a kind of mistake that no training had is no stranger than another.
+Several motions begin with places, sizes, friction, weight and grip within the error of these.
+
+Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import RobotError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+from mtv_world_ros.model.object_motion.rigid_bodies import BodyState, RigidBodies
+
+#: steps of the engine in a period of commands
+_SUBSTEPS = 5
+_STEP_S = PERIOD_S / _SUBSTEPS
+#: standard deviations: of places [m], turns [rad]; relative: sizes, friction, weight, stiffness
+_PLACE_M, _TURN_RAD = 0.001, 0.02
+_SIZE, _FRICTION, _WEIGHT, _STIFFNESS = 0.015, 0.2, 0.3, 0.2
+#: what is found as near to the table stands on it [m]
+_STANDS_M = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactMotions:
+    """Solids on their way; what one chunk hands to the next.
+
+    Attributes:
+        settings: of contact.
+        response: how the arms follow; what its floor stops, the table stops here.
+        solids: O, as found; None = not seen by two views.
+        states: K, of all bodies; empty = nothing has moved yet.
+        arms: where the arms would be by now if nothing were touched.
+        speeds: (D,) of these arms, in the engine's order.
+    """
+
+    settings: ContactSettings
+    response: ArmResponse
+    solids: tuple[Solid | None, ...]
+    states: tuple[BodyState, ...] = ()
+    arms: ArmState | None = None
+    speeds: FloatArray | None = None
+
+    def advance(
+        self, robot: RobotModel, positions: FloatArray, rows: int
+    ) -> tuple[FloatArray, FloatArray, ContactMotions]:
+        """Returns where objects are, and then.
+
+        Args:
+            robot: whose joints are commanded.
+            positions: (1 + N, J) commands, `PERIOD_S` apart [rad or m].
+            rows: periods between two of the rows that are returned.
+
+        Returns:
+            Centres (K, T + 1, O, 3) [m], NaN = not seen by two views, and rotations
+            (K, T + 1, O, 3, 3) since they were found, row 0 where they are now; and the motions
+            after it.
+
+        Raises:
+            RobotError: see `check_robot`.
+        """
+        free = replace(self.response, floor=None)
+        where, arms = free.follow(robot, positions, self.arms)
+        points, turned, states = [], [], []
+        speeds = None
+        for number in range(self.settings.num_motions):
+            settings, solids = self._disturbed(number)
+            bodies = RigidBodies(robot, self.response, solids, settings, _STEP_S)
+            start = bodies.poses()[:, :3, :3]
+            ways, velocities = self._expected(bodies, where)
+            speeds = velocities[-1]
+            if self.states:
+                bodies.state = self.states[number]
+            else:
+                bodies.arms.skeleton.setPositions(ways[0])
+            poses = _run(bodies, ways, velocities, rows * _SUBSTEPS)
+            states.append(bodies.state)
+            points.append(poses[..., :3, 3])
+            turned.append(poses[..., :3, :3] @ np.swapaxes(start, -1, -2))
+        then = replace(self, states=tuple(states), arms=arms, speeds=speeds)
+        return (
+            self._of_all(np.stack(points), np.nan),
+            self._of_all(np.stack(turned), np.eye(3)),
+            then,
+        )
+
+    @property
+    def centres(self) -> FloatArray:
+        """(O, 3) where the solids were found [m], NaN = not seen by two views."""
+        unknown = np.full(3, np.nan)
+        return np.array([unknown if one is None else one.centre for one in self.solids])
+
+    @property
+    def sizes(self) -> FloatArray:
+        """(K, O, 3) extents of the solids [m]."""
+        found = [self._disturbed(number)[1] for number in range(self.settings.num_motions)]
+        sizes = np.array([[solid.size for solid in solids] for solids in found])
+        return self._of_all(sizes.reshape(len(found), 1, -1, 3), np.nan)[:, 0]
+
+    def _of_all(self, found: FloatArray, unknown: FloatArray | float) -> FloatArray:
+        """Gives what was found of solids (K, T, S, ...) to all objects (K, T, O, ...)."""
+        known = [number for number, solid in enumerate(self.solids) if solid is not None]
+        shape = (*found.shape[:2], len(self.solids), *found.shape[3:])
+        filled = np.broadcast_to(unknown, shape).copy()
+        filled[:, :, known] = found
+        return filled
+
+    def _expected(self, bodies: RigidBodies, where: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Ways and velocities (1 + N, D) of the arms in free air, at the engine's steps."""
+        coarse = bodies.arms.ways(where)
+        times = np.arange(len(coarse)) * PERIOD_S
+        first = np.zeros(coarse.shape[1]) if self.speeds is None else self.speeds
+        curve = CubicSpline(times, coarse, bc_type=((1, first), 'not-a-knot'))  # type: ignore[arg-type]
+        ways = curve(np.arange((len(coarse) - 1) * _SUBSTEPS + 1) * _STEP_S)
+        velocities = np.concatenate([first[None], np.diff(ways, axis=0) / _STEP_S])
+        return ways, velocities
+
+    def _disturbed(self, number: int) -> tuple[ContactSettings, list[Solid]]:
+        """Settings and solids of a motion; those of the first are as they are."""
+        rng, share = np.random.default_rng((2, number)), float(number > 0)
+        settings = self.settings
+
+        def scaled(deviation: float) -> float:
+            return float(np.exp(share * deviation * rng.normal()))
+
+        changed = settings.model_copy(
+            update={
+                'grip_friction': settings.grip_friction * scaled(_FRICTION),
+                'table_friction': settings.table_friction * scaled(_FRICTION),
+                'finger_stiffness': settings.finger_stiffness * scaled(_STIFFNESS),
+                'density': settings.density * scaled(_WEIGHT),
+                'tray_kg': settings.tray_kg * scaled(_WEIGHT),
+            }
+        )
+        return changed, [
+            _disturbed(solid, settings.table_m, share, rng)
+            for solid in self.solids
+            if solid is not None
+        ]
+
+
+def check_robot(settings: ContactSettings, robot: RobotModel, response: ArmResponse) -> None:
+    """Checks that contact of a robot can be computed.
+
+    Raises:
+        RobotError: joints have no compliance, or see `RigidBodies`.
+    """
+    if not (response.compliance > 0).all():
+        raise RobotError(
+            f"the joints of robot '{robot.name}' were found without inertias of its URDF; "
+            'contact cannot be computed'
+        )
+    RigidBodies(robot, response, (), settings, _STEP_S)
+
+
+def _disturbed(solid: Solid, table: float, share: float, rng: np.random.Generator) -> Solid:
+    """A solid a little elsewhere, of a little other size; what stands on the table still does."""
+    noise = share * rng.normal(size=5)
+    wide, long, high = solid.size * np.exp(_SIZE * noise[[0, 0, 1]])
+    x, y = solid.centre[:2] + _PLACE_M * noise[2:4]
+    bottom = solid.centre[2] - solid.size[2] / 2
+    if abs(bottom - table) < _STANDS_M:
+        bottom = table
+    return replace(
+        solid,
+        centre=np.array([x, y, bottom + high / 2]),
+        size=np.array([wide, wide if solid.is_round else long, high]),
+        yaw=solid.yaw + _TURN_RAD * float(noise[4]),
+    )
+
+
+def _run(bodies: RigidBodies, ways: FloatArray, velocities: FloatArray, every: int) -> FloatArray:
+    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven along their ways."""
+    forces, poses = bodies.arms.carried(ways, velocities, _STEP_S), [bodies.poses()]
+    state = bodies.state
+    for step, carried in enumerate(forces):
+        bodies.step(bodies.arms.forces(carried, ways[step], velocities[step]))
+        if (step + 1) % every == 0:
+            poses.append(bodies.poses())
+            if np.isfinite(poses[-1]).all():
+                state = bodies.state
+            else:  # the engine has lost them: they go on from where they were last
+                bodies.state, poses[-1] = state, poses[-2]
+    return np.stack(poses)

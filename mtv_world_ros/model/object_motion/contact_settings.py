@@ -1,0 +1,21 @@
+"""What rigid bodies are given beside the shapes that masks show."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from mtv_world_ros.config import Positive, Schema
+
+
+class ContactSettings(Schema):
+    """Numbers of contact, found in recorded episodes (`training/object_motion/contact_fit.py`)."""
+
+    finger_stiffness: Positive = Field(description='of each finger [N/m]')
+    finger_damping: Positive = Field(description='of each finger [N s/m]')
+    finger_mass_kg: Positive = Field(description='of its drive')
+    grip_friction: Positive = Field(description='of fingers and objects')
+    table_friction: Positive = Field(description='of the table and of links')
+    density: Positive = Field(description='of objects [kg/m^3]')
+    tray_kg: Positive = Field(description='of a wide box without a lid')
+    table_m: float = Field(default=0.0, description='its height in the base frame [m]')
+    num_motions: int = Field(default=5, ge=1, le=64, description='the last ones disturbed')

@@ -1,0 +1,410 @@
+"""A table, a robot and solids as rigid bodies of the engine DART (dartsim.github.io).
+
+Its contacts are a linear complementarity problem with Coulomb friction; bodies do not sink into
+each other. Of two bodies that rub, the lower friction counts.
+
+Shape letters: J joints, D degrees of freedom of the description, O solids, A tools.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import dartpy as dart
+import numpy as np
+
+from mtv_world_ros.bounded_input import parse_yaml, read_text
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import RobotError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_shape import find_mesh
+from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+
+#: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
+_DISH_M, _DISH_RATIO = 0.06, 1.5
+#: thickness of the floor of what is hollow, and of its walls if it is round, or a box [m]
+_FLOOR_M, _RIM_M, _WALL_M = 0.006, 0.01, 0.006
+#: walls end this far above the bottom, so that they do not touch the table, too [m]
+_LIFT_M = 0.0005
+#: round things are prisms of so many sides: flat fingers touch a cylinder along a line only
+_SIDES = 16
+_LEAST_KG = 0.01
+#: half the extents of the table [m]
+_TABLE_M = (1.5, 1.5, 0.1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyState:
+    """Positions and velocities of everything that moves, in the engine's order."""
+
+    positions: tuple[FloatArray, ...]
+    velocities: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Part:
+    """A convex part of a solid: a box (half extents) or a cylinder (radius, half height)."""
+
+    size: tuple[float, ...]
+    pose: FloatArray
+    mass: float
+
+    @property
+    def inertia(self) -> FloatArray:
+        """(3, 3) about its centre."""
+        if len(self.size) == 3:
+            x, y, z = (4 * extent**2 for extent in self.size)
+            return self.mass / 12 * np.diag([y + z, x + z, x + y])
+        radius, half = self.size
+        across = (3 * radius**2 + 4 * half**2) / 12
+        return self.mass * np.diag([across, across, radius**2 / 2])
+
+    def shape(self) -> Any:
+        if len(self.size) == 3:
+            return dart.dynamics.BoxShape(2 * np.array(self.size))
+        return dart.dynamics.CylinderShape(self.size[0], 2 * self.size[1])
+
+
+class RigidBodies:
+    """A world that is stepped.
+
+    Args:
+        robot: from a URDF whose base link is its root.
+        response: how its joints follow; all have a compliance.
+        solids: O, on the table.
+        settings: of contact.
+        step_s: of the engine.
+
+    Raises:
+        RobotError: the robot cannot be a tree of rigid bodies.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        response: ArmResponse,
+        solids: Sequence[Solid],
+        settings: ContactSettings,
+        step_s: float,
+    ) -> None:
+        self._world = dart.simulation.World()
+        self._world.setTimeStep(step_s)
+        still = self._world.getDeactivationOptions()
+        still.mEnabled = False  # what sleeps is not woken by fingers that close gently
+        self._world.setDeactivationOptions(still)
+        solver = self._world.getConstraintSolver()
+        solver.setCollisionDetector(dart.collision.BulletCollisionDetector())
+        self._world.addSkeleton(_table(settings))
+        self._settings = settings
+        self._solids = [_body(number, solid, settings) for number, solid in enumerate(solids)]
+        self.arms = _Arms(robot, response, settings)
+        for skeleton in (*self._solids, self.arms.skeleton):
+            self._world.addSkeleton(skeleton)
+
+    def step(self, forces: FloatArray) -> None:
+        """Goes on by a step with forces (D,) on the arms."""
+        self.arms.skeleton.setForces(forces)
+        self._world.step()
+
+    def poses(self) -> FloatArray:
+        """Returns T_base_solid (O, 4, 4) [m]."""
+        found = [solid.getBodyNode(0).getWorldTransform().matrix() for solid in self._solids]
+        return np.array(found).reshape(-1, 4, 4)
+
+    @property
+    def state(self) -> BodyState:
+        """Where everything is now."""
+        moving = (*self._solids, self.arms.skeleton)
+        return BodyState(
+            positions=tuple(np.array(one.getPositions()) for one in moving),
+            velocities=tuple(np.array(one.getVelocities()) for one in moving),
+        )
+
+    @state.setter
+    def state(self, state: BodyState) -> None:
+        moving = (*self._solids, self.arms.skeleton)
+        rows = zip(moving, state.positions, state.velocities, strict=True)
+        for one, positions, velocities in rows:
+            one.setPositions(positions)
+            one.setVelocities(velocities)
+
+
+class _Arms:
+    """The robot's skeleton, and the forces that drive it.
+
+    In free air a joint goes just as `ArmResponse` expects it; what touches the arm moves it off
+    that way against the joint's stiffness and damping.
+    """
+
+    def __init__(
+        self, robot: RobotModel, response: ArmResponse, settings: ContactSettings
+    ) -> None:
+        self.skeleton, described = _skeleton(robot)
+        self._ghost = self.skeleton.clone('expected')
+        followers = {name: (name, 1.0, 0.0) for name in robot.joint_names}
+        followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
+        names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
+        travels = finger_travels(robot)
+        self._follows = np.zeros((len(names), len(robot.joint_names)))
+        self._offsets = np.zeros(len(names))
+        self._stiffness, self._damping = np.zeros(len(names)), np.zeros(len(names))
+        count = {
+            s: sum(s == source for source, *_ in followers.values()) for s in robot.joint_names
+        }
+        for row, name in enumerate(names):
+            if name not in followers:
+                continue
+            source, multiplier, self._offsets[row] = followers[name]
+            column = robot.joint_names.index(source)
+            self._follows[row, column] = multiplier
+            stiffness = 1 / response.compliance[column] / count[source]
+            damping = stiffness * response.damping[column]
+            armature = stiffness * response.armature[column]
+            if source in travels:
+                way = travels[source] ** 2
+                stiffness, damping = settings.finger_stiffness * way, settings.finger_damping * way
+                armature = settings.finger_mass_kg * way
+            self._stiffness[row], self._damping[row] = stiffness, damping
+            for skeleton in (self.skeleton, self._ghost):
+                _add_drive(skeleton.getJoint(name), armature, is_finger=source in travels)
+        fingers = {name for name, (source, *_) in followers.items() if source in travels}
+        for skeleton in (self.skeleton, self._ghost):
+            _settle(skeleton, described, fingers, settings)
+        self._driven = self._stiffness > 0
+
+    def ways(self, positions: FloatArray) -> FloatArray:
+        """Returns where the degrees of freedom are (T, D) at joints (T, J)."""
+        return positions @ self._follows.T + self._offsets
+
+    def carried(self, ways: FloatArray, velocities: FloatArray, step_s: float) -> FloatArray:
+        """Returns the forces (T, D) that move the arms along ways (1 + T, D) in free air.
+
+        Args:
+            ways: expected, a step apart.
+            velocities: (1 + T, D) likewise.
+            step_s: of the engine.
+        """
+        accelerations, forces = np.diff(velocities, axis=0) / step_s, np.zeros_like(ways[:-1])
+        for row, acceleration in enumerate(accelerations):
+            self._ghost.setPositions(ways[row])
+            self._ghost.setVelocities(velocities[row])
+            self._ghost.setAccelerations(acceleration)
+            self._ghost.computeInverseDynamics(False, False, False)
+            forces[row] = self._ghost.getForces()
+        return forces * self._driven
+
+    def forces(self, carried: FloatArray, way: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Returns (D,) forces: what carries the arms, and what pulls them back to the way."""
+        off = way - self.skeleton.getPositions()
+        slow = velocity - self.skeleton.getVelocities()
+        return carried + self._stiffness * off + self._damping * slow
+
+
+def _skeleton(robot: RobotModel) -> tuple[Any, set[str]]:
+    """The robot's bodies, and the links that have an inertia in its description."""
+    urdf = None
+    if robot.file is not None:
+        urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
+    if robot.file is None or urdf is None:
+        raise RobotError(f"robot '{robot.name}' has no URDF; contact needs one")
+    path = robot.file.parent / str(urdf)
+    loader = dart.utils.DartLoader()
+    options = loader.getOptions()
+    options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED
+    loader.setOptions(options)
+    tree = _described(path)
+    text = ElementTree.tostring(tree, encoding='unicode')
+    skeleton = loader.parseSkeletonString(text, dart.common.Uri(path.resolve().as_uri()))
+    if skeleton is None:
+        raise RobotError(f"'{path}' cannot be read as rigid bodies; see the lines before")
+    if skeleton.getRootBodyNode().getName() != robot.base_link:
+        raise RobotError(
+            f"base link '{robot.base_link}' of robot '{robot.name}' must be its URDF's root "
+            f"'{skeleton.getRootBodyNode().getName()}' for contact to be computed"
+        )
+    described = tree.iterfind('link/inertial/..')
+    return skeleton, {link.attrib['name'] for link in described}
+
+
+def _described(path: Path) -> ElementTree.Element:
+    """A URDF without what is only looked at, its meshes where they lie."""
+    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
+    for link in tree.iterfind('link'):
+        for look in link.findall('visual'):
+            link.remove(look)
+    for mesh in tree.iterfind('link/collision/geometry/mesh'):
+        name = mesh.get('filename', '')
+        file = find_mesh(name, path)
+        if file is None:
+            raise RobotError(f"'{path}': mesh '{name}' is missing; contact needs it")
+        mesh.set('filename', file.resolve().as_uri())
+    return tree
+
+
+def finger_travels(robot: RobotModel) -> dict[str, float]:
+    """Gripper joint -> how far a finger goes as it moves by one [m / m or m / rad]."""
+    ends = np.zeros((2, len(robot.joint_names)))
+    travels = {}
+    for tool, name in enumerate(tool.gripper_joint for tool in robot.tools):
+        if name is None:
+            continue
+        column = robot.joint_names.index(name)
+        ends[:, column] = robot.tools[tool].gripper_closed, robot.tools[tool].gripper_open
+        shut, wide = robot.finger_gaps(ends)[:, tool]
+        travels[name] = float((wide - shut) / (ends[1, column] - ends[0, column]))
+    return travels
+
+
+def _add_drive(joint: Any, armature: float, *, is_finger: bool) -> None:
+    """Gives a joint's body the inertia of its drive; only fingers have stops."""
+    body = joint.getChildBodyNode()
+    if 'Prismatic' in joint.getType():
+        body.setMass(body.getMass() + armature)
+    else:
+        axis = np.asarray(joint.getAxis())
+        inertia = np.asarray(body.getInertia().getMoment()) + armature * np.outer(axis, axis)
+        _set_inertia(body, inertia)
+    joint.setVelocityLowerLimit(0, -np.inf)
+    joint.setVelocityUpperLimit(0, np.inf)
+    joint.setForceLowerLimit(0, -np.inf)
+    joint.setForceUpperLimit(0, np.inf)
+    joint.setLimitEnforcement(is_finger)
+
+
+def _settle(
+    skeleton: Any, described: set[str], fingers: set[str], settings: ContactSettings
+) -> None:
+    """Takes the weight off all links, which drives hold, and sets what rubs how."""
+    for number in range(skeleton.getNumBodyNodes()):
+        body = skeleton.getBodyNode(number)
+        body.setGravityMode(False)
+        if body.getName() not in described:
+            body.setMass(1e-4)
+            body.setMomentOfInertia(1e-7, 1e-7, 1e-7)
+        is_finger = body.getParentJoint().getName() in fingers
+        friction = settings.grip_friction if is_finger else settings.table_friction
+        for shape in range(body.getNumShapeNodes()):
+            aspect = body.getShapeNode(shape).getDynamicsAspect()
+            if aspect is not None:
+                aspect.setFrictionCoeff(friction)
+
+
+def _table(settings: ContactSettings) -> Any:
+    skeleton = dart.dynamics.Skeleton('table')
+    _, body = skeleton.createWeldJointAndBodyNodePair()
+    pose = np.eye(4)
+    pose[2, 3] = settings.table_m - _TABLE_M[2]
+    _add_part(body, _Part(size=_TABLE_M, pose=pose, mass=1.0), settings.table_friction)
+    return skeleton
+
+
+def _body(number: int, solid: Solid, settings: ContactSettings) -> Any:
+    """A solid, as it stands."""
+    skeleton = dart.dynamics.Skeleton(f'object {number}')
+    joint, body = skeleton.createFreeJointAndBodyNodePair()
+    parts = _parts(solid, settings)
+    mass = sum(part.mass for part in parts)
+    middle = sum(part.mass * part.pose[:3, 3] for part in parts) / mass
+    inertia = np.zeros((3, 3))
+    for part in parts:
+        _add_part(body, part, settings.grip_friction)
+        turn, arm = part.pose[:3, :3], part.pose[:3, 3] - middle
+        inertia += turn @ part.inertia @ turn.T
+        inertia += part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    body.setMass(mass)
+    body.setLocalCOM(middle)
+    _set_inertia(body, inertia)
+    pose = _turned(solid.yaw)
+    pose[:3, 3] = solid.centre
+    skeleton.setPositions(dart.dynamics.FreeJoint.convertToPositions(dart.math.Isometry3(pose)))
+    return skeleton
+
+
+def _add_part(body: Any, part: _Part, friction: float) -> None:
+    node = body.createShapeNode(part.shape())
+    node.createCollisionAspect()
+    node.createDynamicsAspect().setFrictionCoeff(friction)
+    node.setRelativeTransform(dart.math.Isometry3(part.pose))
+
+
+def _set_inertia(body: Any, inertia: FloatArray) -> None:
+    I = inertia  # noqa: E741
+    body.setMomentOfInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
+
+
+def _parts(solid: Solid, settings: ContactSettings) -> list[_Part]:
+    wide, long, high = map(float, solid.size)
+    across = min(wide, long)
+    if across > _DISH_M and across > _DISH_RATIO * high:
+        return _dish(wide, high, settings) if solid.is_round else _tray(wide, long, high, settings)
+    volume = wide * long * high * (np.pi / 4 if solid.is_round else 1.0)
+    mass = max(volume * settings.density, _LEAST_KG)
+    if not solid.is_round:
+        return [_Part(size=(wide / 2, long / 2, high / 2), pose=np.eye(4), mass=mass)]
+    sides = _SIDES // 2
+    side = (wide / 2, wide / 2 * np.tan(np.pi / _SIDES), high / 2 - _LIFT_M)
+    return [
+        _Part(size=(0.97 * wide / 2, high / 2), pose=np.eye(4), mass=0.9 * mass),
+        *(
+            _Part(size=side, pose=_turned(k * np.pi / sides), mass=0.1 * mass / sides)
+            for k in range(sides)
+        ),
+    ]
+
+
+def _dish(wide: float, high: float, settings: ContactSettings) -> list[_Part]:
+    """Round and open at the top."""
+    middle, half = (wide - _RIM_M) / 2, (high - _LIFT_M) / 2
+    length = middle * np.tan(np.pi / _SIDES) * 1.02
+    floor = _Part(
+        size=(middle, _FLOOR_M / 2),
+        pose=_shifted(0.0, 0.0, (_FLOOR_M - high) / 2),
+        mass=np.pi * middle**2 * _FLOOR_M * settings.density,
+    )
+    wall = (_RIM_M / 2, length, half)
+    mass = 8 * float(np.prod(wall)) * settings.density
+    turns = [_turned(k * 2 * np.pi / _SIDES) for k in range(_SIDES)]
+    return [
+        floor,
+        *(
+            _Part(size=wall, pose=turn @ _shifted(middle, 0.0, _LIFT_M / 2), mass=mass)
+            for turn in turns
+        ),
+    ]
+
+
+def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Part]:
+    """A box without a lid; it is heavy below."""
+    x, y, half, wall = wide / 2, long / 2, (high - _LIFT_M) / 2, _WALL_M / 2
+    walls = (
+        ((wall, y, half), (x - wall, 0.0)),
+        ((wall, y, half), (wall - x, 0.0)),
+        ((x, wall, half), (0.0, y - wall)),
+        ((x, wall, half), (0.0, wall - y)),
+    )
+    floor = _shifted(0.0, 0.0, (_FLOOR_M - high) / 2)
+    return [
+        _Part(size=(x, y, _FLOOR_M / 2), pose=floor, mass=0.9 * settings.tray_kg),
+        *(
+            _Part(size=size, pose=_shifted(*at, _LIFT_M / 2), mass=0.025 * settings.tray_kg)
+            for size, at in walls
+        ),
+    ]
+
+
+def _turned(yaw: float) -> FloatArray:
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    return pose
+
+
+def _shifted(x: float, y: float, z: float) -> FloatArray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose

@@ -1,0 +1,214 @@
+"""Friction, weight and the grip of fingers, from recordings of what commands did to objects.
+
+Settings of rigid bodies are tried on recorded episodes: those whose objects end nearest to where
+they really ended are kept. Nothing is taken from a simulator, and a robot's own recordings do.
+
+Shape letters: T steps, O objects, J joints, N settings, E episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.solids import fit_solid, Solid
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+from mtv_world_ros.model.object_motion.network import STEP_S
+from mtv_world_ros.model.object_motion.rigid_bodies import finger_travels
+from mtv_world_ros.parallel import run_all
+from mtv_world_ros.training.object_motion.tracks import (
+    fine_commands,
+    first_frame,
+    FirstFrame,
+    tracks_of,
+)
+
+#: what is tried: each number by these factors, round by round
+_FITTED = (
+    'finger_stiffness',
+    'finger_damping',
+    'grip_friction',
+    'table_friction',
+    'density',
+    'tray_kg',
+)
+_FACTORS = (1.6, 1.3, 1.15)
+#: errors below the first are as good, above the second as bad [m]
+_LEAST_M, _MOST_M = 0.003, 0.1
+_STEPS = round(STEP_S / PERIOD_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactRecording:
+    """What an episode says about contact.
+
+    Attributes:
+        frame: the first.
+        solids: O, as it shows them.
+        positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
+        way: (O, 3) from the first to the last step, as recorded; NaN = not known [m].
+    """
+
+    frame: FirstFrame
+    solids: tuple[Solid | None, ...]
+    positions: FloatArray
+    way: FloatArray
+
+    def errors(
+        self, robot: RobotModel, response: ArmResponse, settings: ContactSettings
+    ) -> FloatArray:
+        """Returns (O,) how far objects end from where they ended [m], NaN = not known."""
+        alone = settings.model_copy(update={'num_motions': 1})
+        motions = ContactMotions(settings=alone, response=response, solids=self.solids)
+        points = motions.advance(robot, self.positions, _STEPS)[0][0]
+        return np.linalg.norm(points[-1] - points[0] - self.way, axis=-1)
+
+
+def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
+    """Reads what an episode says about contact.
+
+    Raises:
+        EpisodeError: see `tracks_of`.
+    """
+    episode = read_episode(path, views=tuple(views))
+    track = tracks_of(episode, robot, views)[0]
+    frame = first_frame(episode, robot, views)
+    known = track.known[0] & track.known[-1]
+    return ContactRecording(
+        frame=frame,
+        solids=tuple(
+            fit_solid(frame.masks[:, item], point, frame.cameras, frame.poses)
+            for item, point in enumerate(frame.points())
+        ),
+        positions=fine_commands(episode, robot, views)[1],
+        way=np.where(known[:, None], track.points[-1] - track.points[0], np.nan),
+    )
+
+
+def read_recordings(
+    paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
+) -> tuple[list[ContactRecording], dict[str, str]]:
+    """Returns what episodes say about contact, and why others say nothing, by path."""
+    recordings, skipped = [], {}
+    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+        try:
+            recordings.append(read_contact(path, robot, views))
+        except MtvWorldError as error:
+            skipped[str(path)] = str(error)
+    return recordings, skipped
+
+
+def first_settings(robot: RobotModel, response: ArmResponse) -> ContactSettings:
+    """Returns what a search begins with: fingers as their joints follow, objects of plastic."""
+    travels = finger_travels(robot)
+    grips = []
+    for joint, travel in travels.items():
+        column = robot.joint_names.index(joint)
+        fingers = 1 + sum(mimic.source == joint for mimic in robot.mimics)
+        stiffness = 1 / response.compliance[column] / fingers / travel**2
+        grips.append(
+            stiffness * np.array([1.0, response.damping[column], response.armature[column]])
+        )
+    stiffness, damping, mass = np.mean(grips, axis=0) if grips else (200.0, 10.0, 0.05)
+    return ContactSettings(
+        finger_stiffness=float(stiffness),
+        finger_damping=float(damping),
+        finger_mass_kg=float(mass),
+        grip_friction=1.0,
+        table_friction=0.5,
+        density=300.0,
+        tray_kg=0.4,
+    )
+
+
+def fit_contact(
+    recordings: Sequence[ContactRecording],
+    robot_file: Path,
+    response: ArmResponse,
+    first: ContactSettings,
+    workers: int = 1,
+    report: Callable[[str], None] = lambda line: None,
+) -> ContactSettings:
+    """Returns the settings with which solids end nearest to where objects ended.
+
+    In each round every number is tried larger and smaller; those that help are changed, together
+    if that is better still, or else the one that helps most. Then the factors get smaller.
+
+    Args:
+        recordings: E.
+        robot_file: of the robot.
+        response: how its arms follow.
+        first: where the search begins.
+        workers: processes.
+        report: is told how each round went.
+
+    Raises:
+        TrainingError: no recording says where an object went.
+        RobotError: see `RigidBodies`.
+    """
+    if not any(np.isfinite(recording.way).any() for recording in recordings):
+        raise TrainingError('no episode says where an object went; contact cannot be fitted')
+
+    def losses(settings: Sequence[ContactSettings]) -> FloatArray:
+        """(N, E)."""
+        jobs = [(n, e, one) for e in range(len(recordings)) for n, one in enumerate(settings)]
+        make_run = partial(_Trial, robot_file, response, recordings)
+        found = np.full((len(settings), len(recordings)), np.nan)
+        for (number, episode, _), loss in run_all(jobs, make_run, workers):
+            found[number, episode] = loss
+        return found
+
+    best, loss = first, float(np.nanmean(losses([first])))
+    report(f'begins at {loss:.3f}')
+    for factor in _FACTORS:
+        tried = [
+            best.model_copy(update={name: getattr(best, name) * by})
+            for name in _FITTED
+            for by in (factor, 1 / factor)
+        ]
+        found = np.nanmean(losses(tried), axis=1)
+        changes = {}
+        for number, name in enumerate(_FITTED):
+            better = 2 * number + int(found[2 * number + 1] < found[2 * number])
+            if found[better] < loss:
+                changes[name] = getattr(tried[better], name)
+        if changes:
+            together = best.model_copy(update=changes)
+            together_loss = float(np.nanmean(losses([together])))
+            alone = int(np.argmin(found))
+            best, loss = (
+                (together, together_loss)
+                if together_loss <= found[alone]
+                else (tried[alone], float(found[alone]))
+            )
+        report(f'by {factor}: {loss:.3f} with {best.model_dump(mode="json")}')
+    return best
+
+
+class _Trial:
+    """Tries settings on recordings, in a process of its own."""
+
+    def __init__(
+        self, robot_file: Path, response: ArmResponse, recordings: Sequence[ContactRecording]
+    ) -> None:
+        self._robot = load_robot(robot_file)
+        self._response, self._recordings = response, recordings
+
+    def __call__(self, job: tuple[int, int, ContactSettings]) -> float:
+        """Returns the mean logarithm of errors, between the bounds [log m]; NaN = not known."""
+        _, episode, settings = job
+        errors = self._recordings[episode].errors(self._robot, self._response, settings)
+        errors = errors[np.isfinite(errors)]
+        return float(np.log(np.clip(errors, _LEAST_M, _MOST_M)).mean()) if len(errors) else np.nan

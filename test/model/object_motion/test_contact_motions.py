@@ -1,0 +1,220 @@
+"""Objects as rigid bodies, under the bundled episode's commands and under others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.errors import CheckpointError, RobotError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.model.object_motion import predictor
+from mtv_world_ros.model.object_motion.contact_motions import check_robot, ContactMotions
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+from mtv_world_ros.model.object_motion.predictor import (
+    CONTACT_FILE,
+    load_predictor,
+    load_response,
+    save_contact,
+)
+from mtv_world_ros.training.object_motion.contact_fit import read_contact
+
+#: of commands between two rows that come back
+ROWS = 5
+SETTINGS = ContactSettings(
+    finger_stiffness=190.0,
+    finger_damping=7.0,
+    finger_mass_kg=0.02,
+    grip_friction=1.0,
+    table_friction=0.5,
+    density=300.0,
+    tray_kg=0.4,
+    num_motions=1,
+)
+#: out of the arms' reach
+AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='module')
+def response(robot):
+    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
+
+
+@pytest.fixture(scope='module')
+def recording(robot):
+    return read_contact(share_path('resource', 'demo_episode'), robot, ('low', 'high'))
+
+
+def motions_of(response, *solids: Solid | None, **changed) -> ContactMotions:
+    settings = SETTINGS.model_copy(update=changed)
+    return ContactMotions(settings=settings, response=response, solids=solids)
+
+
+def still(robot, seconds: float) -> np.ndarray:
+    joints = np.clip(np.zeros(len(robot.joint_names)), robot.lower, robot.upper)
+    return np.repeat(joints[None], round(seconds / 0.02) + 1, axis=0)
+
+
+def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recording):
+    motions = motions_of(response, *recording.solids)
+    points, rotations, _ = motions.advance(robot, recording.positions, ROWS)
+    assert points.shape == (1, len(recording.positions[::ROWS]), 2, 3)
+    assert rotations.shape == (*points.shape, 3)
+    way = points[0, -1] - points[0, 0]
+    assert np.linalg.norm(way[0] - recording.way[0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
+    assert np.linalg.norm(way[1]) < 0.01
+
+
+def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
+    opened = recording.positions.copy()
+    for tool in robot.tools:
+        opened[:, robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
+    points, _, _ = motions_of(response, *recording.solids).advance(robot, opened, ROWS)
+    assert np.ptp(points[0, ..., 2], axis=0).max() < 0.005
+
+
+def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
+    slippery = motions_of(response, *recording.solids, grip_friction=0.02)
+    points, _, _ = slippery.advance(robot, recording.positions, ROWS)
+    assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.way[0]) > 0.05
+
+
+def test_chunks_go_on_where_the_last_one_ended(robot, response, recording):
+    motions, half = motions_of(response, *recording.solids), 34 * ROWS
+    whole, _, _ = motions.advance(robot, recording.positions, ROWS)
+    first, _, then = motions.advance(robot, recording.positions[: half + 1], ROWS)
+    second, turned, _ = then.advance(robot, recording.positions[half:], ROWS)
+    np.testing.assert_allclose(first[0], whole[0, :35], atol=1e-4)
+    np.testing.assert_allclose(second[0, 0], first[0, -1], atol=1e-9)
+    assert np.linalg.norm(second[0, -1] - whole[0, -1], axis=-1).max() < 0.02
+    assert turned.shape[1] == second.shape[1]
+
+
+def test_arms_that_touch_nothing_go_as_they_are_expected_to(robot, response, recording):
+    """Nor does the table stop them in these one and a half seconds."""
+    commands = recording.positions[:76]
+    points, _, then = motions_of(response, AWAY).advance(robot, commands, ROWS)
+    assert np.abs(points[0] - AWAY.centre).max() < 0.001
+    expected = replace(response, floor=None).follow(robot, commands)[0][-1]
+    arms = then.states[0].positions[-1]
+    # both fingers and the joints are in an order of the engine: any of them may be the one
+    for value in expected:
+        assert np.abs(arms - value).min() < 0.002
+
+
+def test_motions_differ_within_the_errors_of_masks(robot, response):
+    motions = motions_of(response, AWAY, num_motions=4)
+    points, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    starts = points[:, 0, 0]
+    np.testing.assert_allclose(starts[0], AWAY.centre, atol=1e-9)
+    assert 0 < np.abs(starts[1:, :2] - AWAY.centre[:2]).max() < 0.006
+    assert len({size.tobytes() for size in motions.sizes[:, 0]}) == 4
+    again, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    np.testing.assert_array_equal(again, points)
+
+
+@pytest.mark.parametrize('is_round', [False, True])
+def test_what_is_wide_and_low_is_hollow(robot, response, is_round):
+    """A block that stands in it does not stand on it."""
+    dish = replace(
+        AWAY,
+        centre=AWAY.centre - [0, 0, 0.005],
+        size=np.array([0.15, 0.15, 0.04]),
+        is_round=is_round,
+    )
+    block = replace(AWAY, centre=AWAY.centre + [0, 0, 0.005], size=np.full(3, 0.03))
+    points, _, _ = motions_of(response, dish, block).advance(robot, still(robot, 1.0), ROWS)
+    assert points[0, -1, 1, 2] == pytest.approx(0.006 + 0.015, abs=0.003)
+    assert np.linalg.norm(points[0, -1, 1, :2] - AWAY.centre[:2]) < 0.01
+
+
+def test_an_object_that_was_not_seen_is_not_known(robot, response):
+    motions = motions_of(response, None, AWAY)
+    points, rotations, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    assert np.isnan(points[:, :, 0]).all() and np.isfinite(points[:, :, 1]).all()
+    assert np.isfinite(rotations).all()
+    assert np.isnan(motions.sizes[:, 0]).all() and np.isnan(motions.centres[0]).all()
+    motions = motions_of(response, None)
+    points, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    assert points.shape == (1, 3, 1, 3) and motions.sizes.shape == (1, 1, 3)
+
+
+def test_robots_of_which_contact_cannot_be_computed_are_named(robot, response):
+    light = replace(response, compliance=np.zeros_like(response.compliance))
+    with pytest.raises(RobotError, match="robot 'yam_bimanual' were found without inertias"):
+        check_robot(SETTINGS, robot, light)
+    bare = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    bare.file = None
+    with pytest.raises(RobotError, match='has no URDF'):
+        check_robot(SETTINGS, bare, response)
+
+
+def test_meshes_are_found_or_named(response, tmp_path):
+    source = share_path('config', 'robots')
+    for name in ('yam_bimanual.yaml', 'yam_bimanual.urdf'):
+        shutil.copy(source / name, tmp_path)
+    urdf = tmp_path / 'yam_bimanual.urdf'
+    before, rest = urdf.read_text().split('<collision>', 1)
+    shape = '<geometry><mesh filename="base.stl"/></geometry></collision>'
+    urdf.write_text(f'{before}<collision>{shape}{rest.split("</collision>", 1)[1]}')
+    robot = load_robot(tmp_path / 'yam_bimanual.yaml')
+    with pytest.raises(RobotError, match="mesh 'base.stl' is missing"):
+        check_robot(SETTINGS, robot, response)
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], np.float32)
+    faces = [
+        corners[list(face)].tobytes() for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+    ]
+    stl = bytes(80) + np.uint32(4).tobytes()
+    stl += b''.join(bytes(12) + face + bytes(2) for face in faces)
+    (tmp_path / 'base.stl').write_bytes(stl)
+    check_robot(SETTINGS, robot, response)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    copied = tmp_path / 'object_motion'
+    shutil.copytree(checkpoint_path('bundled') / 'object_motion', copied)
+    save_contact(SETTINGS.model_copy(update={'num_motions': 2}), copied)
+    return copied
+
+
+def test_a_checkpoint_foresees_by_both(folder, robot, recording):
+    model = load_predictor(folder, robot)
+    (folder / CONTACT_FILE).unlink()
+    alone = load_predictor(folder, robot)
+    frame = recording.frame
+    both, networks = (one.find(frame.masks, frame.cameras, frame.poses) for one in (model, alone))
+    moved, then = both.advance(recording.positions[:51])
+    few, _ = networks.advance(recording.positions[:51])
+    assert len(moved) == len(few) + 2 and len(both.sizes) == len(networks.sizes) + 2
+    np.testing.assert_array_equal(moved[0].points, few[0].points)
+    assert np.isfinite(np.stack([motion.points for motion in moved])).all()
+    on, _ = then.advance(recording.positions[50:101])
+    np.testing.assert_allclose(on[-1].points[0], moved[-1].points[-1], atol=1e-9)
+
+
+def test_a_bad_contact_file_is_named(folder, robot, monkeypatch):
+    file = folder / CONTACT_FILE
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps(values | {'density': -1}))
+    with pytest.raises(CheckpointError, match=r"contact.json': 'density' is -1"):
+        load_predictor(folder, robot)
+    file.write_text(json.dumps(values))
+    monkeypatch.setattr(predictor, 'find_spec', lambda name: None)
+    with pytest.raises(CheckpointError, match="run 'pip install dartpy scipy', or remove"):
+        load_predictor(folder, robot)
+    monkeypatch.undo()
+    (folder / 'arm_response.json').unlink()
+    with pytest.raises(CheckpointError, match="'arm_response.json' beside it is missing"):
+        load_predictor(folder, robot)

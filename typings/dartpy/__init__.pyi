@@ -1,0 +1,4 @@
+# Compiled without stubs.
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
