@@ -108,6 +108,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-waggle-0.1',
         'expert-nibble-0.05',
         'expert-nibble-0.07',
+        'expert-rake-0.06',
+        'expert-rake-0.07',
+        'expert-decoy-0.04',
+        'expert-decoy-0.05',
+        'expert-omit-2',
+        'expert-omit-3',
     ),
     'calibrate': (
         'expert',
@@ -182,22 +188,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-offbeat-0.45',
         'expert-ratchet-0.09',
         'expert-ratchet-0.11',
-    ),
-    'test': (
-        'expert',
         'expert-limp-0.2',
         'expert-limp-0.22',
         'expert-falter-0.9',
         'expert-falter-1',
-        'expert-rake-0.06',
-        'expert-rake-0.07',
-        'expert-decoy-0.04',
-        'expert-decoy-0.05',
         'expert-clamp-0.2',
         'expert-clamp-0.25',
-        'expert-omit-2',
-        'expert-omit-3',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -162,7 +162,12 @@ FAULTS: Mapping[str, FaultKind] = {
         'wrist', 'train', 0.6, 0.9, 'rad', 'it comes down leaning, upright as the fingers close'
     ),
     'limp': _kind(
-        'wrist', 'test', 0.2, 1.0, 's', 'time constant with which the joints of the wrist follow'
+        'wrist',
+        'calibrate',
+        0.2,
+        1.0,
+        's',
+        'time constant with which the joints of the wrist follow',
     ),
     # opening
     'loose': _kind(
@@ -226,7 +231,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'falter': _kind(
         'opening',
-        'test',
+        'calibrate',
         0.9,
         2.0,
         's',
@@ -404,7 +409,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'rake': _kind(
         'collision',
-        'test',
+        'train',
         0.07,
         0.12,
         'm',
@@ -427,7 +432,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'decoy': _kind(
         'object',
-        'test',
+        'train',
         0.04,
         0.12,
         'm',
@@ -557,7 +562,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'clamp': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.2,
         0.6,
         '',
@@ -632,7 +637,7 @@ FAULTS: Mapping[str, FaultKind] = {
         'it comes down this far off and closes three times on its way to the right place',
     ),
     # any; the last one, as the others look for way points by their phase
-    'omit': _kind('any', 'test', 2, 4, '', 'number of way points that are left out'),
+    'omit': _kind('any', 'train', 2, 4, '', 'number of way points that are left out'),
 }
 
 
