@@ -195,7 +195,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-clamp-0.2',
         'expert-clamp-0.25',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-fence-0.16',
+        'expert-fence-0.18',
+        'expert-leak-0.4',
+        'expert-leak-0.42',
+        'expert-jiggle-0.04',
+        'expert-jiggle-0.05',
+        'expert-hurl-5',
+        'expert-hurl-6',
+        'expert-tow-0.11',
+        'expert-tow-0.13',
+        'expert-jumble-1',
+        'expert-jumble-2',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

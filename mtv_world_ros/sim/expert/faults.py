@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.data_types import BoolArray, FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.sim.expert.glitches import Commands, crossed, with_glitches
@@ -155,6 +155,14 @@ FAULTS: Mapping[str, FaultKind] = {
     'askew': _kind(
         'lateral', 'calibrate', 0.12, 0.3, 'rad', 'all places are turned about where the arm rests'
     ),
+    'fence': _kind(
+        'lateral',
+        'test',
+        0.17,
+        0.6,
+        '',
+        'share that lacks of how far the arm reaches from where it rests; it stops there',
+    ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
     'lean': _kind('wrist', 'train', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
@@ -237,6 +245,14 @@ FAULTS: Mapping[str, FaultKind] = {
         's',
         'whenever a gripper opens or closes, it stands still half-way for this long',
     ),
+    'leak': _kind(
+        'opening',
+        'test',
+        0.4,
+        1.0,
+        '1/s',
+        'share of its range by which a shut gripper opens a second',
+    ),
     # release
     'drops': _kind(
         'release', 'train', 0.5, 1.0, '', 'share of the way to the goal that it is dropped before'
@@ -255,6 +271,14 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'blink': _kind(
         'release', 'calibrate', 0.2, 3.0, 's', 'the gripper opens and closes again, once lifted'
+    ),
+    'jiggle': _kind(
+        'release',
+        'test',
+        0.04,
+        0.1,
+        'm',
+        'having let go, it shakes its fingers to and fro, this far',
     ),
     # collision
     'push': _kind(
@@ -509,6 +533,9 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'once lifted, it waves what it holds to and fro, this far',
     ),
+    'hurl': _kind(
+        'speed', 'test', 5, 9.0, '', 'all is this share faster for as long as a gripper is shut'
+    ),
     # joint
     'zero': _kind(
         'joint',
@@ -567,6 +594,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.6,
         '',
         'share that lacks at both ends of the travel of one joint, which stops there',
+    ),
+    'tow': _kind(
+        'joint',
+        'test',
+        0.12,
+        0.5,
+        '',
+        'share of its motion by which every joint takes along the next one of its arm',
     ),
     # regrasp
     'retry': _kind(
@@ -635,6 +670,9 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'it comes down this far off and closes three times on its way to the right place',
+    ),
+    'jumble': _kind(
+        'any', 'test', 2, 4, '', 'number of way points that change places with the next one'
     ),
     # any; the last one, as the others look for way points by their phase
     'omit': _kind('any', 'train', 2, 4, '', 'number of way points that are left out'),
@@ -838,6 +876,9 @@ _OF_GRIPPERS = (
     'falter',
     'rake',
     'decoy',
+    'leak',
+    'jiggle',
+    'hurl',
 )
 #: joints of a wrist, the last ones of an arm
 _NUM_WRIST = 3
@@ -862,29 +903,16 @@ def with_faults(
     """
     _refuse(variant, robot)
     period = float(plan.times[1] - plan.times[0])
-    tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
-    grippers = [robot.joint_names.index(tool.gripper_joint or '') for tool in tools]
-    travel = np.array([tool.gripper_open - tool.gripper_closed for tool in tools])
-    opens = np.sign(travel)
+    grippers, (_, travel) = _grippers(robot), _strokes(robot)
     positions = _late(np.array(plan.positions), grippers, round(variant.size('late') / period))
     positions = _early(positions, grippers, round(variant.size('early') / period))
-    positions = _hang(positions, grippers, opens, round(variant.size('hang') / period))
+    positions = _hang(positions, grippers, np.sign(travel), round(variant.size('hang') / period))
     positions = _soft(positions, grippers, variant.size('soft') / period)
     positions = _limp(positions, grippers, len(robot.tools), variant.size('limp') / period)
-    closed = np.array([tool.gripper_closed for tool in tools])
-    if variant.size('twitch'):
-        jerks = closed + variant.size('twitch') * travel * _twitches(len(positions), period)
-        positions = _opened(positions, grippers, opens, jerks)
-    if variant.size('starve'):
-        haste = _haste(positions, grippers, len(robot.tools))
-        gives = closed + variant.size('starve') * travel * haste
-        positions = _opened(positions, grippers, opens, gives)
-    if variant.size('chatter'):
-        own, middles = _own(rng), closed + travel / 2
-        lasts = variant.size('chatter')
-        positions = _chatter(positions, grippers, middles, lasts, period, own)
-    num = round(variant.size('falter') / period)
-    positions = _falter(positions, grippers, closed + travel / 2, num, period)
+    positions = _opening_faults(positions, variant, robot, period, rng)
+    if variant.size('hurl'):
+        is_shut = robot.gripper_openings(positions).min(axis=0) < 0.5
+        positions = _hurl(positions, is_shut, variant.size('hurl'))
     if variant.size('stall'):
         share = _own(rng).uniform(0.15, 0.6)
         positions = _stall(
@@ -932,9 +960,51 @@ def _refuse(variant: PolicyVariant, robot: RobotModel) -> None:
         )
 
 
+def _grippers(robot: RobotModel) -> list[int]:
+    """Columns of the grippers."""
+    joints = [tool.gripper_joint for tool in robot.tools]
+    return [robot.joint_names.index(joint) for joint in joints if joint is not None]
+
+
+def _strokes(robot: RobotModel) -> tuple[FloatArray, FloatArray]:
+    """(G,) position of every gripper when shut, and its travel from there to open."""
+    tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
+    closed = np.array([tool.gripper_closed for tool in tools])
+    return closed, np.array([tool.gripper_open for tool in tools]) - closed
+
+
 def _own(rng: np.random.Generator) -> np.random.Generator:
     """A fault's own generator: whatever it draws, those after it draw the same."""
     return np.random.default_rng(rng.integers(2**32))
+
+
+def _opening_faults(
+    positions: FloatArray,
+    variant: PolicyVariant,
+    robot: RobotModel,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): grippers that jerk, give way, flicker, stand still or open slowly."""
+    grippers, (closed, travel) = _grippers(robot), _strokes(robot)
+    opens, middles = np.sign(travel), closed + travel / 2
+    if variant.size('twitch'):
+        jerks = closed + variant.size('twitch') * travel * _twitches(len(positions), period)
+        positions = _opened(positions, grippers, opens, jerks)
+    if variant.size('starve'):
+        haste = _haste(positions, grippers, len(robot.tools))
+        gives = closed + variant.size('starve') * travel * haste
+        positions = _opened(positions, grippers, opens, gives)
+    if variant.size('chatter'):
+        own, lasts = _own(rng), variant.size('chatter')
+        positions = _chatter(positions, grippers, middles, lasts, period, own)
+    num = round(variant.size('falter') / period)
+    positions = _falter(positions, grippers, middles, num, period)
+    if variant.size('leak'):
+        since = _shut_since(positions, grippers, middles, opens) * period
+        leaks = closed + np.minimum(variant.size('leak') * since, 1.0) * travel
+        positions = _opened(positions, grippers, opens, leaks)
+    return positions
 
 
 def _controller_faults(
@@ -969,13 +1039,13 @@ def _controller_faults(
         own = _own(rng)
         positions = _freeze(positions, round(variant.size('freeze') / period), own)
     if variant.size('glitch'):
-        tools = [tool for tool in robot.tools if tool.gripper_joint is not None]
+        closed, travel = _strokes(robot)
         commands = Commands(
             positions=positions,
             period=period,
             grippers=grippers,
-            closed=np.array([tool.gripper_closed for tool in tools]),
-            travel=np.array([tool.gripper_open - tool.gripper_closed for tool in tools]),
+            closed=closed,
+            travel=travel,
             num_arms=len(robot.tools),
         )
         own = _own(rng)
@@ -1017,7 +1087,7 @@ def _one_joint(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): one joint moves less than the others, not so far or not at all; or all lose way."""
+    """(T, J): one joint moves less than the others, or not at all; or all lose way or add some."""
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -1027,6 +1097,10 @@ def _one_joint(
     if variant.size('clamp'):
         own = _own(rng)
         positions = _clamp(positions, grippers, variant.size('clamp'), own)
+    if variant.size('tow'):
+        own = _own(rng)
+        positions = _tow(positions, grippers, len(robot.tools), variant.size('tow'), own)
+        positions = np.clip(positions, robot.lower, robot.upper)
     if variant.size('ratchet'):
         own = _own(rng)
         positions = _ratchet(positions, grippers, variant.size('ratchet'), own)
@@ -1152,6 +1226,23 @@ def _falter(
             blend = np.minimum(after * period / _JUMP_S, 1.0)
             whole[change:, column] = middle + blend * (own[change:] - middle)
     return whole
+
+
+def _shut_since(
+    positions: FloatArray, grippers: list[int], middles: FloatArray, opens: FloatArray
+) -> FloatArray:
+    """(T, G): for how many samples a gripper has been more shut than open."""
+    rows = np.arange(len(positions), dtype=np.float64)[:, None]
+    is_open = (positions[:, grippers] - middles) * opens > 0
+    return rows - np.maximum.accumulate(np.where(is_open, rows, 0))
+
+
+def _hurl(positions: FloatArray, is_shut: BoolArray, more: float) -> FloatArray:
+    """(T', J): while a gripper is shut, all goes faster, by a share."""
+    rows = np.arange(len(positions))
+    times = np.cumsum(np.where(is_shut, 1 / (1 + more), 1.0)) - 1
+    at = np.interp(np.arange(int(times[-1]) + 1), times, rows)
+    return np.stack([np.interp(at, rows, column) for column in positions.T], axis=1)
 
 
 def _stall(positions: FloatArray, grippers: list[int], share: float, num: int) -> FloatArray:
@@ -1430,6 +1521,20 @@ def _clamp(
     way = whole[:, joint] - whole[0, joint]
     least, most = (1 - lacking) * way.min(), (1 - lacking) * way.max()
     whole[:, joint] = whole[0, joint] + np.clip(way, least, most)
+    return whole
+
+
+def _tow(
+    positions: FloatArray,
+    grippers: list[int],
+    num_arms: int,
+    share: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): a joint takes the next one of its arm along, by a share, to a side that is drawn."""
+    whole, ways = positions.copy(), share * (positions - positions[0])
+    for arm in np.delete(np.arange(positions.shape[1]), grippers).reshape(num_arms, -1):
+        whole[:, arm[1:]] += ways[:, arm[:-1]] * rng.choice((-1.0, 1.0), len(arm) - 1)
     return whole
 
 

@@ -58,6 +58,8 @@ _KEEP_TEMPO = frozenset(
         'rake',
         'decoy',
         'omit',
+        'jiggle',
+        'jumble',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -78,8 +80,8 @@ _TINKER_DEPTH_M, _TINKER_OTHER = 0.025, 0.2
 _MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
 #: how deep what is held is pressed on the table as it is dragged [m]
 _DRAG_DEPTH_M = 0.02
-#: how deep what is held is pressed on its goal as it is rubbed there [m]; time of a stroke [s]
-_GRIND_DEPTH_M, _GRIND_S = 0.008, 0.4
+#: what is held is rubbed on its goal: how deep it is pressed [m], how often, time of a stroke [s]
+_GRIND_DEPTH_M, _NUM_GRINDS, _GRIND_S = 0.008, 2, 0.4
 #: what it is put down on is at most this far from its goal, and from where its arm rests, or this
 #: much farther from there than its goal; how far it rises there [m]
 _PERCH_GOAL_M, _PERCH_ARM_M, _PERCH_MORE_M, _PERCH_RISE_M = 0.2, 0.27, 0.03, 0.05
@@ -91,6 +93,8 @@ _NUM_WAGGLES, _WAGGLE_S = 4, 0.2
 _NUM_NIBBLES = 3
 #: another object that it takes first is at most this far from where its arm rests [m]
 _DECOY_ARM_M = 0.27
+#: having let go, it shakes its fingers: how often, and time of a stroke [s]
+_NUM_JIGGLES, _JIGGLE_S = 3, 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -734,8 +738,7 @@ def _grind(stops: Stops, size: float, side: _Side) -> Stops:
     """
     opened, way = _first(stops, 'open'), size * _drawn_way(side)
     pressed = replace(stops[opened - 1], seconds=_GRIND_S).moved(_up(-_GRIND_DEPTH_M))
-    strokes = [pressed.moved(to * way) for to in (1, -1, 1, -1, 0)]
-    return [*stops[:opened], pressed, *strokes, *stops[opened:]]
+    return [*stops[:opened], pressed, *_to_and_fro(pressed, way, _NUM_GRINDS), *stops[opened:]]
 
 
 def _perch(stops: Stops, size: float, side: _Side) -> Stops:
@@ -801,8 +804,7 @@ def _waggle(stops: Stops, size: float, side: _Side) -> Stops:
     """
     lift, way = _first(stops, 'lift'), size * _drawn_way(side)
     lifted = replace(stops[lift], phase='carry', seconds=_WAGGLE_S)
-    strokes = [lifted.moved(to * way) for to in (1, -1) * _NUM_WAGGLES]
-    return [*stops[: lift + 1], *strokes, lifted, *stops[lift + 1 :]]
+    return [*stops[: lift + 1], *_to_and_fro(lifted, way, _NUM_WAGGLES), *stops[lift + 1 :]]
 
 
 def _nibble(stops: Stops, size: float, side: _Side) -> Stops:
@@ -868,6 +870,41 @@ def _omit(stops: Stops, size: float, side: _Side) -> Stops:
             after = replace(after, phase=left_out.phase)
         stops = [*stops[:number], after, *stops[number + 2 :]]
     return stops
+
+
+def _fence(stops: Stops, size: float, side: _Side) -> Stops:
+    """What is farthest from where the arm rests is out of reach, and it stops before."""
+    home = stops[-1].position
+    ways = [(stop.position - home) * (1, 1, 0) for stop in stops]
+    most = (1 - size) * max(map(np.linalg.norm, ways))
+    short = [max(1 - most / max(float(np.linalg.norm(way)), most), 0.0) * way for way in ways]
+    return [stop.moved(-lacks) for stop, lacks in zip(stops, short, strict=True)]
+
+
+def _jiggle(stops: Stops, size: float, side: _Side) -> Stops:
+    """Having let go, it shakes its fingers to and fro, as if something stuck to them.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    end, way = _first(stops, 'open') + 1, size * _drawn_way(side)
+    opened = replace(stops[end - 1], phase='retreat', seconds=_JIGGLE_S)
+    return [*stops[:end], *_to_and_fro(opened, way, _NUM_JIGGLES), *stops[end:]]
+
+
+def _jumble(stops: Stops, size: float, side: _Side) -> Stops:
+    """Way points change places with the next one, so that it does the later thing first.
+
+    Others, drawn anew, where the arm does not reach the way between.
+    """
+    stops = [*stops]
+    for number in map(int, side.play.permutation(len(stops) - 2)[: round(size)]):
+        stops[number : number + 2] = stops[number + 1], stops[number]
+    return stops
+
+
+def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
+    """From a way point to either side of it, `num` times, and back to it."""
+    return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
 
 
 def _drawn_way(side: _Side) -> FloatArray:
@@ -940,4 +977,7 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'rake': _rake,
     'decoy': _decoy,
     'omit': _omit,
+    'fence': _fence,
+    'jiggle': _jiggle,
+    'jumble': _jumble,
 }

@@ -228,6 +228,9 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'falter',
         'rake',
         'decoy',
+        'leak',
+        'jiggle',
+        'hurl',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -338,6 +341,7 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
         ('tidy', 0.8, 60),
         ('grind', 0.6, 80),
         ('waggle', 0.3, 80),
+        ('jiggle', 0.6, 40),
     ],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
@@ -749,6 +753,103 @@ def test_one_joint_stops_before_the_ends_of_its_travel(expert):
     np.testing.assert_allclose(short[own > ends[1]], ends[1])
 
 
+def test_an_arm_stops_before_what_is_farthest_away():
+    stops, changed = changed_stops('expert-fence-0.2')
+    home = stops[-1].position
+    # 0.28 m from where it rests to the object, 0.2 m to the goal
+    most = 0.8 * np.hypot(0.2, 0.2)
+    for stop, short in zip(stops[:4], changed[:4], strict=True):
+        ways = [(point.position - home)[:2] for point in (stop, short)]
+        np.testing.assert_allclose(ways[1], most * ways[0] / np.linalg.norm(ways[0]))
+        assert short.position[2] == stop.position[2] and short.opening == stop.opening
+    for stop, same in zip(stops[4:], changed[4:], strict=True):
+        np.testing.assert_array_equal(same.position, stop.position)
+
+
+def test_a_gripper_that_is_shut_opens_slowly(expert):
+    expert_plan, leak = plan(expert, 'expert'), plan(expert, 'expert-leak-0.2')
+    arms = arm_columns(expert)
+    np.testing.assert_array_equal(leak[:, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, leak)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
+    own, leaks = openings[0][used], openings[1][used]
+    shut = np.flatnonzero(own < 0.5)
+    assert np.ptp(shut) == len(shut) - 1
+    seconds = (np.arange(len(shut)) + 1) / 50
+    np.testing.assert_allclose(leaks[shut], np.maximum(own[shut], 0.2 * seconds), atol=1e-9)
+    assert leaks[shut].max() > 0.4
+    np.testing.assert_array_equal(np.delete(leaks, shut), np.delete(own, shut))
+
+
+def test_fingers_that_have_let_go_are_shaken_where_they_are():
+    stops, changed = changed_stops('expert-jiggle-0.03')
+    assert changed[:7] == stops[:7] and changed[14:] == stops[7:] and len(changed) == 16
+    assert all(stop.opening == stops[6].opening for stop in changed[7:14])
+    ways = np.array([stop.position - stops[6].position for stop in changed[7:14]])
+    assert np.linalg.norm(ways[0]) == pytest.approx(0.03) and ways[0, 2] == 0
+    wanted = np.outer([1, -1, 1, -1, 1, -1, 0], ways[0])
+    np.testing.assert_allclose(ways, wanted, atol=1e-12)
+
+
+def test_all_is_faster_while_a_gripper_is_shut(expert):
+    expert_plan, hurl = plan(expert, 'expert'), plan(expert, 'expert-hurl-3')
+    shut = [expert.robot.gripper_openings(p).min(axis=0) < 0.5 for p in (expert_plan, hurl)]
+    nums = [int(is_shut.sum()) for is_shut in shut]
+    assert nums[0] > 80 and nums[1] == pytest.approx(nums[0] / 4, abs=2)
+    first, last = np.flatnonzero(shut[0])[[0, -1]]
+    np.testing.assert_array_equal(hurl[:first], expert_plan[:first])
+    # every fourth command is carried out
+    rows = np.arange(first, last, 4)[1:]
+    np.testing.assert_allclose(hurl[first : first + len(rows)], expert_plan[rows - 1], atol=0.02)
+    after = len(expert_plan) - last - 2
+    np.testing.assert_allclose(hurl[-after:], expert_plan[-after:], atol=0.02)
+
+
+def test_joints_take_the_next_one_of_their_arm_along(expert):
+    expert_plan, tow = plan(expert, 'expert'), plan(expert, 'expert-tow-0.1')
+    arms = np.array(arm_columns(expert)).reshape(2, -1)
+    grippers = np.setdiff1d(np.arange(expert_plan.shape[1]), arms)
+    ways, errors = expert_plan - expert_plan[0], tow - expert_plan
+    np.testing.assert_array_equal(errors[:, grippers], 0.0)
+    np.testing.assert_array_equal(errors[:, arms[:, 0]], 0.0)
+    sides = set()
+    for arm in arms:
+        for joint, towed in pairwise(arm):
+            side = np.sign(ways[:, joint] @ errors[:, towed])
+            np.testing.assert_allclose(errors[:, towed], side * 0.1 * ways[:, joint], atol=1e-9)
+            sides.add(int(side))
+    # to none where a joint rests
+    assert sides == {-1, 0, 1}
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_way_points_change_places_with_the_next_one(seed):
+    stops, _ = changed_stops('expert')
+    before = stops
+    for size in range(1, 5):
+        name = parse_variant(f'expert-jumble-{size}')
+        changed = WayPointFaults(name, np.random.default_rng(seed)).applied(stops, 0.0, [])
+        # a larger size does what a smaller one does, and one exchange more
+        moved = [
+            k for k, pair in enumerate(zip(before, changed, strict=True)) if pair[0] != pair[1]
+        ]
+        first, second = moved
+        assert second == first + 1 < len(stops) - 1
+        assert (changed[first], changed[second]) == (before[second], before[first])
+        before = changed
+
+
+def test_any_two_way_points_but_the_last_may_change_places():
+    stops, _ = changed_stops('expert')
+    firsts = set()
+    for seed in range(60):
+        faults = WayPointFaults(parse_variant('expert-jumble-1'), np.random.default_rng(seed))
+        changed = faults.applied(stops, 0.0, [])
+        firsts.add(next(k for k, stop in enumerate(stops) if stop != changed[k]))
+    assert firsts == set(range(len(stops) - 2))
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06), ('decoy', 0.05)],
@@ -935,6 +1036,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'decoy',
         'clamp',
         'omit',
+        'fence',
+        'leak',
+        'jiggle',
+        'hurl',
+        'tow',
+        'jumble',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1041,9 +1148,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-decoy-0.03' has decoy"
+    said = r"split test are not for training: 'expert-high-0.1-jiggle-0.03' has jiggle"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-decoy-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-jiggle-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
