@@ -28,7 +28,6 @@ from mtv_world_ros.model.object_motion.predictor import load_network, load_predi
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
-from mtv_world_ros.sim.expert.faults import kinds_of
 from mtv_world_ros.sim.world.opengl import missing_opengl
 from mtv_world_ros.training.object_motion import motion_training, windows
 from mtv_world_ros.training.object_motion.motion_training import (
@@ -64,7 +63,8 @@ def episodes(tmp_path_factory) -> list[Path]:
     if reason := missing_opengl():
         pytest.skip(reason)
     out = tmp_path_factory.mktemp('first_pictures')
-    config = CollectConfig(kinds=kinds_of('train'), record=RecordConfig(pictures='first'))
+    policies = ('expert-noise-0.107', 'expert-stop-0.925')
+    config = CollectConfig(policies=policies, record=RecordConfig(pictures='first'))
     collect('stack_blocks_two', 2, 5, out, config=config, progress=False)
     return sorted(path.parent for path in out.rglob('metadata.yaml'))
 
