@@ -5,8 +5,8 @@
 
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
 checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
-first has `contact.json`. `share` is how many motions succeed; half or more is a success. Beside it stands the rule that imagines nothing: an
-object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
+first has `contact.json`. `share` is how many motions succeed; half or more is a success. Beside it
+stands the rule that imagines nothing: an object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
 Wilson of shares, jackknife of AUROC, bootstrap of differences, over episodes. What is chosen by
 this must not be measured by it: kinds of the split `test` are refused. With `--recorded-arms` the
 networks and the rule are told where the arms really went, which nobody knows ahead: what that costs.
@@ -38,6 +38,7 @@ from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.predictor import (
     load_predictor,
     ObjectMotionPredictor,
+    TrackedObjects,
 )
 from mtv_world_ros.ranking.no_picture_rule import is_done, Thing
 from mtv_world_ros.ranking.optimism import area_interval
@@ -130,29 +131,32 @@ def read_plan(path: Path, robot: RobotModel, recorded_arms: bool = False) -> Pla
     )
 
 
-def share_foreseen(plan: Plan, predictor: ObjectMotionPredictor) -> float | None:
+def found_by(plan: Plan, predictor: ObjectMotionPredictor) -> TrackedObjects:
+    """Returns the objects of a plan's first frame."""
+    return predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
+
+
+def share_foreseen(plan: Plan, tracked: TrackedObjects) -> float | None:
     """Returns which share of the motions of a plan succeeds; None = they do not tell."""
-    tracked = predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
     motions, _ = tracked.advance(plan.positions)
     foreseen = ForeseenMotions(
         names=plan.names,
         points=np.stack([motion.points for motion in motions]),
         rotations=np.stack([motion.rotations for motion in motions]),
         sizes=tracked.sizes,
-        openings=predictor.robot.gripper_openings(plan.positions[:: tracked.commands_a_step]),
+        openings=tracked.model.robot.gripper_openings(plan.positions[:: tracked.commands_a_step]),
     )
     succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
     return None if succeeded is None else float(np.mean(succeeded))
 
 
-def ruled(plan: Plan, predictor: ObjectMotionPredictor) -> float:
+def ruled(plan: Plan, tracked: TrackedObjects) -> float:
     """Returns whether a plan succeeds by the rule, which is given the same places and sizes."""
-    tracked = predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
     things = {
         name: Thing(name=name, centre=centre, size=size)
         for name, centre, size in zip(plan.names, tracked.reference, tracked.sizes[0], strict=True)
     }
-    return float(is_done(plan.task, plan.bound, things, predictor.robot, plan.positions))
+    return float(is_done(plan.task, plan.bound, things, tracked.model.robot, plan.positions))
 
 
 def judged(
@@ -172,9 +176,10 @@ def judged(
     plan = read_plan(path, first.robot, recorded_arms)
     if plan is None:
         return None
-    said = [share_foreseen(plan, predictor) for predictor in _LOADED.values()]
+    found = [found_by(plan, predictor) for predictor in _LOADED.values()]
+    said = [share_foreseen(plan, tracked) for tracked in found]
     known = [share for share in said if share is not None]
-    return (plan.success, [ruled(plan, first), *known]) if len(known) == len(said) else None
+    return (plan.success, [ruled(plan, found[0]), *known]) if len(known) == len(said) else None
 
 
 #: in a worker: the networks by their names

@@ -24,8 +24,12 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
+from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
+
 #: between two steps [s]
 STEP_S = 0.1
+#: commands in a step: what is quick counts as well
+COMMANDS_A_STEP = round(STEP_S / PERIOD_S)
 _SCALE = 20.0  # 1 / 5 cm: lengths enter in this unit
 _NEAR = 100.0  # 1 / 1 cm: clearances enter in this unit, cut off at 3
 #: further than anything [m]

@@ -28,10 +28,10 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import (
     ArmResponse,
     ArmState,
-    PERIOD_S,
 )
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.network import (
+    COMMANDS_A_STEP,
     Memory,
     ObjectMotionNetwork,
     Scene,
@@ -201,7 +201,7 @@ class TrackedObjects:
     @property
     def commands_a_step(self) -> int:
         """How many joint positions `advance` takes a step: what is quick counts as well."""
-        return round(STEP_S / PERIOD_S)
+        return COMMANDS_A_STEP
 
     @property
     def sizes(self) -> FloatArray:

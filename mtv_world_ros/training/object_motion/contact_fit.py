@@ -14,24 +14,24 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.solids import fit_solid, Solid
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.network import STEP_S
+from mtv_world_ros.model.object_motion.network import COMMANDS_A_STEP
 from mtv_world_ros.model.object_motion.rigid_bodies import finger_travels
 from mtv_world_ros.parallel import run_all
 from mtv_world_ros.training.object_motion.tracks import (
     fine_commands,
     first_frame,
     FirstFrame,
+    read_each,
     tracks_of,
 )
 
@@ -47,7 +47,6 @@ _FITTED = (
 _FACTORS = (1.6, 1.3, 1.15)
 #: errors below the first are as good, above the second as bad [m]
 _LEAST_M, _MOST_M = 0.003, 0.1
-_STEPS = round(STEP_S / PERIOD_S)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +71,7 @@ class ContactRecording:
         """Returns (O,) how far objects end from where they ended [m], NaN = not known."""
         alone = settings.model_copy(update={'num_motions': 1})
         motions = ContactMotions(settings=alone, response=response, solids=self.solids)
-        points = motions.advance(robot, self.positions, _STEPS)[0][0]
+        points = motions.advance(robot, self.positions, COMMANDS_A_STEP)[0][0]
         return np.linalg.norm(points[-1] - points[0] - self.way, axis=-1)
 
 
@@ -101,13 +100,7 @@ def read_recordings(
     paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
 ) -> tuple[list[ContactRecording], dict[str, str]]:
     """Returns what episodes say about contact, and why others say nothing, by path."""
-    recordings, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep'):
-        try:
-            recordings.append(read_contact(path, robot, views))
-        except MtvWorldError as error:
-            skipped[str(path)] = str(error)
-    return recordings, skipped
+    return read_each(paths, lambda path: read_contact(path, robot, views))
 
 
 def first_settings(robot: RobotModel, response: ArmResponse) -> ContactSettings:

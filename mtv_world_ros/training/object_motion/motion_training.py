@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch.optim import _muon
 from tqdm import tqdm
 
-from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
@@ -34,7 +34,7 @@ from mtv_world_ros.model.object_motion.network import (
     Truth,
 )
 from mtv_world_ros.model.object_motion.predictor import num_features, save_network
-from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks
+from mtv_world_ros.training.object_motion.tracks import object_tracks, ObjectTracks, read_each
 from mtv_world_ros.training.object_motion.windows import Batch, pools_of, TrackPool
 
 _EMA_DECAY = 0.999
@@ -115,12 +115,9 @@ def read_tracks(
     Raises:
         TrainingError: none can.
     """
-    tracks, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep'):
-        try:
-            tracks.append(object_tracks(path, robot, views, num_starts, response))
-        except MtvWorldError as error:
-            skipped[str(path)] = str(error)
+    tracks, skipped = read_each(
+        paths, lambda path: object_tracks(path, robot, views, num_starts, response)
+    )
     if not tracks:
         raise TrainingError(
             f'no episode can be trained on; the first: {next(iter(skipped.items()))}'

@@ -5,27 +5,28 @@ T steps, O objects, A tools, V views.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from tqdm import tqdm
 
 from mtv_world_ros.data.episode import Episode, JointStates, Track
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_shape import object_shapes
 from mtv_world_ros.geometry.resample import nearest_rows, resample
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.network import STEP_S
+from mtv_world_ros.model.object_motion.network import COMMANDS_A_STEP, STEP_S
 
-#: commands in a step of the network
-_EVERY = round(STEP_S / PERIOD_S)
+Read = TypeVar('Read')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +77,19 @@ class ObjectTracks:
     scene: str = ''
 
 
+def read_each(
+    paths: Sequence[Path], read: Callable[[Path], Read]
+) -> tuple[list[Read], dict[str, str]]:
+    """Returns what is read of each episode, and why others cannot be used, by path."""
+    found, skipped = [], {}
+    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+        try:
+            found.append(read(path))
+        except MtvWorldError as error:
+            skipped[str(path)] = str(error)
+    return found, skipped
+
+
 def object_tracks(
     path: Path,
     robot: RobotModel,
@@ -117,9 +131,9 @@ def tracks_of(
     masks = {view: episode.masks[view] for view in views}
     stamps = masks[views[0]].stamps_ns
     times, positions = fine_commands(episode, robot, views)
-    count, every = (len(times) - 1) // _EVERY, _EVERY
+    count = (len(times) - 1) // COMMANDS_A_STEP
     expected = positions if response is None else response.follow(robot, positions)[0]
-    times, positions, expected = (rows[::every] for rows in (times, positions, expected))
+    times, positions, expected = (rows[::COMMANDS_A_STEP] for rows in (times, positions, expected))
     stamps_ns = stamps[0] + times * 1e9
     recorded = recorded_positions(states, robot, stamps_ns)
     cameras = [episode.cameras[view] for view in views]
@@ -170,7 +184,7 @@ def fine_commands(
     assert episode.masks is not None and episode.joint_states is not None
     stamp = int(episode.masks[views[0]].stamps_ns[0])
     count = int(_last_ns(episode, views[0]) / 1e9 / STEP_S + 1e-6)
-    times = np.arange(count * _EVERY + 1, dtype=np.float64) * PERIOD_S
+    times = np.arange(count * COMMANDS_A_STEP + 1, dtype=np.float64) * PERIOD_S
     columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
     first = episode.joint_states.positions[0][columns]
     return times, resample(stitched_commands(episode, robot, stamp), first, times)
