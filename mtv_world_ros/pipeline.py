@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
 from types import MappingProxyType
@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from mtv_world_ros.data_types import (
+    BoolArray,
     ByteArray,
     CameraModel,
     FloatArray,
@@ -24,7 +25,11 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.geometry.camera import camera_poses, tools_in_view
-from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
+from mtv_world_ros.geometry.object_motion import (
+    FoundObjects,
+    ObjectMotionModel,
+    TrackedObjects,
+)
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
@@ -36,7 +41,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 from mtv_world_ros.rollout_state import ChunkPlan, RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
-from mtv_world_ros.success.foreseen import foreseen_of
+from mtv_world_ros.success.foreseen import foreseen_of, ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -270,14 +275,15 @@ class ImaginedEpisode:
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
-        for plan in self._plan_chunks(trajectory):
-            if plan.chunk and self.should_stop():
-                raise RolloutPreempted('stopped between two chunks')
+        plans = self._plan_chunks(trajectory)
+        for plan in plans:
+            if plan.chunk:
+                self._check_stop()
             # rollouts of further seeds branch off from the first one
             states = (self._rollouts + self._rollouts[:1] * self.num_seeds)[: self.num_seeds]
             seeds = (self.seed + self.num_chunks + SEED_STEP * r for r in range(self.num_seeds))
             made = [
-                self._imagine_chunk(state, plan, seed)
+                self._imagine_chunk(state, plans[plan.chunk :], seed)
                 for state, seed in zip(states, seeds, strict=True)
             ]
             self._rollouts = tuple(state for _, state in made)
@@ -302,7 +308,7 @@ class ImaginedEpisode:
         frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
         start_masks = self._find_start_masks(state)
         masks = self._follow_masks(state, start_masks, frames)
-        success, memory = self._judge(state, positions, start_masks, masks)
+        success, memory = self._judge(state, positions, start_masks, masks, is_real=True)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
         state = state.after(frames, positions[-1], stamp_ns, spec.num_history, memory)
         last = replace(state.observation, cameras=cameras or state.observation.cameras)
@@ -345,16 +351,27 @@ class ImaginedEpisode:
             for chunk, first in enumerate(range(0, total, spec.num_frames))
         ]
 
+    def _check_stop(self) -> None:
+        if self.should_stop():
+            raise RolloutPreempted('stopped between two chunks')
+
     def _imagine_chunk(
-        self, state: RolloutState, plan: ChunkPlan, seed: int
+        self, state: RolloutState, plans: Sequence[ChunkPlan], seed: int
     ) -> tuple[Prediction, RolloutState]:
-        """One chunk of one rollout, stage by stage, and where the rollout stands then."""
+        """One chunk of one rollout, stage by stage, and where the rollout stands then.
+
+        Args:
+            state: where it stands.
+            plans: what is left of the trajectory, the chunk first.
+            seed: of the noise.
+        """
+        plan = plans[0]
         pipeline, start, clock = self.pipeline, state.observation, StageClock()
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
         shown = [tools_in_view(c, pipeline.robot, plan.positions) for c in start.cameras]
         start_masks = self._find_start_masks(state)
         clock.lap('start masks')
-        pictures, objects = self._move_objects(state, plan, start_masks)
+        pictures, ahead = self._move_objects(state, plans, start_masks)
         clock.lap('object motion')
         control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks, pictures)
         clock.lap('trajectory video')
@@ -371,14 +388,14 @@ class ImaginedEpisode:
         masks = self._follow_masks(state, start_masks, frames)
         clock.lap('masks')
         positions = plan.positions[: plan.num_frames + 1]
-        success, memory = self._judge(state, positions, start_masks, masks, objects)
+        success, memory = self._judge(state, positions, start_masks, masks, *ahead[:1])
         if not any(shown):
             success = replace(success, reasons=(*success.reasons, _UNSEEN))
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
         state = state.after(
-            frames, positions[-1], stamp_ns, pipeline.spec.num_history, memory, objects
+            frames, positions[-1], stamp_ns, pipeline.spec.num_history, memory, ahead
         )
         prediction = Prediction(
             start=start,
@@ -402,37 +419,52 @@ class ImaginedEpisode:
         return prediction, state
 
     def _move_objects(
-        self, state: RolloutState, plan: ChunkPlan, start_masks: ObjectMasks
-    ) -> tuple[ByteArray | None, FoundObjects | None]:
-        """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after it.
+        self, state: RolloutState, plans: Sequence[ChunkPlan], start_masks: ObjectMasks
+    ) -> tuple[ByteArray | None, tuple[FoundObjects, ...]]:
+        """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after a plan.
 
-        None where the model is not shown them.
+        None where the model is not shown them. The objects are those after each of the `plans`.
         """
-        pipeline = self.pipeline
+        pipeline, plan = self.pipeline, plans[0]
         if pipeline.object_motion is None or not pipeline.rendering.object_motion:
-            return None, None
+            return None, ()
         poses = self._camera_poses(plan.positions)
-        objects = state.objects
-        if objects is None or objects.names != self.names:
-            # at its own size the real frame shows better where they are; where the names have
-            # changed only an imagined frame shows where they are now
-            source = state.source if objects is None else state.observation
-            sharp = pipeline.segmenter.segment(source.frames[:, None], self.names)
-            found = pipeline.object_motion.find(
-                sharp.masks[:, :, 0], source.cameras, list(poses[:, 0])
-            )
-            objects = FoundObjects(
-                names=self.names,
-                frames=state.observation.frames,
-                masks=start_masks.masks[:, :, 0],
-                poses=poses[:, 0],
-                tracked=found,
-            )
-        return objects.move(
-            plan.fine_positions(objects.tracked.step_s, objects.tracked.commands_a_step),
-            plan.times - plan.times[0],
-            state.observation.cameras,
-            poses,
+        ahead = state.ahead
+        if plan.chunk == 0 or not ahead or ahead[0].names != self.names:
+            objects = state.objects
+            if objects is None or objects.names != self.names:
+                objects = self._find_objects(state, poses[:, 0], start_masks)
+            ahead = objects.foresee(self._commands(plans, objects.tracked))
+            shown = objects.most_like(ahead[-1], self._believed(state, plans[-1], ahead[-1]))
+            ahead = tuple(replace(part, shown=shown) for part in ahead)
+        times = plan.times - plan.times[0]
+        return ahead[0].pictures(times, state.observation.cameras, poses), ahead
+
+    def _commands(
+        self, plans: Sequence[ChunkPlan], objects: TrackedObjects
+    ) -> Iterator[FloatArray]:
+        """The joints of plans, as finely as objects are tracked."""
+        for number, plan in enumerate(plans):
+            if number:
+                self._check_stop()
+            yield plan.fine_positions(objects.step_s, objects.commands_a_step)
+
+    def _find_objects(
+        self, state: RolloutState, poses: FloatArray, start_masks: ObjectMasks
+    ) -> FoundObjects:
+        """The named objects where the rollout stands, seen from poses (V, 4, 4)."""
+        pipeline = self.pipeline
+        # at its own size the real frame shows better where they are; where the names have
+        # changed only an imagined frame shows where they are now
+        source = state.source if state.objects is None else state.observation
+        sharp = pipeline.segmenter.segment(source.frames[:, None], self.names)
+        assert pipeline.object_motion is not None
+        return FoundObjects(
+            names=self.names,
+            frames=state.observation.frames,
+            masks=start_masks.masks[:, :, 0],
+            poses=poses,
+            tracked=pipeline.object_motion.find(sharp.masks[:, :, 0], source.cameras, list(poses)),
         )
 
     def _camera_poses(self, positions: FloatArray) -> FloatArray:
@@ -462,20 +494,46 @@ class ImaginedEpisode:
         start_masks: ObjectMasks,
         masks: ObjectMasks,
         objects: FoundObjects | None = None,
+        *,
+        is_real: bool = False,
     ) -> Judged:
         """The estimate after a chunk with joints at (1 + T, J), and what it remembers.
 
-        `objects` are those at the end of the whole chunk, of which T frames may be left.
+        `objects` are those at the end of the whole chunk, of which T frames may be left; of real
+        frames there are none.
         """
         pipeline = self.pipeline
         footage = footage_of(
             pipeline.robot, state.observation.cameras, positions, start_masks, masks
         )
-        foreseen = None
+        num_left = pipeline.spec.num_frames - footage.num_frames
+        foreseen = self._foreseen(state, objects, num_left)
+        return pipeline.estimator.estimate(
+            footage, self.instruction, state.memory, foreseen, is_real=is_real
+        )
+
+    def _foreseen(
+        self, state: RolloutState, objects: FoundObjects | None, num_left: int
+    ) -> ForeseenMotions | None:
+        """Motions until the end of a chunk without its last frames; None = they do not count."""
         # where the rollout began earlier, objects were found half hidden, or off the table
         begun = state.memory is None or state.memory.num_frames == 1 + state.num_imagined
-        if begun and objects is not None and objects.positions is not None:
-            left_s = (pipeline.spec.num_frames - footage.num_frames) / pipeline.spec.fps
-            num = len(objects.positions) - round(left_s / objects.tracked.step_s)
-            foreseen = foreseen_of(pipeline.robot, objects, num)
-        return pipeline.estimator.estimate(footage, self.instruction, state.memory, foreseen)
+        if not begun or objects is None or objects.positions is None:
+            return None
+        left_s = num_left / self.pipeline.spec.fps
+        num = len(objects.positions) - round(left_s / objects.tracked.step_s)
+        return foreseen_of(self.pipeline.robot, objects, num)
+
+    def _believed(
+        self, state: RolloutState, plan: ChunkPlan, objects: FoundObjects
+    ) -> BoolArray | None:
+        """Which motions (K,) end a plan as the most of them do; None = they do not tell.
+
+        So pictures and the estimate say the same.
+        """
+        num_left = len(plan.times) - 1 - plan.num_frames
+        foreseen = self._foreseen(state, objects, num_left)
+        if foreseen is None:
+            return None
+        succeeded = self.pipeline.estimator.foresee(foreseen, self.instruction, state.memory)
+        return None if succeeded is None else succeeded == (np.mean(succeeded) >= 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,7 @@ class RolloutState:
         history: the frames before that one.
         source: the last real observation, at its own size.
         objects: where the named objects are; None before the first chunk after `source`.
+        ahead: where they are foreseen to be after each further chunk of the trajectory.
         memory: what the estimate remembers; None before the first chunk.
         num_imagined: frames since the last real one.
     """
@@ -39,6 +41,7 @@ class RolloutState:
     history: History
     source: Observation
     objects: FoundObjects | None = None
+    ahead: tuple[FoundObjects, ...] = ()
     memory: RolloutMemory | None = None
     num_imagined: int = 0
 
@@ -59,7 +62,7 @@ class RolloutState:
         stamp_ns: int,
         num_history: int,
         memory: RolloutMemory,
-        objects: FoundObjects | None = None,
+        objects: Sequence[FoundObjects] = (),
     ) -> RolloutState:
         """Returns the state at the last of the frames (V, T, H, W, 3).
 
@@ -69,7 +72,7 @@ class RolloutState:
             stamp_ns: of the last one [ns].
             num_history: most frames to keep before it.
             memory: what the estimate remembers then.
-            objects: where the objects are then.
+            objects: where they are then, and after each further chunk of the trajectory.
         """
         start = self.observation
         return RolloutState(
@@ -78,7 +81,8 @@ class RolloutState:
             ),
             history=self.history.after(start.frames, frames, num_history),
             source=self.source,
-            objects=objects,
+            objects=objects[0] if objects else None,
+            ahead=tuple(objects[1:]),
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
         )

@@ -16,6 +16,7 @@ from mtv_world_ros.errors import (
     RolloutPreempted,
     TrajectoryError,
 )
+from mtv_world_ros.evaluation.imagined_stretches import observe_stretch, stretches
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import project
@@ -298,6 +299,53 @@ def test_a_recorded_frame_is_seen_at_its_own_size(recording: Recording, tmp_path
         assert not cached.recorded and len(list(tmp_path.iterdir())) == 1, kept
         frames, cameras = cached.seen_at(3)
         assert np.array_equal(frames, recording.frames[:, 3]) and cameras == cached.cameras
+
+
+def test_a_recording_is_judged_by_its_own_frames(pipeline: Pipeline, recording: Recording) -> None:
+    """A model that holds its frame shows no move; the recorded frames do."""
+    (stretch,) = stretches(recording, SPEC, 'imagine')
+    seen = observe_stretch(pipeline, recording, stretch)
+    *_, last = imagine(pipeline, recording, stretch.num_frames / SPEC.fps)
+    assert seen.features['moved'] == 1.0 > last.success.features['moved']
+    assert seen.probability > 0.5 > last.success.probability
+
+
+class ThreeWays:
+    """Objects that go along x in the first second; how far, in each of three motions [m]."""
+
+    step_s, commands_a_step = 0.1, 1
+    sizes = np.full((3, 2, 3), 0.04)
+
+    def __init__(self, *ways: float) -> None:
+        self._ways = ways
+
+    def find(self, masks, cameras, poses):
+        return self
+
+    def advance(self, positions):
+        turns = np.broadcast_to(np.eye(3), (len(positions), 2, 3, 3))
+        motions = []
+        for way in self._ways:
+            points = np.full((len(positions), 2, 3), (0.0, 0.3, 0.02))
+            points[..., 0] += way * np.clip(np.arange(len(positions)) / 10, 0, 1)[:, None]
+            start = points[0].copy()
+            motions.append(ObjectMotion(reference=start, points=points, rotations=turns))
+        return tuple(motions), self
+
+
+def test_pictures_show_what_most_of_the_motions_say(recording: Recording) -> None:
+    def shown(*ways: float) -> np.ndarray:
+        world_model = CountingWorldModel(SPEC)
+        pipeline = assemble(
+            CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM
+        )
+        imagine(replace(pipeline, object_motion=ThreeWays(*ways)), recording, 1.6)
+        return world_model.trajectories[0]
+
+    still, moved = shown(0.0, 0.0, 0.0), shown(0.06, 0.06, 0.06)
+    assert not np.array_equal(still, moved)
+    assert np.array_equal(shown(0.06, 0.0, 0.0), still)
+    assert np.array_equal(shown(0.0, 0.06, 0.06), moved)
 
 
 class DriftingObjects:

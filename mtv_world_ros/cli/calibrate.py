@@ -160,6 +160,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
                 num_inference_steps=arguments.steps,
                 actions=('true',),
                 ceiling=False,
+                observed=True,
             ),
             name=fingerprint(
                 arguments.checkpoint,

@@ -16,6 +16,7 @@ from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
+    observe_stretch,
     predicted_frames,
     Stretch,
     stretches,
@@ -129,11 +130,15 @@ class EpisodeScorer:
             recording, donor = self._load(job.path), self._donor(job)
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
-        success = None
+        success, observed = None, {}
         names = job.objects or self.pipeline.objects or recording.names
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
             success = chunks[-1].success
+            if self.config.observed:
+                with found.timed('segmenting'):
+                    pipeline = replace(self.pipeline, objects=names)
+                    observed = observe_stretch(pipeline, recording, stretch).features
             if features:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])
@@ -151,6 +156,7 @@ class EpisodeScorer:
             probability=success.probability if success else np.nan,
             reasons=success.reasons if success else (),
             features=dict(success.features) if success else {},
+            observed=dict(observed),
             notes=tuple(found.notes),
             seconds_per_chunk=float(np.mean(found.chunk_seconds)),
             seconds=found.seconds,

@@ -10,11 +10,14 @@ import numpy as np
 from mtv_world_ros.data.recording import commands_until, frame_indices, Recording
 from mtv_world_ros.data_types import (
     ByteArray,
+    JointTrajectory,
     Observation,
+    SuccessEstimate,
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.geometry.resample import resample
+from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 
 #: observe: every chunk from real frames; imagine: chunks chained from the episode's first frame
@@ -115,9 +118,33 @@ def imagine_stretch(
         num_inference_steps: denoising steps.
         num_seeds: rollouts whose mean the success estimate is.
     """
-    spec = pipeline.spec
+    trajectory = _commands(pipeline, actions, stretch)
+    episode = _begin(pipeline, recording, stretch, seed, num_inference_steps, num_seeds)
+    return list(episode.extend(trajectory))
+
+
+def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) -> SuccessEstimate:
+    """Returns what the estimate says at the end of a stretch's recorded frames."""
+    trajectory = _commands(pipeline, recording, stretch)
+    episode = _begin(pipeline, recording, stretch)
+    times = np.arange(stretch.num_frames + 1) / pipeline.spec.fps
+    positions = resample(trajectory, recording.positions[stretch.start], times)
+    return episode.observe(stretch.frames[:, 1:], positions).success
+
+
+def _commands(pipeline: Pipeline, actions: Recording, stretch: Stretch) -> JointTrajectory:
     start = min(stretch.start, len(actions.times) - 1)
-    trajectory = commands_until(actions, start, stretch.num_frames / spec.fps)
+    return commands_until(actions, start, stretch.num_frames / pipeline.spec.fps)
+
+
+def _begin(
+    pipeline: Pipeline,
+    recording: Recording,
+    stretch: Stretch,
+    seed: int = 0,
+    num_inference_steps: int = 0,
+    num_seeds: int = 1,
+) -> ImaginedEpisode:
     frames, cameras = recording.seen_at(stretch.start)
     observation = Observation(
         cameras=cameras,
@@ -125,14 +152,13 @@ def imagine_stretch(
         positions=recording.positions[stretch.start],
         stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
     )
-    episode = pipeline.begin(
+    return pipeline.begin(
         observation,
         instruction=recording.instruction,
         seed=seed,
         num_seeds=num_seeds,
         num_inference_steps=num_inference_steps,
     )
-    return list(episode.extend(trajectory))
 
 
 def predicted_frames(chunks: list[Prediction]) -> ByteArray:

@@ -44,6 +44,8 @@ class EpisodeResult:
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: what the time of the episode went into [s].
         features: of that estimate, by name; empty where it abstained.
+        observed: of the estimate at the end of the recorded frames, likewise; empty where they
+            were not judged.
         has_ids: which objects move was read from recorded identities.
     """
 
@@ -60,6 +62,7 @@ class EpisodeResult:
     seconds: Mapping[str, float]
     has_ids: bool
     features: Mapping[str, float] = field(default_factory=dict)
+    observed: Mapping[str, float] = field(default_factory=dict)
 
     def means(self, view: str | None) -> dict[str, float]:
         """Returns the numbers of a view (None = all views) that are averaged over episodes."""
@@ -79,8 +82,9 @@ class EpisodeResult:
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
-        given = values.get('features', {})
-        read['features'] = {k: np.nan if v is None else v for k, v in given.items()}
+        for name in ('features', 'observed'):
+            given = values.get(name, {})
+            read[name] = {k: np.nan if v is None else v for k, v in given.items()}
         return EpisodeResult(**read)
 
 

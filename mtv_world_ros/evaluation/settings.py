@@ -40,6 +40,10 @@ class EvaluationConfig(Schema):
         default=True,
         description='score the recorded frames too, as they are and through the autoencoder',
     )
+    observed: bool = Field(
+        default=False,
+        description='also judge the recorded frames of whole episodes, for `calibrate`',
+    )
     use_ids: bool = Field(
         default=True,
         description='score against the recorded identities, where an episode has them, instead of '

@@ -5,7 +5,7 @@ V views, O objects, T frames, H W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,6 +18,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 
 #: what moved or turned by less is taken to stand still
 _STILL_M, _STILL_RAD = 0.004, 0.08
+#: what is nearer than this looks to be at the same place; what is further away, just elsewhere
+_SAME_M, _ELSEWHERE_M = 0.01, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +38,13 @@ class ObjectMotion:
 
     def moves(self) -> BoolArray:
         """Returns (T, O) whether an object is elsewhere than at first, by more than an error."""
-        way = np.linalg.norm(self.points - self.reference, axis=-1)
         turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
-        return (way > _STILL_M) | turned
+        return (np.linalg.norm(self.ways, axis=-1) > _STILL_M) | turned
+
+    @property
+    def ways(self) -> FloatArray:
+        """(T, O, 3) from where they were at the reference [m]."""
+        return self.points - self.reference
 
     def then(self, motion: ObjectMotion) -> ObjectMotion:
         """Returns both, one after the other; row 0 of the second is the last of the first."""
@@ -111,8 +117,11 @@ class FoundObjects:
         masks: (V, O, H, W) in it.
         poses: (V, 4, 4) T_base_camera then.
         tracked: where they are now.
-        motions: since that frame, `tracked.step_s` apart; the expected one first.
+        motions: since that frame, `tracked.step_s` apart; of the first one places and sizes are as
+            the masks have them.
         positions: (N, J) joints at their rows [rad or m].
+        part_row: row at which the last part of a plan begins.
+        shown: which of the motions pictures show.
     """
 
     names: tuple[str, ...]
@@ -122,36 +131,76 @@ class FoundObjects:
     tracked: TrackedObjects
     motions: tuple[ObjectMotion, ...] = ()
     positions: FloatArray | None = None
+    part_row: int = 0
+    shown: int = 0
 
-    def move(
-        self,
-        positions: FloatArray,
-        times: FloatArray,
-        cameras: Sequence[CameraModel],
-        poses: FloatArray,
-    ) -> tuple[ByteArray, FoundObjects]:
-        """Moves the objects as the robot moves.
+    def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
+        """Returns the objects after each part of a plan, which show the same motion as before.
 
         Args:
-            positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced; row 0
-                where the robot is now.
-            times: (T,) at which they are shown, from row 0 on [s].
+            parts: (1 + T * `tracked.commands_a_step`, J) each [rad or m], evenly spaced; row 0
+                where the robot is by then.
+        """
+        found: list[FoundObjects] = []
+        for positions in parts:
+            found.append((found[-1] if found else self)._then(positions))
+        return tuple(found)
+
+    def most_like(self, ahead: FoundObjects, among: BoolArray | None = None) -> int:
+        """Returns the motion to show from here on: the one whose end is most like those of all.
+
+        Objects do not jump: only motions that have them now where the one shown so far has them
+        are chosen from.
+
+        Args:
+            ahead: these objects at the end of a plan.
+            among: (K,) of which motions it should be one, if any can be chosen; None = of all.
+        """
+        fits = np.ones(len(ahead.motions), np.bool_)
+        if self.motions:
+            fits = _apart(self.motions)[self.shown].max(-1, initial=0.0) <= _SAME_M
+        if among is not None and (fits & among).any():
+            fits &= among
+        if not fits.any():
+            return self.shown
+        unlike = _apart(ahead.motions).sum((1, 2))
+        return int(np.argmin(np.where(fits, unlike, np.inf)))
+
+    def pictures(
+        self, times: FloatArray, cameras: Sequence[CameraModel], poses: FloatArray
+    ) -> ByteArray:
+        """Returns pictures (V, T, H, W, 4) of the objects in the last part of the plan.
+
+        Args:
+            times: (T,) from its row 0 on [s].
             cameras: V cameras at the masks' size.
             poses: (V, T, 4, 4) T_base_camera at these times.
-
-        Returns:
-            Their pictures (V, T, H, W, 4), and the objects after the last row.
         """
+        motion = self.motions[self.shown]
+        rows = self.part_row + np.rint(times / self.tracked.step_s).astype(int)
+        shown = motion[np.minimum(rows, len(motion.points) - 1)]
+        return moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)
+
+    def _then(self, positions: FloatArray) -> FoundObjects:
         motions, tracked = self.tracked.advance(positions)
         positions = positions[:: self.tracked.commands_a_step]
-        rows = np.rint(times / self.tracked.step_s).astype(int)
-        shown = motions[0][np.minimum(rows, len(positions) - 1)]
-        pictures = moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)
-        if self.motions and self.positions is not None:
-            pairs = zip(self.motions, motions, strict=True)
-            motions = tuple(before.then(after) for before, after in pairs)
-            positions = np.concatenate([self.positions, positions[1:]])
-        return pictures, replace(self, tracked=tracked, motions=motions, positions=positions)
+        if self.positions is None:
+            return replace(self, tracked=tracked, motions=motions, positions=positions)
+        pairs = zip(self.motions, motions, strict=True)
+        return replace(
+            self,
+            tracked=tracked,
+            motions=tuple(before.then(after) for before, after in pairs),
+            positions=np.concatenate([self.positions, positions[1:]]),
+            part_row=len(self.positions) - 1,
+        )
+
+
+def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
+    """(K, K, O) how far objects are apart at the ends of motions [m]; those not known are not."""
+    ends = np.stack([motion.ways[-1] for motion in motions])
+    apart = np.linalg.norm(ends[:, None] - ends[None], axis=-1)
+    return np.nan_to_num(np.minimum(apart, _ELSEWHERE_M))
 
 
 def moved_pictures(

@@ -31,8 +31,8 @@ def weighed(features: Mapping[str, float], name: str) -> float:
     return min(value, 0.0) if name in DOUBTS else value
 
 
-class Calibration(Schema):
-    """What `mtv-world calibrate` found: F features, standardised, weighed and added up.
+class Weights(Schema):
+    """A logistic of F features, standardised, weighed and added up.
 
     Attributes:
         features: F names.
@@ -40,13 +40,6 @@ class Calibration(Schema):
         scales: F, divided by.
         weights: F, logit per scale.
         bias: logit of an episode whose features are all at their mean.
-        segmenter: that found the masks.
-        tasks: that it was fitted on.
-        num_episodes: that it was fitted on.
-        num_seeds: rollouts of each.
-        l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
-        scores: before and after, the latter on tasks that were left out of the fit.
-        made: command, date, machine.
     """
 
     features: ListOf[str]
@@ -54,13 +47,6 @@ class Calibration(Schema):
     scales: ListOf[float]
     weights: ListOf[float]
     bias: float
-    segmenter: str
-    tasks: ListOf[str]
-    num_episodes: int
-    num_seeds: int = 1
-    l2: float = 1.0
-    scores: Mapping[str, Mapping[str, Any]] = {}
-    made: Mapping[str, str] = {}
 
     @model_validator(mode='after')
     def _are_equally_many(self) -> Self:
@@ -80,6 +66,35 @@ class Calibration(Schema):
             value = weighed(features, name)
             logit += weight * (value - mean) / scale if isfinite(value) else 0.0
         return 1.0 / (1.0 + exp(-max(min(logit, 50.0), -50.0)))
+
+
+class Calibration(Weights):
+    """What `mtv-world calibrate` found.
+
+    Attributes:
+        observed: for frames that were seen, not imagined, of the same episodes; None = as for
+            those that are imagined.
+        segmenter: that found the masks.
+        tasks: that it was fitted on.
+        num_episodes: that it was fitted on.
+        num_seeds: rollouts of each.
+        l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
+        scores: before and after, the latter on tasks that were left out of the fit.
+        made: command, date, machine.
+    """
+
+    observed: Weights | None = None
+    segmenter: str
+    tasks: ListOf[str]
+    num_episodes: int
+    num_seeds: int = 1
+    l2: float = 1.0
+    scores: Mapping[str, Mapping[str, Any]] = {}
+    made: Mapping[str, str] = {}
+
+    def given(self, is_real: bool) -> Weights:
+        """Returns the weights for frames that are real, or imagined."""
+        return (self.observed or self) if is_real else self
 
     def objection(self, task: str, segmenter: str) -> str:
         """Returns why it does not apply to a task and a segmenter; empty = it applies."""

@@ -94,6 +94,8 @@ class SuccessEstimator:
         instruction: str = '',
         memory: RolloutMemory | None = None,
         foreseen: ForeseenMotions | None = None,
+        *,
+        is_real: bool = False,
     ) -> Judged:
         """Returns the probability that the task is done at the end of a rollout's chunk.
 
@@ -105,6 +107,7 @@ class SuccessEstimator:
             instruction: what the robot was told; says which task it is and with which objects.
             memory: of the chunks before; None = the chunk is the rollout's first.
             foreseen: motions of the objects up to the chunk's end, by a model of contact.
+            is_real: the frames were not imagined.
         """
         memory = remember(memory, footage)
         try:
@@ -123,7 +126,24 @@ class SuccessEstimator:
             return Judged(_abstains(reason, views, subjects), memory)
         starts = memory.points[:, 0]
         succeeded = None if foreseen is None else foreseen.succeeds(task, bound, starts)
-        return Judged(self._judge(task, evidence, views, succeeded), memory)
+        return Judged(self._judge(task, evidence, views, succeeded, is_real), memory)
+
+    def foresee(
+        self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
+    ) -> FloatArray | None:
+        """Returns (K,) whether the task is done at the end of motions; None = not known.
+
+        Args:
+            foreseen: since the objects were found.
+            instruction: what the robot is told.
+            memory: of the rollout so far; None = it begins where they were found.
+        """
+        try:
+            task, bound = self._task(instruction, foreseen.names)
+        except CannotTell:
+            return None
+        starts = foreseen.points[0, 0] if memory is None else memory.points[:, 0]
+        return foreseen.succeeds(task, bound, starts)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """The task and its objects; a given task takes the objects in their order."""
@@ -136,14 +156,19 @@ class SuccessEstimator:
         raise CannotTell(f"'{instruction}' is no known task (known: {known})")
 
     def _judge(
-        self, task: TaskSpec, evidence: Evidence, views: Views, succeeded: FloatArray | None
+        self,
+        task: TaskSpec,
+        evidence: Evidence,
+        views: Views,
+        succeeded: FloatArray | None,
+        is_real: bool,
     ) -> SuccessEstimate:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
         features['foreseen'] = foreseen_feature(succeeded)
         features['released'] = _released(task, views.footage.openings)
         basis = self._objection(task)
-        calibrated = None if basis else self.calibration
-        probability = calibrated.probability if calibrated else stated_probability
+        weights = None if basis or self.calibration is None else self.calibration.given(is_real)
+        probability = weights.probability if weights else stated_probability
         low, middle, high = (
             capped(
                 probability({**features, 'margin': clipped(features['margin'] + shift)}),
@@ -167,7 +192,8 @@ class SuccessEstimator:
         elif features['released'] == 0.0:
             low = 0.0
             reasons.append('a gripper is still closed')
-        reasons.append(basis or f'calibrated: {_origin(self.calibration)}, given the world model')
+        given = 'frames that were seen' if is_real else 'the world model'
+        reasons.append(basis or f'calibrated: {_origin(self.calibration)}, given {given}')
         return SuccessEstimate(
             probability=middle,
             interval=(low, high),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
+from mtv_world_ros.geometry.object_motion import FoundObjects, moved_pictures, ObjectMotion
 
 FOCAL, SIZE = 100.0, (60, 80)
 POSE = np.eye(4)
@@ -106,3 +108,73 @@ def test_what_goes_behind_the_camera_is_held(camera):
     start = [0.005, 0.005, 1.0]
     moved = shown(camera, [mask], [(255, 0, 0)], [start], [[[0.0, 0.0, -1.0]]])[0]
     np.testing.assert_array_equal(moved[..., 3] == 255, mask)
+
+
+class Foreseen:
+    """One object that goes along x at speeds (K,) of its motions [m / step]."""
+
+    step_s, commands_a_step = 0.1, 1
+
+    def __init__(self, *speeds: float, steps: int = 0) -> None:
+        self.speeds, self.steps = speeds, steps
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.full((len(self.speeds), 1, 3), 0.05)
+
+    def advance(self, positions: np.ndarray) -> tuple[tuple[ObjectMotion, ...], Foreseen]:
+        steps = self.steps + np.arange(len(positions))
+        turns = np.tile(np.eye(3), (len(steps), 1, 1, 1))
+        motions = []
+        for speed in self.speeds:
+            points = np.zeros((len(steps), 1, 3))
+            points[..., 0], points[..., 2] = speed * steps[:, None], 1.0
+            start = np.array([[0.0, 0.0, 1.0]])
+            motions.append(ObjectMotion(reference=start, points=points, rotations=turns))
+        return tuple(motions), Foreseen(*self.speeds, steps=int(steps[-1]))
+
+
+def found(*speeds: float) -> FoundObjects:
+    return FoundObjects(
+        names=('block',),
+        frames=np.full((1, *SIZE, 3), 200, np.uint8),
+        masks=square(30, 40, 3)[None, None],
+        poses=POSE[None],
+        tracked=Foreseen(*speeds),
+    )
+
+
+def plan(steps: int) -> np.ndarray:
+    return np.zeros((steps + 1, 1))
+
+
+def test_the_motion_that_is_shown_is_most_like_all():
+    objects = found(0.0, 0.02, 0.021, 0.022, 0.9)
+    ahead = objects.foresee([plan(4), plan(4)])
+    assert [len(part.positions) for part in ahead] == [5, 9]
+    assert objects.most_like(ahead[-1]) == 2
+    assert objects.most_like(ahead[-1], np.array([True, False, False, True, True])) == 3
+    assert objects.most_like(ahead[-1], np.zeros(5, bool)) == 2
+
+
+def test_objects_do_not_jump_from_one_plan_to_the_next():
+    """What most motions say later is shown only as far as it is where the object is now."""
+    first = found(0.02, 0.0, 0.0, 0.0, 0.0205).foresee([plan(8)])[0]
+    shown = replace(first, shown=0)
+    later = shown.foresee([plan(8)])[-1]
+    assert shown.most_like(later) in (0, 4)
+    assert shown.most_like(later, np.array([False, True, True, True, False])) in (0, 4)
+
+
+def test_pictures_are_those_of_the_motion_that_is_shown(camera):
+    parts = found(0.0, 0.01).foresee([plan(4), plan(4)])
+    poses = np.tile(POSE, (1, 2, 1, 1))
+    for number, part in enumerate(parts):
+        still, moved = (
+            replace(part, shown=k).pictures(np.array([0.0, 0.4]), [camera], poses)[0]
+            for k in (0, 1)
+        )
+        at, _ = centre_and_area(still[1])
+        for row, frame in enumerate(moved):
+            gone = 100 * 0.01 * 4 * (number + row)
+            np.testing.assert_allclose(centre_and_area(frame)[0] - at, [gone, 0], atol=0.1)

@@ -5,7 +5,7 @@ import pytest
 from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.success.calibration import Calibration
+from mtv_world_ros.success.calibration import Calibration, Weights
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -211,6 +211,20 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
     assert found.is_calibrated == words.startswith('calibrated')
     # weights of zero say one half, whatever is seen; the stated ones do not
     assert (found.probability == 0.5) == found.is_calibrated
+
+
+def test_frames_that_were_seen_have_weights_of_their_own():
+    seen = Weights(features=('margin',), means=(1.0,), scales=(2.0,), weights=(0.0,), bias=2.0)
+    task = CALIBRATION.replace(observed=seen)
+    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
+    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    tasks = load_tasks(share_path('config', 'tasks'))
+    for calibration, expected in ((task, 1 / (1 + np.exp(-2))), (CALIBRATION, 0.5)):
+        estimator = SuccessEstimator(tasks, calibration=calibration, segmenter=Named('colour'))
+        real = estimator.estimate(shown, LEFT, is_real=True).estimate
+        assert real.probability == pytest.approx(expected)
+        assert 'given frames that were seen' in real.reasons[-1]
+        assert estimator.estimate(shown, LEFT).estimate.probability == 0.5
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,13 @@ from mtv_world_ros.evaluation.calibration.fit import (
     BEFORE,
     Calibrated,
     FITTED,
+    OBSERVED,
     Sample,
 )
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.files import write_json, write_whole
-from mtv_world_ros.success.calibration import HorizonCurve
+from mtv_world_ros.success.calibration import HorizonCurve, Weights
 
 _COLUMNS = {
     'num_abstained': 'abstained',
@@ -35,6 +36,7 @@ _ROWS = {
     BEFORE: 'before: stated weights',
     AFTER: 'after: each task left out of the fit',
     AFTER_KINDS: 'after: each fault kind left out of the fit',
+    OBSERVED: 'the recorded frames, each kind or task left out of a fit to them',
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }
@@ -60,21 +62,27 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
         for name, words in _ROWS.items()
         if name in calibration.scores
     ]
-    rows = zip(
-        calibration.features, calibration.weights, calibration.means, calibration.scales,
-        strict=True,
-    )  # fmt: skip
-    weights = [[name, *map(number, row)] for name, *row in rows]
+    observed = calibration.observed
     return render(
         'calibration.md.j2',
         summary=_summary(found),
         scores=Table(head=['', *_COLUMNS.values()], rows=scores),
         tasks=_groups(found, AFTER, 'task', lambda sample: (sample.task,)),
         kinds=_kinds(found),
-        weights=Table(head=['feature', 'logit per scale', 'mean', 'scale'], rows=weights),
+        weights=_weights(calibration),
         bias=calibration.bias,
+        observed=observed and _weights(observed),
+        observed_bias=observed and observed.bias,
         horizon='' if horizon is None else _horizon_text(horizon),
         made=calibration.made,
+    )
+
+
+def _weights(found: Weights) -> Table:
+    rows = zip(found.features, found.weights, found.means, found.scales, strict=True)
+    return Table(
+        head=['feature', 'logit per scale', 'mean', 'scale'],
+        rows=[[name, *map(number, row)] for name, *row in rows],
     )
 
 
@@ -155,6 +163,7 @@ def _values(found: Calibrated) -> dict[str, Any]:
                 'kinds': list(sample.kinds),
                 'success': sample.success,
                 'features': list(sample.features),
+                'observed': sample.observed,
                 'reasons': sample.reasons,
                 **{name: judged[index].probability for name, judged in found.judgements.items()},
             }

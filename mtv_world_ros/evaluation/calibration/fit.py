@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import isfinite, nan
 from typing import Any
 
@@ -15,8 +15,8 @@ from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
-from mtv_world_ros.success.calibration import Calibration, weighed
-from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
+from mtv_world_ros.success.calibration import Calibration, weighed, Weights
+from mtv_world_ros.success.estimator import capped, stated_probability, STATED_WEIGHTS
 from mtv_world_ros.success.evidence import FEATURES
 
 #: fewer episodes of known outcome than this say nothing
@@ -25,6 +25,7 @@ MIN_EPISODES = 8
 MAX_BIAS = 30.0
 #: what the scores are called, in the order of the tables
 BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
+OBSERVED = 'observed'
 ALWAYS = 'always success'
 
 
@@ -40,6 +41,8 @@ class Sample:
         before: probabilities by seed with the stated weights; NaN = abstained.
         reasons: of the first seed's estimate.
         kinds: faults of the policy that acted; empty = none, or not a scripted policy.
+        observed: features of the estimate on the recorded frames; empty where it abstained, or
+            they were not judged.
     """
 
     episode: str
@@ -49,6 +52,14 @@ class Sample:
     before: tuple[float, ...]
     reasons: tuple[str, ...]
     kinds: tuple[str, ...] = ()
+    observed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def as_observed(self) -> Sample:
+        """The same with the recorded frames in place of the imagined ones."""
+        features = dict(self.observed)
+        before = capped(stated_probability(features), features) if features else nan
+        return replace(self, features=(features,), before=(before,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +71,8 @@ class Calibrated:
         samples: with known outcome.
         judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
             `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
-            only where there are faults), `FITTED` (on what it was fitted on: too good) -> one
-            per sample.
+            only where there are faults), `OBSERVED` (the same of the recorded frames, by a fit to
+            them), `FITTED` (on what it was fitted on: too good) -> one per sample.
     """
 
     calibration: Calibration
@@ -93,6 +104,7 @@ def samples_of(
                     before=tuple(result.probability for result in found),
                     reasons=first.reasons,
                     kinds=known_kinds.get(name, ()),
+                    observed=first.observed,
                 )
             )
     return samples
@@ -124,23 +136,33 @@ def calibrate(
         FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
         ALWAYS: tuple(_judged(s, 1.0) for s in samples),
     }
+    groups = [{s.task} for s in samples]
     if any(sample.kinds for sample in samples):
         groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
         judgements[AFTER_KINDS] = _left_out(samples, groups, segmenter, l2)
+    seen, observed = [sample.as_observed for sample in samples], None
+    if _tells(seen):
+        observed = Weights(**_weights(seen, l2))
+        judgements[OBSERVED] = _left_out(seen, groups, segmenter, l2)
     scores = {name: agreement(found) for name, found in judgements.items()}
-    calibration = Calibration(**fitted, scores=scores, made=dict(made or {}))
+    calibration = Calibration(**fitted, observed=observed, scores=scores, made=dict(made or {}))
     return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
 
 
 def _check(samples: Sequence[Sample]) -> None:
     usable = [sample for sample in samples if any(sample.features)]
-    outcomes = {sample.success for sample in usable}
-    if len(usable) < MIN_EPISODES or len(outcomes) < 2:
+    if not _tells(samples):
         raise ConfigError(
             f'{len(samples)} episodes have a known outcome, of which {len(usable)} could be '
             f'judged, {sum(s.success for s in usable)} of them successes; a calibration needs at '
             f'least {MIN_EPISODES} and both outcomes: collect some with --failures-of-ten 5'
         )
+
+
+def _tells(samples: Sequence[Sample]) -> bool:
+    """Whether there are enough episodes, of both outcomes."""
+    outcomes = [sample.success for sample in samples if any(sample.features)]
+    return len(outcomes) >= MIN_EPISODES and len(set(outcomes)) == 2
 
 
 def _left_out(
@@ -165,6 +187,18 @@ def _left_out(
 
 def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:
     """Fields of `Calibration`."""
+    return {
+        **_weights(samples, l2),
+        'segmenter': segmenter,
+        'tasks': tuple(sorted({sample.task for sample in samples})),
+        'num_episodes': len(samples),
+        'num_seeds': max(len(sample.before) for sample in samples),
+        'l2': l2,
+    }
+
+
+def _weights(samples: Sequence[Sample], l2: float) -> dict[str, Any]:
+    """Fields of `Weights`."""
     rows, labels = _design(samples)
     with np.errstate(invalid='ignore'):
         known = np.isfinite(rows)
@@ -182,11 +216,6 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
         'scales': tuple(scales.tolist()),
         'weights': tuple(logistic.weights.tolist()),
         'bias': logistic.bias,
-        'segmenter': segmenter,
-        'tasks': tuple(sorted({sample.task for sample in samples})),
-        'num_episodes': len(samples),
-        'num_seeds': max(len(sample.before) for sample in samples),
-        'l2': l2,
     }
 
 

@@ -24,8 +24,10 @@ from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.rigid_bodies import BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
-_SUBSTEPS = 5
+_SUBSTEPS = 10
 _STEP_S = PERIOD_S / _SUBSTEPS
+#: periods for which everything is still before arms only pass by
+_STILL_PERIODS = 5
 #: standard deviations: of places [m], turns [rad]; relative: sizes, friction, weight, stiffness
 _PLACE_M, _TURN_RAD = 0.001, 0.02
 _SIZE, _FRICTION, _WEIGHT, _STIFFNESS = 0.015, 0.2, 0.3, 0.2
@@ -85,7 +87,7 @@ class ContactMotions:
                 bodies.state = self.states[number]
             else:
                 bodies.arms.skeleton.setPositions(ways[0])
-            poses = _run(bodies, ways, velocities, rows * _SUBSTEPS)
+            poses = _run(bodies, ways, velocities, rows)
             states.append(bodies.state)
             points.append(poses[..., :3, 3])
             turned.append(poses[..., :3, :3] @ np.swapaxes(start, -1, -2))
@@ -182,12 +184,22 @@ def _disturbed(solid: Solid, table: float, share: float, rng: np.random.Generato
 
 
 def _run(bodies: RigidBodies, ways: FloatArray, velocities: FloatArray, every: int) -> FloatArray:
-    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven along their ways."""
-    forces, poses = bodies.arms.carried(ways, velocities, _STEP_S), [bodies.poses()]
-    state = bodies.state
-    for step, carried in enumerate(forces):
-        bodies.step(bodies.arms.forces(carried, ways[step], velocities[step]))
-        if (step + 1) % every == 0:
+    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven along their ways.
+
+    Where nothing is touched and nothing moves, the arms pass by without any dynamics: in free air
+    they are on their way by definition.
+    """
+    poses, state, still = [bodies.poses()], bodies.state, 0
+    for period, first in enumerate(range(0, len(ways) - 1, _SUBSTEPS), 1):
+        last = first + _SUBSTEPS
+        still = still + 1 if bodies.is_at_rest else 0
+        is_free = still > _STILL_PERIODS and bodies.arms.is_on(ways[first], velocities[first])
+        if not (is_free and bodies.passes(ways[last], velocities[last])):
+            part = slice(first, last + 1)
+            forces = bodies.arms.carried(ways[part], velocities[part], _STEP_S)
+            for step, carried in enumerate(forces, first):
+                bodies.step(bodies.arms.forces(carried, ways[step], velocities[step]))
+        if period % every == 0:
             poses.append(bodies.poses())
             if np.isfinite(poses[-1]).all():
                 state = bodies.state

@@ -1,7 +1,8 @@
 """A table, a robot and solids as rigid bodies of the engine DART (dartsim.github.io).
 
 Its contacts are a linear complementarity problem with Coulomb friction; bodies do not sink into
-each other. Of two bodies that rub, the lower friction counts.
+each other. Of two bodies that rub, the lower friction counts. Everything is made of boxes and
+balls, of which the engine itself finds contacts best; a robot with meshes needs another way.
 
 Shape letters: J joints, D degrees of freedom of the description, O solids, A tools.
 """
@@ -34,6 +35,13 @@ _FLOOR_M, _RIM_M, _WALL_M = 0.006, 0.01, 0.006
 _LIFT_M = 0.0005
 #: round things are prisms of so many sides: flat fingers touch a cylinder along a line only
 _SIDES = 16
+#: side of the square that has the area of a circle, in radii; a capsule is this much longer than
+#: its cylinder, in radii
+_SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
+#: what is slower than this is at rest [m/s], [rad/s]; an arm that is nearer to its way is on it
+#: [m or rad], [m/s or rad/s]
+_REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
+_ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
 _LEAST_KG = 0.01
 #: half the extents of the table [m]
 _TABLE_M = (1.5, 1.5, 0.1)
@@ -49,26 +57,20 @@ class BodyState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Part:
-    """A convex part of a solid: a box (half extents) or a cylinder (radius, half height)."""
+    """A box of a solid, by its half extents."""
 
-    size: tuple[float, ...]
+    size: tuple[float, float, float]
     pose: FloatArray
     mass: float
 
     @property
     def inertia(self) -> FloatArray:
         """(3, 3) about its centre."""
-        if len(self.size) == 3:
-            x, y, z = (4 * extent**2 for extent in self.size)
-            return self.mass / 12 * np.diag([y + z, x + z, x + y])
-        radius, half = self.size
-        across = (3 * radius**2 + 4 * half**2) / 12
-        return self.mass * np.diag([across, across, radius**2 / 2])
+        x, y, z = (4 * extent**2 for extent in self.size)
+        return self.mass / 12 * np.diag([y + z, x + z, x + y])
 
     def shape(self) -> Any:
-        if len(self.size) == 3:
-            return dart.dynamics.BoxShape(2 * np.array(self.size))
-        return dart.dynamics.CylinderShape(self.size[0], 2 * self.size[1])
+        return dart.dynamics.BoxShape(2 * np.array(self.size))
 
 
 class RigidBodies:
@@ -98,14 +100,34 @@ class RigidBodies:
         still = self._world.getDeactivationOptions()
         still.mEnabled = False  # what sleeps is not woken by fingers that close gently
         self._world.setDeactivationOptions(still)
-        solver = self._world.getConstraintSolver()
-        solver.setCollisionDetector(dart.collision.BulletCollisionDetector())
-        self._world.addSkeleton(_table(settings))
         self._settings = settings
         self._solids = [_body(number, solid, settings) for number, solid in enumerate(solids)]
         self.arms = _Arms(robot, response, settings)
-        for skeleton in (*self._solids, self.arms.skeleton):
+        detector = _detector(self.arms.skeleton)
+        self._world.getConstraintSolver().setCollisionDetector(detector)
+        self._of_arms, self._others = (detector.createCollisionGroup() for _ in range(2))
+        for node in _moving_nodes(self.arms.skeleton):
+            self._of_arms.addShapeFrame(node)
+        for skeleton in (_table(settings), *self._solids):
+            self._others.addShapeFramesOf(skeleton)
             self._world.addSkeleton(skeleton)
+        self._world.addSkeleton(self.arms.skeleton)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether no solid moves."""
+        return all((np.abs(solid.getVelocities()) < _REST).all() for solid in self._solids)
+
+    def passes(self, way: FloatArray, velocity: FloatArray) -> bool:
+        """Moves the arms along their way (D,) if they touch nothing there, else not at all."""
+        skeleton = self.arms.skeleton
+        before = np.array(skeleton.getPositions())
+        skeleton.setPositions(way)
+        if self._of_arms.collide(self._others):
+            skeleton.setPositions(before)
+            return False
+        skeleton.setVelocities(velocity)
+        return True
 
     def step(self, forces: FloatArray) -> None:
         """Goes on by a step with forces (D,) on the arms."""
@@ -178,6 +200,12 @@ class _Arms:
             _settle(skeleton, described, fingers, settings)
         self._driven = self._stiffness > 0
 
+    def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
+        """Tells whether the arms are where they are in free air, (D,) each."""
+        off = np.abs(self.skeleton.getPositions() - way)[self._driven]
+        slow = np.abs(self.skeleton.getVelocities() - velocity)[self._driven]
+        return bool((off < _ON_WAY).all() and (slow < _ON_WAY_SPEED).all())
+
     def ways(self, positions: FloatArray) -> FloatArray:
         """Returns where the degrees of freedom are (T, D) at joints (T, J)."""
         return positions @ self._follows.T + self._offsets
@@ -204,6 +232,31 @@ class _Arms:
         off = way - self.skeleton.getPositions()
         slow = velocity - self.skeleton.getVelocities()
         return carried + self._stiffness * off + self._damping * slow
+
+
+def _moving_nodes(arms: Any) -> list[Any]:
+    """Shapes of bodies that joints move."""
+    bodies = map(arms.getBodyNode, range(arms.getNumBodyNodes()))
+    moving = [body for body in bodies if body.getNumDependentGenCoords()]
+    return [body.getShapeNode(k) for body in moving for k in range(body.getNumShapeNodes())]
+
+
+def _detector(arms: Any) -> Any:
+    """What finds contacts: the engine's own knows boxes and balls alone."""
+    kinds = {node.getShape().getType() for node in _moving_nodes(arms)}
+    if kinds <= {'BoxShape', 'SphereShape'}:
+        return dart.collision.DARTCollisionDetector()
+    return dart.collision.BulletCollisionDetector()
+
+
+def _boxed(shape: Any) -> Any:
+    """A box in place of a cylinder or capsule; other shapes as they are."""
+    caps = {'CylinderShape': 0.0, 'CapsuleShape': _CAPS}.get(shape.getType())
+    if caps is None:
+        return shape
+    radius = shape.getRadius()
+    side, length = _SQUARE * radius, shape.getHeight() + caps * radius
+    return dart.dynamics.BoxShape(np.array([side, side, length]))
 
 
 def _skeleton(robot: RobotModel) -> tuple[Any, set[str]]:
@@ -289,8 +342,11 @@ def _settle(
             body.setMomentOfInertia(1e-7, 1e-7, 1e-7)
         is_finger = body.getParentJoint().getName() in fingers
         friction = settings.grip_friction if is_finger else settings.table_friction
-        for shape in range(body.getNumShapeNodes()):
-            aspect = body.getShapeNode(shape).getDynamicsAspect()
+        for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
+            node.setShape(_boxed(node.getShape()))
+            if not body.getNumDependentGenCoords() and node.getCollisionAspect():
+                node.getCollisionAspect().setCollidable(False)  # it stands on the table
+            aspect = node.getDynamicsAspect()
             if aspect is not None:
                 aspect.setFrictionCoeff(friction)
 
@@ -347,14 +403,21 @@ def _parts(solid: Solid, settings: ContactSettings) -> list[_Part]:
     mass = max(volume * settings.density, _LEAST_KG)
     if not solid.is_round:
         return [_Part(size=(wide / 2, long / 2, high / 2), pose=np.eye(4), mass=mass)]
-    sides = _SIDES // 2
-    side = (wide / 2, wide / 2 * np.tan(np.pi / _SIDES), high / 2 - _LIFT_M)
+    return _prism(wide, high, 0.0, mass)
+
+
+def _prism(wide: float, high: float, middle: float, mass: float) -> list[_Part]:
+    """Boxes through one axis, which are round together; at a height of their middle.
+
+    They stand on one box within the round, which makes few contacts.
+    """
+    sides, within = _SIDES // 2, wide / 2 * np.sqrt(0.5)
+    size = (wide / 2, wide / 2 * float(np.tan(np.pi / _SIDES)), high / 2 - _LIFT_M)
+    turns = [_turned(k * np.pi / sides) for k in range(sides)]
+    at = _shifted(0.0, 0.0, middle)
     return [
-        _Part(size=(0.97 * wide / 2, high / 2), pose=np.eye(4), mass=0.9 * mass),
-        *(
-            _Part(size=side, pose=_turned(k * np.pi / sides), mass=0.1 * mass / sides)
-            for k in range(sides)
-        ),
+        _Part(size=(within, within, high / 2), pose=at, mass=mass / 2),
+        *(_Part(size=size, pose=turn @ at, mass=mass / 2 / sides) for turn in turns),
     ]
 
 
@@ -362,18 +425,14 @@ def _dish(wide: float, high: float, settings: ContactSettings) -> list[_Part]:
     """Round and open at the top."""
     middle, half = (wide - _RIM_M) / 2, (high - _LIFT_M) / 2
     length = middle * np.tan(np.pi / _SIDES) * 1.02
-    floor = _Part(
-        size=(middle, _FLOOR_M / 2),
-        pose=_shifted(0.0, 0.0, (_FLOOR_M - high) / 2),
-        mass=np.pi * middle**2 * _FLOOR_M * settings.density,
-    )
-    wall = (_RIM_M / 2, length, half)
-    mass = 8 * float(np.prod(wall)) * settings.density
+    mass = np.pi * middle**2 * _FLOOR_M * settings.density
+    wall = (_RIM_M / 2, float(length), half)
+    wall_mass = 8 * float(np.prod(wall)) * settings.density
     turns = [_turned(k * 2 * np.pi / _SIDES) for k in range(_SIDES)]
     return [
-        floor,
+        *_prism(2 * middle, _FLOOR_M, (_FLOOR_M - high) / 2, mass),
         *(
-            _Part(size=wall, pose=turn @ _shifted(middle, 0.0, _LIFT_M / 2), mass=mass)
+            _Part(size=wall, pose=turn @ _shifted(middle, 0.0, _LIFT_M / 2), mass=wall_mass)
             for turn in turns
         ),
     ]

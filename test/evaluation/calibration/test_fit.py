@@ -22,6 +22,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
     calibrate,
     fit_logistic,
     FITTED,
+    OBSERVED,
     Sample,
 )
 from mtv_world_ros.evaluation.metrics.success_agreement import (
@@ -254,6 +255,27 @@ def test_left_out_fault_kinds_do_not_leak_into_what_judges_them():
     text = markdown(fitted, None)
     assert '| after: each fault kind left out of the fit |' in text
     assert '## By fault kind' in text and '| (no fault) |' in text
+
+
+def test_recorded_frames_are_fitted_by_themselves():
+    samples = made_samples()
+    assert calibrate(samples, segmenter='colour').calibration.observed is None
+    seen = [
+        replace(s, observed={**s.features[0], 'margin': 2.0 if s.success else -2.0})
+        for s in samples
+        if s.features[0]
+    ]
+    found = calibrate(seen, segmenter='colour')
+    assert OBSERVED in found.judgements and found.calibration.scores[OBSERVED]['auroc'] > 0.99
+    observed, imagined = found.calibration.given(True), found.calibration.given(False)
+    # of what was seen, the margin tells
+    per_margin = [w.weights[0] / w.scales[0] for w in (observed, imagined)]
+    assert per_margin[0] > 1.2 > 0.8 > per_margin[1]
+    # what is imagined is judged as before
+    assert imagined.weights == calibrate(samples, segmenter='colour').calibration.weights
+    text = markdown(found, None)
+    assert '| the recorded frames, each kind or task left out of a fit to them |' in text
+    assert '## Weights for frames that were seen' in text
 
 
 def test_task_that_is_all_there_is_cannot_be_left_out():

@@ -23,6 +23,7 @@ from mtv_world_ros.model.object_motion.predictor import (
     load_response,
     save_contact,
 )
+from mtv_world_ros.model.object_motion.rigid_bodies import RigidBodies
 from mtv_world_ros.training.object_motion.contact_fit import read_contact
 
 #: of commands between two rows that come back
@@ -88,6 +89,22 @@ def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
     slippery = motions_of(response, *recording.solids, grip_friction=0.02)
     points, _, _ = slippery.advance(robot, recording.positions, ROWS)
     assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.way[0]) > 0.05
+
+
+def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
+    robot, response, recording, monkeypatch
+):
+    steps = []
+    step = RigidBodies.step
+    monkeypatch.setattr(RigidBodies, 'step', lambda self, f: (steps.append(0), step(self, f)))
+    motions = motions_of(response, *recording.solids)
+    points, _, _ = motions.advance(robot, recording.positions, ROWS)
+    short = len(steps)
+    monkeypatch.setattr(RigidBodies, 'passes', lambda *_: False)
+    steps.clear()
+    whole, _, _ = motions.advance(robot, recording.positions, ROWS)
+    assert short < 0.75 * len(steps)
+    np.testing.assert_allclose(points[0, -1], whole[0, -1], atol=0.005)
 
 
 def test_chunks_go_on_where_the_last_one_ended(robot, response, recording):
