@@ -5,11 +5,13 @@
 
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
 checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
-first has `contact.json`. `share` is how many motions succeed; half or more is a success. Beside it
-stands the rule that imagines nothing: an object sticks to a gripper that closes near it. Differences are to the first networks; intervals:
-Wilson of shares, jackknife of AUROC, bootstrap of differences, over episodes. What is chosen by
-this must not be measured by it: kinds of the split `test` are refused. With `--recorded-arms` the
-networks and the rule are told where the arms really went, which nobody knows ahead: what that costs.
+first has `contact.json`. A row of a name judges by the share of the motions that succeed: half or
+more is a success. `shown` is the one motion that pictures show, `expected` the first one of the
+networks. Beside them stands the rule that imagines nothing: an object sticks to a gripper that
+closes near it. Differences are to the first row of networks; intervals: Wilson of shares, jackknife
+of AUROC, bootstrap of differences, over episodes. What is chosen by this must not be measured by
+it: kinds of the split `test` are refused. With `--recorded-arms` the networks and the rule are told
+where the arms really went, which nobody knows ahead: what that costs.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.predictor import (
@@ -43,7 +46,7 @@ from mtv_world_ros.model.object_motion.predictor import (
 from mtv_world_ros.ranking.no_picture_rule import is_done, Thing
 from mtv_world_ros.ranking.optimism import area_interval
 from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
-from mtv_world_ros.success.foreseen import ForeseenMotions
+from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.training.object_motion.tracks import (
     fine_commands,
@@ -55,6 +58,8 @@ from mtv_world_ros.training.object_motion.tracks import (
 VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'
 HEAD = ('judged by', 'n', 'right', 'AUROC', 'false success', 'false failure', 'Brier of the share')
+#: what is said by networks: what follows their name
+SAID = ('', ', shown', ', expected')
 _DRAWS = 2000
 
 
@@ -136,18 +141,24 @@ def found_by(plan: Plan, predictor: ObjectMotionPredictor) -> TrackedObjects:
     return predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
 
 
-def share_foreseen(plan: Plan, tracked: TrackedObjects) -> float | None:
-    """Returns which share of the motions of a plan succeeds; None = they do not tell."""
-    motions, _ = tracked.advance(plan.positions)
-    foreseen = ForeseenMotions(
+def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:
+    """Returns what motions say by `SAID`, 0 to 1; empty = they do not tell."""
+    frame = plan.frame
+    objects = FoundObjects(
         names=plan.names,
-        points=np.stack([motion.points for motion in motions]),
-        rotations=np.stack([motion.rotations for motion in motions]),
-        sizes=tracked.sizes,
-        openings=tracked.model.robot.gripper_openings(plan.positions[:: tracked.commands_a_step]),
+        frames=np.zeros((*frame.masks[:, 0].shape, 3), np.uint8),
+        masks=frame.masks,
+        poses=np.stack(frame.poses),
+        tracked=tracked,
     )
+    (ahead,) = objects.foresee([plan.positions])
+    foreseen = foreseen_of(tracked.model.robot, ahead, len(ahead.motions[0].points))
     succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
-    return None if succeeded is None else float(np.mean(succeeded))
+    if succeeded is None:
+        return []
+    share = float(np.mean(succeeded))
+    shown = objects.most_like(ahead, succeeded == (share >= 0.5))
+    return [share, float(succeeded[shown]), float(succeeded[0])]
 
 
 def ruled(plan: Plan, tracked: TrackedObjects) -> float:
@@ -177,9 +188,10 @@ def judged(
     if plan is None:
         return None
     found = [found_by(plan, predictor) for predictor in _LOADED.values()]
-    said = [share_foreseen(plan, tracked) for tracked in found]
-    known = [share for share in said if share is not None]
-    return (plan.success, [ruled(plan, found[0]), *known]) if len(known) == len(said) else None
+    said = [foreseen_by(plan, tracked) for tracked in found]
+    if not all(said):
+        return None
+    return plan.success, [ruled(plan, found[0]), *(value for values in said for value in values)]
 
 
 #: in a worker: the networks by their names
@@ -251,10 +263,10 @@ def main() -> None:
         raise MtvWorldError(f"'{options.dataset}' needs episodes that succeed and that fail")
     real = np.array([outcome for outcome, _ in found])
     columns = np.array([said for _, said in found]).T
-    judges = dict(zip((RULE, *options.networks), columns, strict=True))
+    names = [name + what for name in options.networks for what in SAID]
+    judges = dict(zip((RULE, *names), columns, strict=True))
     lines = [
-        difference(name, judges[options.networks[0]], judges[name], real, options.seed)
-        for name in options.networks[1:]
+        difference(name, judges[names[0]], judges[name], real, options.seed) for name in names[1:]
     ]
     publish(
         'foreseen_verdicts',
