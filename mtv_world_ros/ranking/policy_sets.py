@@ -114,6 +114,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-decoy-0.05',
         'expert-omit-2',
         'expert-omit-3',
+        'expert-fence-0.16',
+        'expert-fence-0.18',
+        'expert-jiggle-0.04',
+        'expert-jiggle-0.05',
+        'expert-tow-0.11',
+        'expert-tow-0.13',
     ),
     'calibrate': (
         'expert',
@@ -194,22 +200,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-falter-1',
         'expert-clamp-0.2',
         'expert-clamp-0.25',
-    ),
-    'test': (
-        'expert',
-        'expert-fence-0.16',
-        'expert-fence-0.18',
         'expert-leak-0.4',
         'expert-leak-0.42',
-        'expert-jiggle-0.04',
-        'expert-jiggle-0.05',
         'expert-hurl-5',
         'expert-hurl-6',
-        'expert-tow-0.11',
-        'expert-tow-0.13',
         'expert-jumble-1',
         'expert-jumble-2',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

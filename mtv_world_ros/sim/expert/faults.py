@@ -157,7 +157,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'fence': _kind(
         'lateral',
-        'test',
+        'train',
         0.17,
         0.6,
         '',
@@ -247,7 +247,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'leak': _kind(
         'opening',
-        'test',
+        'calibrate',
         0.4,
         1.0,
         '1/s',
@@ -274,7 +274,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'jiggle': _kind(
         'release',
-        'test',
+        'train',
         0.04,
         0.1,
         'm',
@@ -534,7 +534,12 @@ FAULTS: Mapping[str, FaultKind] = {
         'once lifted, it waves what it holds to and fro, this far',
     ),
     'hurl': _kind(
-        'speed', 'test', 5, 9.0, '', 'all is this share faster for as long as a gripper is shut'
+        'speed',
+        'calibrate',
+        5,
+        9.0,
+        '',
+        'all is this share faster for as long as a gripper is shut',
     ),
     # joint
     'zero': _kind(
@@ -597,7 +602,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'tow': _kind(
         'joint',
-        'test',
+        'train',
         0.12,
         0.5,
         '',
@@ -672,7 +677,7 @@ FAULTS: Mapping[str, FaultKind] = {
         'it comes down this far off and closes three times on its way to the right place',
     ),
     'jumble': _kind(
-        'any', 'test', 2, 4, '', 'number of way points that change places with the next one'
+        'any', 'calibrate', 2, 4, '', 'number of way points that change places with the next one'
     ),
     # any; the last one, as the others look for way points by their phase
     'omit': _kind('any', 'train', 2, 4, '', 'number of way points that are left out'),
