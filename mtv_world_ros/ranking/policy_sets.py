@@ -207,7 +207,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-jumble-1',
         'expert-jumble-2',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-swoop-0.3',
+        'expert-swoop-0.36',
+        'expert-thump-0.035',
+        'expert-thump-0.04',
+        'expert-taut-0.57',
+        'expert-taut-0.6',
+        'expert-lob-0.05',
+        'expert-lob-0.07',
+        'expert-gnaw-0.06',
+        'expert-gnaw-0.08',
+        'expert-smear-0.04',
+        'expert-smear-0.05',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

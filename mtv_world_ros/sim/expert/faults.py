@@ -114,6 +114,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share by which the grippers are faster or slower than the arms, at most',
     ),
+    'swoop': _kind(
+        'timing',
+        'test',
+        0.36,
+        0.5,
+        'm',
+        'it passes its object on a way of up to this length, and the fingers close as it goes',
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -127,6 +135,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'share of the way to its goal over which it drags the object before it lifts it',
+    ),
+    'thump': _kind(
+        'height',
+        'test',
+        0.035,
+        0.06,
+        'm',
+        'what it holds is thumped on its goal, three times, this deep',
     ),
     # lateral
     'shift': _kind(
@@ -253,6 +269,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '1/s',
         'share of its range by which a shut gripper opens a second',
     ),
+    'taut': _kind(
+        'opening',
+        'test',
+        0.58,
+        1.0,
+        '',
+        'the gripper gives way as its arm reaches out, by up to this share of its range',
+    ),
     # release
     'drops': _kind(
         'release', 'train', 0.5, 1.0, '', 'share of the way to the goal that it is dropped before'
@@ -279,6 +303,22 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'having let go, it shakes its fingers to and fro, this far',
+    ),
+    'gnaw': _kind(
+        'release',
+        'test',
+        0.06,
+        0.12,
+        'm',
+        'having let go, it closes three times on its way aside, this far',
+    ),
+    'lob': _kind(
+        'release',
+        'test',
+        0.05,
+        0.2,
+        'm',
+        'it swings what it holds this far, over its goal, and lets go in full swing',
     ),
     # collision
     'push': _kind(
@@ -438,6 +478,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.12,
         'm',
         'open fingers go this far towards the goal with the object between them, then close',
+    ),
+    'smear': _kind(
+        'collision',
+        'test',
+        0.04,
+        0.1,
+        'm',
+        'it lets go this far before its goal; shut fingers press on the object and drag it on',
     ),
     # object and place
     'wrong': _kind(
@@ -851,6 +899,8 @@ _TWITCH_EVERY_S = 0.8
 #: from shut to open or back as a gripper flickers [s]; how often at most; how long before it
 #: passes its middle it is still open, or shut [s]
 _FLICKER_S, _NUM_FLICKERS, _BEFORE_S = (0.1, 0.3), 30, 0.6
+#: way of a tool up to which its arm is at rest [m]
+_RESTS_M = 1e-6
 #: of an oscillation [Hz]
 _TREMBLE_HZ = 2.5
 #: length of a chunk of commands [s]
@@ -884,6 +934,12 @@ _OF_GRIPPERS = (
     'leak',
     'jiggle',
     'hurl',
+    'swoop',
+    'thump',
+    'taut',
+    'lob',
+    'smear',
+    'gnaw',
 )
 #: joints of a wrist, the last ones of an arm
 _NUM_WRIST = 3
@@ -1009,6 +1065,9 @@ def _opening_faults(
         since = _shut_since(positions, grippers, middles, opens) * period
         leaks = closed + np.minimum(variant.size('leak') * since, 1.0) * travel
         positions = _opened(positions, grippers, opens, leaks)
+    if variant.size('taut'):
+        yields = closed + variant.size('taut') * travel * _reach(positions, grippers, robot)
+        positions = _opened(positions, grippers, opens, yields)
     return positions
 
 
@@ -1403,6 +1462,15 @@ def _twitches(num: int, period: float) -> FloatArray:
     """(T, 1) from 0, which is most of the time, to 1."""
     times = np.arange(num) * period % _TWITCH_EVERY_S
     return np.interp(times, _JUMP_S * np.arange(4), [0.0, 1.0, 1.0, 0.0])[:, None]
+
+
+def _reach(positions: FloatArray, grippers: list[int], robot: RobotModel) -> FloatArray:
+    """(T, G) from 0 to 1: how far the arm of each gripper reaches over the table, of its most."""
+    tools = np.stack([poses[:, :2, 3] for poses in robot.tool_poses(positions)], axis=1)
+    ways = np.linalg.norm(tools - tools[0], axis=2)
+    most = ways.max(axis=0)
+    num_joints = positions.shape[1] // len(robot.tools)
+    return (ways / np.where(most > _RESTS_M, most, 1.0))[:, np.array(grippers) // num_joints]
 
 
 def _haste(positions: FloatArray, grippers: list[int], num_arms: int) -> FloatArray:

@@ -60,6 +60,10 @@ _KEEP_TEMPO = frozenset(
         'omit',
         'jiggle',
         'jumble',
+        'lob',
+        'thump',
+        'smear',
+        'gnaw',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -95,6 +99,13 @@ _NUM_NIBBLES = 3
 _DECOY_ARM_M = 0.27
 #: having let go, it shakes its fingers: how often, and time of a stroke [s]
 _NUM_JIGGLES, _JIGGLE_S = 3, 0.15
+
+#: how often fingers close on their way aside, once they have let go
+_NUM_GNAWS = 3
+#: time in which what it holds is swung over its goal [s]
+_LOB_S = 0.3
+#: what is held is thumped on its goal: how far it is raised [m], how often, time of a stroke [s]
+_THUMP_M, _NUM_THUMPS, _THUMP_S = 0.05, 3, 0.12
 
 
 @dataclass(frozen=True, slots=True)
@@ -902,6 +913,71 @@ def _jumble(stops: Stops, size: float, side: _Side) -> Stops:
     return stops
 
 
+def _gnaw(stops: Stops, size: float, side: _Side) -> Stops:
+    """Having let go, it closes and opens again and again on its way aside, and rises there.
+
+    To another side, drawn anew, where the arm does not reach so far.
+    """
+    end, way = _first(stops, 'open') + 1, size * _drawn_way(side)
+    opened = replace(stops[end - 1], phase='retreat')
+    bite = [replace(opened, seconds=None), replace(opened, opening=0.0), opened]
+    shares = np.arange(1, _NUM_GNAWS + 1) / _NUM_GNAWS
+    bites = [stop.moved(share * way) for share in shares for stop in bite]
+    rest = _changed(stops[end:], ('retreat',), lambda stop: stop.moved(way))
+    return [*stops[:end], *bites, *rest]
+
+
+def _lob(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds is swung over its goal, and the fingers open in full swing.
+
+    From any side, drawn anew, where it comes from nearer than that.
+    """
+    lower = _first(stops, 'lower')
+    way = (stops[lower].position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
+    distance = float(np.linalg.norm(way))
+    on = size * (way / distance if distance > size else _drawn_way(side))
+    carry, opened = stops[lower - 1 : lower + 2 : 2]
+    let_go = replace(opened, position=carry.position)
+    swung = replace(let_go, phase='lower', seconds=_LOB_S)
+    return [*stops[: lower - 1], carry.moved(-on), swung, let_go, *stops[lower + 2 :]]
+
+
+def _thump(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds is thumped on its goal, again and again, before it is let go."""
+    opened = _first(stops, 'open')
+    raised, low = (
+        replace(stops[opened - 1], seconds=_THUMP_S).moved(_up(to)) for to in (_THUMP_M, -size)
+    )
+    return [*stops[:opened], *[raised, low] * _NUM_THUMPS, *stops[opened:]]
+
+
+def _smear(stops: Stops, size: float, side: _Side) -> Stops:
+    """It lets go on the way to its goal, and shut fingers press on the object and drag it on.
+
+    From any side, drawn anew, where it comes from nearer than that.
+    """
+    lower, end = _first(stops, 'lower'), _first(stops, 'retreat') + 1
+    way = (stops[lower].position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
+    distance = float(np.linalg.norm(way))
+    on = size * (way / distance if distance > size else _drawn_way(side))
+    short = [stop.moved(-on) for stop in stops[lower - 1 : end]]
+    above = replace(short[-1], opening=0.0)
+    down = replace(short[1], phase='retreat', opening=0.0).moved(_up(_PAW_HEIGHT_M))
+    dragged = [above, down, down.moved(on), above.moved(on)]
+    return [*stops[: lower - 1], *short, *dragged, *stops[end:]]
+
+
+def _swoop(stops: Stops, size: float, side: _Side) -> Stops:
+    """Open fingers pass along both sides of the object, and close as they go.
+
+    How far and from which end is drawn, anew where the arm does not reach so far.
+    """
+    first, way = _first(stops, 'close'), size * side.play.uniform(-0.5, 0.5) * side.across
+    comes = [stop.moved(-way) for stop in stops[:first]]
+    goes = [stop.moved(way) for stop in stops[first : first + 2]]
+    return [*comes, *goes, *stops[first + 2 :]]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -980,4 +1056,9 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'fence': _fence,
     'jiggle': _jiggle,
     'jumble': _jumble,
+    'gnaw': _gnaw,
+    'lob': _lob,
+    'thump': _thump,
+    'smear': _smear,
+    'swoop': _swoop,
 }

@@ -231,6 +231,12 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'leak',
         'jiggle',
         'hurl',
+        'swoop',
+        'thump',
+        'taut',
+        'lob',
+        'smear',
+        'gnaw',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -342,6 +348,8 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
         ('grind', 0.6, 80),
         ('waggle', 0.3, 80),
         ('jiggle', 0.6, 40),
+        ('smear', 0.35, 80),
+        ('gnaw', 0.6, 80),
     ],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
@@ -850,6 +858,100 @@ def test_any_two_way_points_but_the_last_may_change_places():
     assert firsts == set(range(len(stops) - 2))
 
 
+def test_fingers_that_have_let_go_close_three_times_on_their_way_aside():
+    stops, changed = changed_stops('expert-gnaw-0.06')
+    assert changed[:7] == stops[:7] and changed[-1] == stops[-1] and len(changed) == 18
+    bites = changed[7:16]
+    assert [stop.opening for stop in bites] == [0.7, 0, 0.7] * 3
+    ways = np.array([stop.position - stops[6].position for stop in bites])
+    way = ways[-1]
+    assert np.linalg.norm(way) == pytest.approx(0.06) and way[2] == 0
+    np.testing.assert_allclose(ways, np.outer(np.repeat([1, 2, 3], 3) / 3, way), atol=1e-12)
+    np.testing.assert_allclose(changed[16].position, stops[7].position + way)
+
+
+@pytest.mark.parametrize('far', [0.06, 0.2])
+def test_what_it_holds_is_swung_over_its_goal_and_let_go_on_the_way(far):
+    stops, changed = changed_stops(f'expert-lob-{far}')
+    assert changed[:4] == stops[:4] and changed[-2:] == stops[-2:] and len(changed) == len(stops)
+    assert [stop.phase for stop in changed] == [stop.phase for stop in stops]
+    begin, swung, let_go = changed[4:7]
+    # over the goal, at the height from which it would have come down
+    np.testing.assert_array_equal(swung.position, stops[4].position)
+    np.testing.assert_array_equal(let_go.position, stops[4].position)
+    assert (begin.opening, swung.opening, let_go.opening) == (0, 0.7, 0.7)
+    assert swung.seconds is not None
+    way = swung.position - begin.position
+    assert np.linalg.norm(way) == pytest.approx(far) and way[2] == 0
+    # from where it comes from, which is 0.2 m away
+    if far < 0.2:
+        np.testing.assert_allclose(way, [-far, 0, 0], atol=1e-12)
+
+
+def test_what_it_holds_is_thumped_on_its_goal_three_times():
+    stops, changed = changed_stops('expert-thump-0.025')
+    assert changed[:6] == stops[:6] and changed[12:] == stops[6:] and len(changed) == 15
+    blows, goal = changed[6:12], stops[5].position
+    ways = np.array([stop.position - goal for stop in blows])
+    np.testing.assert_allclose(ways, [[0, 0, 0.05], [0, 0, -0.025]] * 3, atol=1e-12)
+    assert all(stop.opening == 0 and 0 < (stop.seconds or 0) < 0.2 for stop in blows)
+
+
+def test_a_gripper_gives_way_as_its_arm_reaches_out(expert):
+    expert_plan, taut = plan(expert, 'expert'), plan(expert, 'expert-taut-0.4')
+    arms = arm_columns(expert)
+    np.testing.assert_array_equal(taut[:, arms], expert_plan[:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, taut)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
+    places = expert.robot.tool_poses(expert_plan)[used][:, :2, 3]
+    reach = np.linalg.norm(places - places[0], axis=1)
+    wanted = np.maximum(openings[0][used], 0.4 * reach / reach.max())
+    np.testing.assert_allclose(openings[1][used], wanted, atol=1e-9)
+    is_shut = openings[0][used] < 1e-9
+    assert openings[1][used][is_shut].max() > 0.3
+
+
+@pytest.mark.parametrize('far', [0.04, 0.1])
+def test_what_was_let_go_before_its_goal_is_dragged_on_from_above(far):
+    stops, changed = changed_stops(f'expert-smear-{far}')
+    assert changed[:4] == stops[:4] and changed[-1] == stops[-1] and len(changed) == 13
+    short = np.array(
+        [a.position - b.position for a, b in zip(changed[4:8], stops[4:8], strict=True)]
+    )
+    # from where it comes from
+    way = np.array([-far, 0, 0])
+    np.testing.assert_allclose(short, np.broadcast_to(-way, (4, 3)), atol=1e-12)
+    assert [stop.opening for stop in changed[4:8]] == [s.opening for s in stops[4:8]]
+    dragged, goal = changed[8:12], stops[5].position
+    assert all(stop.opening == 0 for stop in dragged)
+    ways = np.array([stop.position - goal for stop in dragged])
+    # pressed on it 1 cm over where it was held
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0.01, 0.01, 0.1], atol=1e-12)
+    begin_and_end = [-way, -way, 0 * way, 0 * way]
+    np.testing.assert_allclose(ways * (1, 1, 0), begin_and_end, atol=1e-12)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.5])
+def test_open_fingers_close_as_they_pass_along_the_object(yaw):
+    stops, _ = changed_stops('expert')
+    faults = WayPointFaults(parse_variant('expert-swoop-0.2'), np.random.default_rng(0))
+    ends = []
+    for _ in range(20):
+        changed = faults.applied(stops, yaw, [])
+        assert changed[4:] == stops[4:] and len(changed) == len(stops)
+        assert [stop.opening for stop in changed] == [stop.opening for stop in stops]
+        pairs = zip(changed[:4], stops[:4], strict=True)
+        ways = np.array([a.position - b.position for a, b in pairs])
+        end = ways[2]
+        np.testing.assert_allclose(ways, [-end, -end, end, end], atol=1e-12)
+        # across the fingers' travel, so that they pass on both sides
+        across = end @ [-np.sin(yaw), np.cos(yaw), 0]
+        assert np.linalg.norm(end) == pytest.approx(abs(across))
+        ends.append(across)
+    assert min(ends) < -0.05 and max(ends) > 0.05 and np.abs(ends).max() <= 0.1
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06), ('decoy', 0.05)],
@@ -1042,6 +1144,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'hurl',
         'tow',
         'jumble',
+        'gnaw',
+        'lob',
+        'swoop',
+        'thump',
+        'taut',
+        'smear',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1148,9 +1256,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-jiggle-0.03' has jiggle"
+    said = r"split test are not for training: 'expert-high-0.1-smear-0.03' has smear"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-jiggle-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-smear-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
