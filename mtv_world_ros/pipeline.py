@@ -48,6 +48,8 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
 SEED_STEP = 1_000_003
+#: objects are foreseen so far at once, before the first chunk of it is imagined [s]
+_FORESEEN_S = 12.0
 #: of an estimate for which the model was shown no motion
 _UNSEEN = 'no view shows a tool at any time'
 
@@ -423,7 +425,8 @@ class ImaginedEpisode:
     ) -> tuple[ByteArray | None, tuple[FoundObjects, ...]]:
         """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after a plan.
 
-        None where the model is not shown them. The objects are those after each of the `plans`.
+        None where the model is not shown them. The objects are those after each of the `plans`,
+        or of the first ones of them.
         """
         pipeline, plan = self.pipeline, plans[0]
         if pipeline.object_motion is None or not pipeline.rendering.object_motion:
@@ -434,6 +437,7 @@ class ImaginedEpisode:
             objects = state.objects
             if objects is None or objects.names != self.names:
                 objects = self._find_objects(state, poses[:, 0], start_masks)
+            plans = plans[: ceil(_FORESEEN_S / float(plan.times[-1] - plan.times[0]))]
             ahead = objects.foresee(self._commands(plans, objects.tracked))
             shown = objects.most_like(ahead[-1], self._believed(state, plans[-1], ahead[-1]))
             ahead = tuple(replace(part, shown=shown) for part in ahead)

@@ -348,6 +348,28 @@ def test_pictures_show_what_most_of_the_motions_say(recording: Recording) -> Non
     assert np.array_equal(shown(0.0, 0.06, 0.06), moved)
 
 
+def test_a_long_plan_is_foreseen_in_parts(
+    recording: Recording, world_model: CountingWorldModel
+) -> None:
+    """So that its first chunk does not wait for all of it."""
+    log: list[int] = []
+    pipeline = replace(
+        assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM),
+        object_motion=DriftingObjects(log),
+    )
+    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    long = JointTrajectory(
+        joint_names=YAM.joint_names,
+        times=np.array([20.0]),
+        positions=episode.observation.positions[None],
+    )
+    chunks = episode.extend(long)
+    next(chunks)
+    assert log == [0, *range(16, 129, 16)]
+    list(chunks)
+    assert log == [0, *range(16, 209, 16)] and len(world_model.trajectories) == 13
+
+
 class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 

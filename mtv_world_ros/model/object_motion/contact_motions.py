@@ -102,7 +102,8 @@ class ContactMotions:
     def centres(self) -> FloatArray:
         """(O, 3) where the solids were found [m], NaN = not seen by two views."""
         unknown = np.full(3, np.nan)
-        return np.array([unknown if one is None else one.centre for one in self.solids])
+        centres = [unknown if one is None else one.centre for one in self.solids]
+        return np.array(centres).reshape(-1, 3)
 
     @property
     def sizes(self) -> FloatArray:

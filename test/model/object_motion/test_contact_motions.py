@@ -165,6 +165,9 @@ def test_an_object_that_was_not_seen_is_not_known(robot, response):
     motions = motions_of(response, None)
     points, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
     assert points.shape == (1, 3, 1, 3) and motions.sizes.shape == (1, 1, 3)
+    nothing = motions_of(response)
+    points, _, _ = nothing.advance(robot, still(robot, 0.2), ROWS)
+    assert points.shape == (1, 3, 0, 3) and nothing.centres.shape == (0, 3)
 
 
 def test_robots_of_which_contact_cannot_be_computed_are_named(robot, response):
