@@ -511,21 +511,21 @@ class ImaginedEpisode:
             pipeline.robot, state.observation.cameras, positions, start_masks, masks
         )
         num_left = pipeline.spec.num_frames - footage.num_frames
-        foreseen = self._foreseen(state, objects, num_left)
+        foreseen = None if objects is None else self._foreseen(state, objects, num_left)
         return pipeline.estimator.estimate(
             footage, self.instruction, state.memory, foreseen, is_real=is_real
         )
 
     def _foreseen(
-        self, state: RolloutState, objects: FoundObjects | None, num_left: int
+        self, state: RolloutState, objects: FoundObjects, num_left: int
     ) -> ForeseenMotions | None:
         """Motions until the end of a chunk without its last frames; None = they do not count."""
         # where the rollout began earlier, objects were found half hidden, or off the table
         begun = state.memory is None or state.memory.num_frames == 1 + state.num_imagined
-        if not begun or objects is None or objects.positions is None:
+        if not begun:
             return None
         left_s = num_left / self.pipeline.spec.fps
-        num = len(objects.positions) - round(left_s / objects.tracked.step_s)
+        num = len(objects.motions[0].points) - round(left_s / objects.tracked.step_s)
         return foreseen_of(self.pipeline.robot, objects, num)
 
     def _believed(

@@ -90,6 +90,12 @@ def commands(recording: Recording, seconds: float) -> JointTrajectory:
     )
 
 
+def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:
+    """A pipeline that shows the model where objects go."""
+    card = CARD.replace(rendering={'object_motion': True})
+    return replace(assemble(card, world_model, robot=YAM), object_motion=object_motion)
+
+
 def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
     episode = pipeline.begin(observe(recording), instruction=recording.instruction, **options)
     return list(episode.extend(commands(recording, seconds)))
@@ -336,10 +342,7 @@ class ThreeWays:
 def test_pictures_show_what_most_of_the_motions_say(recording: Recording) -> None:
     def shown(*ways: float) -> np.ndarray:
         world_model = CountingWorldModel(SPEC)
-        pipeline = assemble(
-            CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM
-        )
-        imagine(replace(pipeline, object_motion=ThreeWays(*ways)), recording, 1.6)
+        imagine(with_motion(world_model, ThreeWays(*ways)), recording, 1.6)
         return world_model.trajectories[0]
 
     still, moved = shown(0.0, 0.0, 0.0), shown(0.06, 0.06, 0.06)
@@ -353,10 +356,7 @@ def test_a_long_plan_is_foreseen_in_parts(
 ) -> None:
     """So that its first chunk does not wait for all of it."""
     log: list[int] = []
-    pipeline = replace(
-        assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM),
-        object_motion=DriftingObjects(log),
-    )
+    pipeline = with_motion(world_model, DriftingObjects(log))
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
     long = JointTrajectory(
         joint_names=YAM.joint_names,
@@ -398,10 +398,7 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
     log: list[int] = []
-    pipeline = replace(
-        assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM),
-        object_motion=DriftingObjects(log),
-    )
+    pipeline = with_motion(world_model, DriftingObjects(log))
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
     list(episode.extend(commands(recording, 3.2)))
     assert log == [0, 16, 32]  # found once; two chunks of 1.6 s in steps of 0.1 s
@@ -415,9 +412,8 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
 def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
-    pipeline = assemble(CARD.replace(rendering={'object_motion': True}), world_model, robot=YAM)
-    predictor = ObjectMotionPredictor([Member(network=ObjectMotionNetwork())], pipeline.robot)
-    episode = replace(pipeline, object_motion=predictor).begin(observe(recording))
+    predictor = ObjectMotionPredictor([Member(network=ObjectMotionNetwork())], YAM)
+    episode = with_motion(world_model, predictor).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
     assert len(chunks) == 2 and chunks[-1].masks.names == ()
 
@@ -529,9 +525,8 @@ class SlidingModel:
 def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
     world_model: CountingWorldModel, recording: Recording
 ) -> None:
-    card = CARD.replace(rendering={'object_motion': True})
     model = SlidingModel()
-    pipeline = replace(assemble(card, world_model, robot=YAM), object_motion=model)
+    pipeline = with_motion(world_model, model)
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
     chunks = list(episode.extend(commands(recording, 3.2)))
     num_objects = len(chunks[0].masks.names)

@@ -16,7 +16,7 @@ from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.success.calibration import Calibration, weighed, Weights
-from mtv_world_ros.success.estimator import capped, stated_probability, STATED_WEIGHTS
+from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
 from mtv_world_ros.success.evidence import FEATURES
 
 #: fewer episodes of known outcome than this say nothing
@@ -57,9 +57,7 @@ class Sample:
     @property
     def as_observed(self) -> Sample:
         """The same with the recorded frames in place of the imagined ones."""
-        features = dict(self.observed)
-        before = capped(stated_probability(features), features) if features else nan
-        return replace(self, features=(features,), before=(before,))
+        return replace(self, features=(self.observed,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,9 +1,10 @@
 """Motions of objects as rigid bodies: what a robot's commands do to the solids that masks show.
 
-Nothing here is learned from motions of objects: shapes are those of the masks, arms follow as
-`ArmResponse` found, and friction, weight and the grip of fingers are guesses that a checkpoint
-states (`contact.json`). So a kind of mistake that no training had is no stranger than another.
-Several motions begin with places, sizes, friction, weight and grip within the error of these.
+No network is trained here: shapes are those of the masks, arms follow as `ArmResponse` found, and
+friction, weight and the grip of fingers are numbers that were found in recordings and that a
+checkpoint states (`contact.json`). So a kind of mistake that no training had is no stranger than
+another. Several motions begin with places, sizes, friction, weight and grip within the error of
+these.
 
 Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 """

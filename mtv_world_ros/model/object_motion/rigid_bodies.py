@@ -38,8 +38,8 @@ _SIDES = 16
 #: side of the square that has the area of a circle, in radii; a capsule is this much longer than
 #: its cylinder, in radii
 _SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
-#: what is slower than this is at rest [m/s], [rad/s]; an arm that is nearer to its way is on it
-#: [m or rad], [m/s or rad/s]
+#: what is slower than this is at rest, turns [rad/s] before ways [m/s]; an arm that is nearer to
+#: its way is on it [m or rad], [m/s or rad/s]
 _REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 _ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
 _LEAST_KG = 0.01

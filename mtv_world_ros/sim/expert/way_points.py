@@ -451,9 +451,7 @@ def _putt(stops: Stops, size: float, side: _Side) -> Stops:
     """
     lower, end = _first(stops, 'lower'), _first(stops, 'retreat') + 1
     goal, rise = stops[lower], stops[end - 1].position - stops[end - 2].position
-    way = (goal.position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
-    distance = float(np.linalg.norm(way))
-    on = way / distance if distance > size else side.anywhere
+    on = _direction(stops[_first(stops, 'grasp')], goal, size, lambda: side.anywhere)
     short = [stop.moved(-size * on) for stop in stops[lower - 1 : end]]
     beside = side.play.normal(0.0, _PUTT_BESIDE_M) * np.array([-on[1], on[0], 0.0])
     push = _pushed(goal.moved(beside), 0.0, rise, on, size)
@@ -692,9 +690,8 @@ def _undo(stops: Stops, size: float, side: _Side) -> Stops:
     """Once it has let go, it closes, carries what it holds back, and lets go again."""
     opened, rise = _first(stops, 'open'), _up(_TRY_LIFT_M)
     released = stops[opened]
-    back = (stops[_first(stops, 'grasp')].position - released.position) * (1, 1, 0)
-    distance = float(np.linalg.norm(back))
-    way = size * (back / distance if distance > size else side.anywhere)
+    grasp = stops[_first(stops, 'grasp')]
+    way = size * _direction(released, grasp, size, lambda: side.anywhere)
     closed = replace(released, opening=0.0)
     held = replace(closed, seconds=None)
     again = [
@@ -837,9 +834,8 @@ def _rake(stops: Stops, size: float, side: _Side) -> Stops:
     To any side where the goal is nearer than that.
     """
     first = _first(stops, 'close')
-    way = (stops[_first(stops, 'lower')].position - stops[first].position) * (1, 1, 0)
-    distance = float(np.linalg.norm(way))
-    on = size * (way / distance if distance > size else side.anywhere)
+    lower = stops[_first(stops, 'lower')]
+    on = size * _direction(stops[first], lower, size, lambda: side.anywhere)
     rest = _changed(stops[first:], ('close', 'lift'), lambda stop: stop.moved(on))
     return [*stops[:first], stops[first - 1].moved(on), *rest]
 
@@ -933,9 +929,8 @@ def _lob(stops: Stops, size: float, side: _Side) -> Stops:
     From any side, drawn anew, where it comes from nearer than that.
     """
     lower = _first(stops, 'lower')
-    way = (stops[lower].position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
-    distance = float(np.linalg.norm(way))
-    on = size * (way / distance if distance > size else _drawn_way(side))
+    grasp = stops[_first(stops, 'grasp')]
+    on = size * _direction(grasp, stops[lower], size, lambda: _drawn_way(side))
     carry, opened = stops[lower - 1 : lower + 2 : 2]
     let_go = replace(opened, position=carry.position)
     swung = replace(let_go, phase='lower', seconds=_LOB_S)
@@ -957,9 +952,8 @@ def _smear(stops: Stops, size: float, side: _Side) -> Stops:
     From any side, drawn anew, where it comes from nearer than that.
     """
     lower, end = _first(stops, 'lower'), _first(stops, 'retreat') + 1
-    way = (stops[lower].position - stops[_first(stops, 'grasp')].position) * (1, 1, 0)
-    distance = float(np.linalg.norm(way))
-    on = size * (way / distance if distance > size else _drawn_way(side))
+    grasp = stops[_first(stops, 'grasp')]
+    on = size * _direction(grasp, stops[lower], size, lambda: _drawn_way(side))
     short = [stop.moved(-on) for stop in stops[lower - 1 : end]]
     above = replace(short[-1], opening=0.0)
     down = replace(short[1], phase='retreat', opening=0.0).moved(_up(_PAW_HEIGHT_M))
@@ -981,6 +975,15 @@ def _swoop(stops: Stops, size: float, side: _Side) -> Stops:
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
+
+
+def _direction(
+    begin: WayPoint, end: WayPoint, least: float, other: Callable[[], FloatArray]
+) -> FloatArray:
+    """Unit vector (3,) in the plane towards another way point; `other` where that is too near."""
+    way = (end.position - begin.position) * (1, 1, 0)
+    distance = float(np.linalg.norm(way))
+    return way / distance if distance > least else other()
 
 
 def _drawn_way(side: _Side) -> FloatArray:

@@ -72,6 +72,16 @@ def arm_columns(expert) -> list[int]:
     return [j for j in range(len(expert.robot.joint_names)) if j not in grippers]
 
 
+def used_openings(expert, name: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """The gripper that a plan uses, its openings, and with a fault that changes nothing else."""
+    plans, arms = [plan(expert, one) for one in ('expert', name)], arm_columns(expert)
+    np.testing.assert_array_equal(plans[1][:, arms], plans[0][:, arms])
+    openings = [expert.robot.gripper_openings(positions) for positions in plans]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
+    return used, openings[0][used], openings[1][used]
+
+
 def test_a_loop_carries_out_commands_of_its_length_once_more(expert):
     expert_plan, loop = plan(expert, 'expert'), plan(expert, 'expert-loop-2')
     assert len(loop) == len(expert_plan) + 100
@@ -504,13 +514,7 @@ def test_it_is_put_on_the_other_object_next_to_its_goal_and_taken_again(is_near)
 
 
 def test_a_gripper_flickers_after_it_has_opened_or_closed(expert):
-    expert_plan, chatter = plan(expert, 'expert'), plan(expert, 'expert-chatter-0.6')
-    arms = arm_columns(expert)
-    np.testing.assert_array_equal(chatter[:, arms], expert_plan[:, arms])
-    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, chatter)]
-    used = int(np.argmax(np.ptp(openings[0], axis=1)))
-    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
-    own, flickers = openings[0][used], openings[1][used]
+    _, own, flickers = used_openings(expert, 'expert-chatter-0.6')
     closes, lets_go = np.flatnonzero(np.diff(own > 0.5)) + 1
     differs = np.flatnonzero(np.abs(flickers - own) > 1e-9)
     after = [differs[differs < lets_go] - closes, differs[differs >= lets_go] - lets_go]
@@ -518,7 +522,7 @@ def test_a_gripper_flickers_after_it_has_opened_or_closed(expert):
     assert all(0 < rows.min() <= 15 and 20 < rows.max() <= 35 for rows in after)
     assert flickers[closes + after[0]].max() > 0.8
     # as long as it flickers, another size draws the same
-    longer = plan(expert, 'expert-chatter-1')
+    chatter, longer = plan(expert, 'expert-chatter-0.6'), plan(expert, 'expert-chatter-1')
     np.testing.assert_array_equal(longer[: closes + 29], chatter[: closes + 29])
 
 
@@ -711,14 +715,7 @@ def test_any_way_point_but_the_last_may_be_left_out():
 
 
 def test_grippers_stand_still_half_way_whenever_they_open_or_close(expert):
-    expert_plan, falter = plan(expert, 'expert'), plan(expert, 'expert-falter-0.6')
-    arms = arm_columns(expert)
-    assert len(falter) == len(expert_plan)
-    np.testing.assert_array_equal(falter[:, arms], expert_plan[:, arms])
-    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, falter)]
-    used = int(np.argmax(np.ptp(openings[0], axis=1)))
-    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
-    own, stands = openings[0][used], openings[1][used]
+    _, own, stands = used_openings(expert, 'expert-falter-0.6')
     closes, lets_go = np.flatnonzero(np.diff(own > 0.5)) + 1
     for first in (closes, lets_go):
         # 0.6 s at 50 Hz, then a tenth of a second to where it should be
@@ -775,13 +772,7 @@ def test_an_arm_stops_before_what_is_farthest_away():
 
 
 def test_a_gripper_that_is_shut_opens_slowly(expert):
-    expert_plan, leak = plan(expert, 'expert'), plan(expert, 'expert-leak-0.2')
-    arms = arm_columns(expert)
-    np.testing.assert_array_equal(leak[:, arms], expert_plan[:, arms])
-    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, leak)]
-    used = int(np.argmax(np.ptp(openings[0], axis=1)))
-    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
-    own, leaks = openings[0][used], openings[1][used]
+    _, own, leaks = used_openings(expert, 'expert-leak-0.2')
     shut = np.flatnonzero(own < 0.5)
     assert np.ptp(shut) == len(shut) - 1
     seconds = (np.arange(len(shut)) + 1) / 50
@@ -898,18 +889,11 @@ def test_what_it_holds_is_thumped_on_its_goal_three_times():
 
 
 def test_a_gripper_gives_way_as_its_arm_reaches_out(expert):
-    expert_plan, taut = plan(expert, 'expert'), plan(expert, 'expert-taut-0.4')
-    arms = arm_columns(expert)
-    np.testing.assert_array_equal(taut[:, arms], expert_plan[:, arms])
-    openings = [expert.robot.gripper_openings(positions) for positions in (expert_plan, taut)]
-    used = int(np.argmax(np.ptp(openings[0], axis=1)))
-    np.testing.assert_array_equal(openings[1][1 - used], openings[0][1 - used])
-    places = expert.robot.tool_poses(expert_plan)[used][:, :2, 3]
+    used, own, taut = used_openings(expert, 'expert-taut-0.4')
+    places = expert.robot.tool_poses(plan(expert, 'expert'))[used][:, :2, 3]
     reach = np.linalg.norm(places - places[0], axis=1)
-    wanted = np.maximum(openings[0][used], 0.4 * reach / reach.max())
-    np.testing.assert_allclose(openings[1][used], wanted, atol=1e-9)
-    is_shut = openings[0][used] < 1e-9
-    assert openings[1][used][is_shut].max() > 0.3
+    np.testing.assert_allclose(taut, np.maximum(own, 0.4 * reach / reach.max()), atol=1e-9)
+    assert taut[own < 1e-9].max() > 0.3
 
 
 @pytest.mark.parametrize('far', [0.04, 0.1])
