@@ -138,7 +138,7 @@ def read_plan(path: Path, robot: RobotModel, recorded_arms: bool = False) -> Pla
 
 def found_by(plan: Plan, predictor: ObjectMotionPredictor) -> TrackedObjects:
     """Returns the objects of a plan's first frame."""
-    return predictor.find(plan.frame.masks, plan.frame.cameras, plan.frame.poses)
+    return predictor.find(plan.names, plan.frame.masks, plan.frame.cameras, plan.frame.poses)
 
 
 def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:

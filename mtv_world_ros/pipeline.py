@@ -468,7 +468,9 @@ class ImaginedEpisode:
             frames=state.observation.frames,
             masks=start_masks.masks[:, :, 0],
             poses=poses,
-            tracked=pipeline.object_motion.find(sharp.masks[:, :, 0], source.cameras, list(poses)),
+            tracked=pipeline.object_motion.find(
+                self.names, sharp.masks[:, :, 0], source.cameras, list(poses)
+            ),
         )
 
     def _camera_poses(self, positions: FloatArray) -> FloatArray:

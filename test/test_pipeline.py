@@ -534,6 +534,7 @@ def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
     point = (
         SlidingModel()
         .find(
+            chunks[0].masks.names,
             chunks[0].start_masks.masks[:, :, 0],
             chunks[0].start.cameras,
             [camera.T_mount_camera for camera in chunks[0].start.cameras],

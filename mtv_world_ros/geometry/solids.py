@@ -6,7 +6,8 @@ V views, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import re
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ _TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
 #: a box must fit by so much better than a cylinder, which has two numbers less
 _BETTER = 0.9
 _MAX_EVALUATIONS = 60
+#: words for what is hollow and open at the top
+_VESSEL = re.compile(r'\b(basket|bin|bowl|bucket|cup|dish|glass|jar|mug|plate|pot|tray|vase)s?\b')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +41,7 @@ class Solid:
         size: (3,) along its own x, y and z [m].
         yaw: about z [rad].
         is_round: a cylinder.
+        is_open: at the top, and hollow.
         error_px: by how much its outline misses those of the masks, root mean square.
     """
 
@@ -45,7 +49,13 @@ class Solid:
     size: FloatArray
     yaw: float = 0.0
     is_round: bool = False
+    is_open: bool = False
     error_px: float = 0.0
+
+
+def is_vessel(name: str) -> bool:
+    """Tells whether what is called so is hollow and open at the top, which no mask shows."""
+    return _VESSEL.search(name.lower()) is not None
 
 
 def fit_solid(
@@ -54,11 +64,13 @@ def fit_solid(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
     floor: float = 0.0,
+    *,
+    is_open: bool = False,
 ) -> Solid | None:
     """Returns the solid whose outlines are nearest to those of an object.
 
     Of a block whose masks are whole at 384 x 288, place and size are found to half a millimetre.
-    What a mask does not show (hidden parts, hollows) the solid does not have.
+    What a mask does not show (hidden parts, hollows) the solid does not have, but `is_open`.
 
     Args:
         masks: (V, H, W) of one frame.
@@ -66,6 +78,7 @@ def fit_solid(
         cameras: V cameras at the masks' size.
         poses: V of T_base_camera (4, 4).
         floor: height on which things stand, most of them [m].
+        is_open: see `Solid`.
 
     Returns:
         None where no two views see it.
@@ -105,7 +118,7 @@ def fit_solid(
                 error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
                 best = found.cost, _solid(found.x, turn is None, error)
     assert best is not None
-    return best[1]
+    return replace(best[1], is_open=is_open)
 
 
 def _solid(numbers: FloatArray, is_round: bool, error_px: float) -> Solid:

@@ -11,6 +11,7 @@ Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.rigid_bodies import BodyState, RigidBodies
+from mtv_world_ros.model.object_motion.finger_swing import together
+from mtv_world_ros.model.object_motion.rigid_bodies import Arms, BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
 _SUBSTEPS = 10
@@ -47,6 +49,8 @@ class ContactMotions:
         states: K, of all bodies; empty = nothing has moved yet.
         arms: where the arms would be by now if nothing were touched.
         speeds: (D,) of these arms, in the engine's order.
+        swings: (2, K, F) how far fingers swing off their ways then, and how fast; see
+            `FingerDrives`.
     """
 
     settings: ContactSettings
@@ -55,6 +59,7 @@ class ContactMotions:
     states: tuple[BodyState, ...] = ()
     arms: ArmState | None = None
     speeds: FloatArray | None = None
+    swings: FloatArray | None = None
 
     def advance(
         self, robot: RobotModel, positions: FloatArray, rows: int
@@ -77,22 +82,22 @@ class ContactMotions:
         free = replace(self.response, floor=None)
         where, arms = free.follow(robot, positions, self.arms)
         points, turned, states = [], [], []
-        speeds = None
-        for number in range(self.settings.num_motions):
-            settings, solids = self._disturbed(number)
-            bodies = RigidBodies(robot, self.response, solids, settings, _STEP_S)
+        worlds = [
+            RigidBodies(robot, self.response, solids, settings, _STEP_S, positions[0])
+            for settings, solids in map(self._disturbed, range(self.settings.num_motions))
+        ]
+        courses, speeds, swings = self._courses([one.arms for one in worlds], where)
+        for number, (bodies, course) in enumerate(zip(worlds, courses, strict=True)):
             start = bodies.poses()[:, :3, :3]
-            ways, velocities = self._expected(bodies, where)
-            speeds = velocities[-1]
             if self.states:
                 bodies.state = self.states[number]
             else:
-                bodies.arms.skeleton.setPositions(ways[0])
-            poses = _run(bodies, ways, velocities, rows)
+                bodies.arms.skeleton.setPositions(course.free[0])
+            poses = _run(bodies, course, rows)
             states.append(bodies.state)
             points.append(poses[..., :3, 3])
             turned.append(poses[..., :3, :3] @ np.swapaxes(start, -1, -2))
-        then = replace(self, states=tuple(states), arms=arms, speeds=speeds)
+        then = replace(self, states=tuple(states), arms=arms, speeds=speeds, swings=swings)
         return (
             self._of_all(np.stack(points), np.nan),
             self._of_all(np.stack(turned), np.eye(3)),
@@ -121,15 +126,28 @@ class ContactMotions:
         filled[:, :, known] = found
         return filled
 
-    def _expected(self, bodies: RigidBodies, where: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ways and velocities (1 + N, D) of the arms in free air, at the engine's steps."""
-        coarse = bodies.arms.ways(where)
+    def _courses(
+        self, arms: Sequence[Arms], where: FloatArray
+    ) -> tuple[list[_Course], FloatArray, FloatArray]:
+        """What the arms of K motions are to do; `speeds` and `swings` after it."""
+        coarse, fingers = arms[0].ways(where), arms[0].fingers
         times = np.arange(len(coarse)) * PERIOD_S
         first = np.zeros(coarse.shape[1]) if self.speeds is None else self.speeds
         curve = CubicSpline(times, coarse, bc_type=((1, first), 'not-a-knot'))  # type: ignore[arg-type]
         ways = curve(np.arange((len(coarse) - 1) * _SUBSTEPS + 1) * _STEP_S)
         velocities = np.concatenate([first[None], np.diff(ways, axis=0) / _STEP_S])
-        return ways, velocities
+        carried = arms[0].carried(coarse, curve(times, 1), curve(times, 2))
+        forces, pulls = (_between(rows) for rows in carried)
+        start = np.zeros((2, len(arms), len(fingers))) if self.swings is None else self.swings
+        drives = together([one.finger_drives for one in arms])
+        swings, then = drives.swings(pulls, ways[:, fingers], _STEP_S, start)
+        courses = []
+        for off, speed in zip(swings, start[1], strict=True):
+            free, fast = ways.copy(), velocities.copy()
+            free[:, fingers] += off
+            fast[:, fingers] += np.concatenate([speed[None], np.diff(off, axis=0) / _STEP_S])
+            courses.append(_Course(ways, velocities, forces, free, fast))
+        return courses, velocities[-1], then
 
     def _disturbed(self, number: int) -> tuple[ContactSettings, list[Solid]]:
         """Settings and solids of a motion; those of the first are as they are."""
@@ -185,22 +203,49 @@ def _disturbed(solid: Solid, table: float, share: float, rng: np.random.Generato
     )
 
 
-def _run(bodies: RigidBodies, ways: FloatArray, velocities: FloatArray, every: int) -> FloatArray:
-    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven along their ways.
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """What arms are to do, at steps of the engine.
+
+    Attributes:
+        ways: (1 + N, D) of drives.
+        velocities: (1 + N, D) likewise.
+        forces: (N, D) that move them so.
+        free: (1 + N, D) where all is if nothing is touched; fingers swing.
+        fast: (1 + N, D) velocities there.
+    """
+
+    ways: FloatArray
+    velocities: FloatArray
+    forces: FloatArray
+    free: FloatArray
+    fast: FloatArray
+
+
+def _between(rows: FloatArray) -> FloatArray:
+    """Rows (1 + T, D), a period apart, at the steps of the engine but the last."""
+    share = np.arange(_SUBSTEPS)[:, None] / _SUBSTEPS
+    mixed = rows[:-1, None] * (1 - share) + rows[1:, None] * share
+    return mixed.reshape(-1, rows.shape[1])
+
+
+def _run(bodies: RigidBodies, course: _Course, every: int) -> FloatArray:
+    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven.
 
     Where nothing is touched and nothing moves, the arms pass by without any dynamics: in free air
     they are on their way by definition.
     """
     poses, state, still = [bodies.poses()], bodies.state, 0
-    for period, first in enumerate(range(0, len(ways) - 1, _SUBSTEPS), 1):
+    for period, first in enumerate(range(0, len(course.forces), _SUBSTEPS), 1):
         last = first + _SUBSTEPS
         still = still + 1 if bodies.is_at_rest else 0
-        is_free = still > _STILL_PERIODS and bodies.arms.is_on(ways[first], velocities[first])
-        if not (is_free and bodies.passes(ways[last], velocities[last])):
-            part = slice(first, last + 1)
-            forces = bodies.arms.carried(ways[part], velocities[part], _STEP_S)
-            for step, carried in enumerate(forces, first):
-                bodies.step(bodies.arms.forces(carried, ways[step], velocities[step]))
+        is_free = still > _STILL_PERIODS and bodies.arms.is_on(
+            course.free[first], course.fast[first]
+        )
+        if not (is_free and bodies.passes(course.free[last], course.fast[last])):
+            for step in range(first, last):
+                forces = course.forces[step], course.ways[step], course.velocities[step]
+                bodies.step(bodies.arms.forces(*forces))
         if period % every == 0:
             poses.append(bodies.poses())
             if np.isfinite(poses[-1]).all():

@@ -136,22 +136,28 @@ class ObjectMotionPredictor:
         return drawn[:, :, np.arange(num_objects) % _MAX_OBJECTS]
 
     def find(
-        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+        self,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
     ) -> TrackedObjects:
         """Returns the objects of masks (V, O, H, W), best of the camera's own size.
 
         Args:
+            names: O of them; those of vessels say that they are hollow.
             masks: of one frame.
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
         points = locate_all(cameras, poses, centroids(masks))
         features = object_shapes(masks, points, cameras, poses)
-        contact = self._solids(masks, points, cameras, poses)
+        contact = self._solids(names, masks, points, cameras, poses)
         return TrackedObjects(model=self, reference=points, features=features, contact=contact)
 
     def _solids(
         self,
+        names: Sequence[str],
         masks: BoolArray,
         points: FloatArray,
         cameras: Sequence[CameraModel],
@@ -161,13 +167,13 @@ class ObjectMotionPredictor:
         if self.contact is None:
             return None
         assert response is not None  # checked when it was loaded
-        from mtv_world_ros.geometry.solids import fit_solid
+        from mtv_world_ros.geometry.solids import fit_solid, is_vessel
         from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 
         table = self.contact.table_m
         solids = [
-            fit_solid(masks[:, item], point, cameras, poses, table)
-            for item, point in enumerate(points)
+            fit_solid(masks[:, item], point, cameras, poses, table, is_open=is_vessel(name))
+            for item, (name, point) in enumerate(zip(names, points, strict=True))
         ]
         return ContactMotions(settings=self.contact, response=response, solids=tuple(solids))
 

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import dartpy as dart
 import numpy as np
+from scipy.optimize import nnls
 
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import FloatArray
@@ -26,11 +28,12 @@ from mtv_world_ros.geometry.robot_shape import find_mesh
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
 
 #: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
 _DISH_M, _DISH_RATIO = 0.06, 1.5
-#: thickness of the floor of what is hollow, and of its walls if it is round, or a box [m]
-_FLOOR_M, _RIM_M, _WALL_M = 0.006, 0.01, 0.006
+#: thickness of the floor of what is hollow [m]
+_FLOOR_M = 0.006
 #: walls end this far above the bottom, so that they do not touch the table, too [m]
 _LIFT_M = 0.0005
 #: round things are prisms of so many sides: flat fingers touch a cylinder along a line only
@@ -82,6 +85,7 @@ class RigidBodies:
         solids: O, on the table.
         settings: of contact.
         step_s: of the engine.
+        pose: (J,) near which the arms work; None = the middle of their range [rad or m].
 
     Raises:
         RobotError: the robot cannot be a tree of rigid bodies.
@@ -94,6 +98,7 @@ class RigidBodies:
         solids: Sequence[Solid],
         settings: ContactSettings,
         step_s: float,
+        pose: FloatArray | None = None,
     ) -> None:
         self._world = dart.simulation.World()
         self._world.setTimeStep(step_s)
@@ -102,9 +107,14 @@ class RigidBodies:
         self._world.setDeactivationOptions(still)
         self._settings = settings
         self._solids = [_body(number, solid, settings) for number, solid in enumerate(solids)]
-        self.arms = _Arms(robot, response, settings)
+        middle = (robot.lower + robot.upper) / 2
+        self.arms = Arms(robot, response, settings, middle if pose is None else pose)
         detector = _detector(self.arms.skeleton)
-        self._world.getConstraintSolver().setCollisionDetector(detector)
+        solver = self._world.getConstraintSolver()
+        solver.setCollisionDetector(detector)
+        self._option = solver.getCollisionOption()
+        for pair in _same_arm(self.arms.skeleton):
+            self._option.collisionFilter.addBodyNodePairToBlackList(*pair)
         self._of_arms, self._others = (detector.createCollisionGroup() for _ in range(2))
         for node in _moving_nodes(self.arms.skeleton):
             self._of_arms.addShapeFrame(node)
@@ -123,7 +133,7 @@ class RigidBodies:
         skeleton = self.arms.skeleton
         before = np.array(skeleton.getPositions())
         skeleton.setPositions(way)
-        if self._of_arms.collide(self._others):
+        if self._of_arms.collide(self._others) or self._of_arms.collide(self._option):
             skeleton.setPositions(before)
             return False
         skeleton.setVelocities(velocity)
@@ -157,7 +167,7 @@ class RigidBodies:
             one.setVelocities(velocities)
 
 
-class _Arms:
+class Arms:
     """The robot's skeleton, and the forces that drive it.
 
     In free air a joint goes just as `ArmResponse` expects it; what touches the arm moves it off
@@ -165,17 +175,24 @@ class _Arms:
     """
 
     def __init__(
-        self, robot: RobotModel, response: ArmResponse, settings: ContactSettings
+        self,
+        robot: RobotModel,
+        response: ArmResponse,
+        settings: ContactSettings,
+        pose: FloatArray,
     ) -> None:
-        self.skeleton, described = _skeleton(robot)
+        self.skeleton, described = _skeleton(robot, swing=settings.fingers_swing)
         self._ghost = self.skeleton.clone('expected')
         followers = {name: (name, 1.0, 0.0) for name in robot.joint_names}
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         travels = finger_travels(robot)
+        moves = [followers[name][0] if name in followers else '' for name in names]
+        self.fingers = np.flatnonzero([source in travels for source in moves])
         self._follows = np.zeros((len(names), len(robot.joint_names)))
         self._offsets = np.zeros(len(names))
         self._stiffness, self._damping = np.zeros(len(names)), np.zeros(len(names))
+        self._armature = np.zeros(len(names))
         count = {
             s: sum(s == source for source, *_ in followers.values()) for s in robot.joint_names
         }
@@ -193,12 +210,36 @@ class _Arms:
                 stiffness, damping = settings.finger_stiffness * way, settings.finger_damping * way
                 armature = settings.finger_mass_kg * way
             self._stiffness[row], self._damping[row] = stiffness, damping
-            for skeleton in (self.skeleton, self._ghost):
-                _add_drive(skeleton.getJoint(name), armature, is_finger=source in travels)
-        fingers = {name for name, (source, *_) in followers.items() if source in travels}
+            self._armature[row] = armature
+        self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
+        fingers = {names[row] for row in self.fingers}
         for skeleton in (self.skeleton, self._ghost):
             _settle(skeleton, described, fingers, settings)
-        self._driven = self._stiffness > 0
+        self.skeleton.setPositions(self.ways(pose[None])[0])
+        rotors = _rotors(self.skeleton, self._armature, self.fingers)
+        for row in np.flatnonzero(self._driven):
+            for skeleton in (self.skeleton, self._ghost):
+                joint = skeleton.getJoint(names[row])
+                _add_drive(joint, float(rotors[row]), is_finger=names[row] in fingers)
+
+    @property
+    def finger_drives(self) -> FingerDrives:
+        """What the fingers hang on."""
+        dofs = [self.skeleton.getDof(int(number)) for number in self.fingers]
+        return FingerDrives(
+            stiffness=self._stiffness[self.fingers],
+            damping=self._damping[self.fingers],
+            mass=np.diag(self.skeleton.getMassMatrix())[self.fingers],
+            lower=np.array([dof.getPositionLowerLimit() for dof in dofs]),
+            upper=np.array([dof.getPositionUpperLimit() for dof in dofs]),
+        )
+
+    def shares(self, columns: Sequence[int]) -> FloatArray:
+        """Returns (F, C) what fingers make of joints: the mean of those that follow it."""
+        follows = self._follows[np.ix_(self.fingers, columns)]
+        return np.divide(1, follows, out=np.zeros_like(follows), where=follows != 0) / np.maximum(
+            (follows != 0).sum(axis=0), 1
+        )
 
     def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
         """Tells whether the arms are where they are in free air, (D,) each."""
@@ -210,22 +251,29 @@ class _Arms:
         """Returns where the degrees of freedom are (T, D) at joints (T, J)."""
         return positions @ self._follows.T + self._offsets
 
-    def carried(self, ways: FloatArray, velocities: FloatArray, step_s: float) -> FloatArray:
-        """Returns the forces (T, D) that move the arms along ways (1 + T, D) in free air.
+    def carried(
+        self, ways: FloatArray, velocities: FloatArray, accelerations: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns what moves the arms along their ways in free air, (T, D) each.
 
-        Args:
-            ways: expected, a step apart.
-            velocities: (1 + T, D) likewise.
-            step_s: of the engine.
+        Returns:
+            Forces (T, D) of the drives, and those with which hands pull their fingers (T, F).
         """
-        accelerations, forces = np.diff(velocities, axis=0) / step_s, np.zeros_like(ways[:-1])
+        forces, own = np.zeros_like(ways), accelerations[:, self.fingers]
         for row, acceleration in enumerate(accelerations):
             self._ghost.setPositions(ways[row])
             self._ghost.setVelocities(velocities[row])
+            acceleration = acceleration.copy()
+            acceleration[self.fingers] = 0.0
             self._ghost.setAccelerations(acceleration)
             self._ghost.computeInverseDynamics(False, False, False)
             forces[row] = self._ghost.getForces()
-        return forces * self._driven
+        forces *= self._driven
+        pulls, mass = -forces[:, self.fingers], self.finger_drives.mass
+        # a moving hand does not pull what a drive adds, nor fingers that are geared to each other
+        added = self._armature[self.fingers] / mass if self._swing else np.ones(len(mass))
+        forces[:, self.fingers] = mass * own - added * pulls
+        return forces, (1 - added) * pulls
 
     def forces(self, carried: FloatArray, way: FloatArray, velocity: FloatArray) -> FloatArray:
         """Returns (D,) forces: what carries the arms, and what pulls them back to the way."""
@@ -234,11 +282,51 @@ class _Arms:
         return carried + self._stiffness * off + self._damping * slow
 
 
+def _rotors(arms: Any, armature: FloatArray, fingers: FloatArray) -> FloatArray:
+    """Inertias (D,) of bodies about their joints that come nearest to an armature (D,) of these.
+
+    The engine has no rotors, which turn by their own joint alone: what turns with a body is felt
+    by all joints before it. What slides and what grips has the armature itself.
+    """
+    count = arms.getNumDofs()
+    rotors, mass = armature.copy(), arms.getMassMatrix()
+    scale = 1 / np.sqrt(np.diag(mass) + armature)
+    felt, rows = [], []
+    for row in range(count):
+        joint = arms.getJoint(arms.getDof(row).getName())
+        if row in fingers or armature[row] == 0 or 'Prismatic' in joint.getType():
+            continue
+        turns = np.asarray(joint.getAxis()) @ arms.getJacobian(joint.getChildBodyNode())[:3]
+        felt.append(np.outer(turns * scale, turns * scale))
+        rows.append(row)
+    if rows:
+        wanted = np.zeros(count)
+        wanted[rows] = armature[rows]
+        all_felt = np.stack(felt, axis=-1).reshape(-1, len(rows))
+        rotors[rows] = nnls(all_felt, np.diag(wanted * scale**2).ravel())[0]
+    return rotors
+
+
 def _moving_nodes(arms: Any) -> list[Any]:
     """Shapes of bodies that joints move."""
     bodies = map(arms.getBodyNode, range(arms.getNumBodyNodes()))
     moving = [body for body in bodies if body.getNumDependentGenCoords()]
     return [body.getShapeNode(k) for body in moving for k in range(body.getNumShapeNodes())]
+
+
+def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
+    """Pairs of bodies that a joint moves both: an arm does not hit itself, but another arm."""
+    arms.enableSelfCollisionCheck()
+    bodies = [arms.getBodyNode(number) for number in range(arms.getNumBodyNodes())]
+    movers = [
+        {one.getDependentGenCoordIndex(k) for k in range(one.getNumDependentGenCoords())}
+        for one in bodies
+    ]
+    return [
+        (bodies[one], bodies[other])
+        for one, other in combinations(range(len(bodies)), 2)
+        if movers[one] & movers[other]
+    ]
 
 
 def _detector(arms: Any) -> Any:
@@ -259,7 +347,7 @@ def _boxed(shape: Any) -> Any:
     return dart.dynamics.BoxShape(np.array([side, side, length]))
 
 
-def _skeleton(robot: RobotModel) -> tuple[Any, set[str]]:
+def _skeleton(robot: RobotModel, *, swing: bool) -> tuple[Any, set[str]]:
     """The robot's bodies, and the links that have an inertia in its description."""
     urdf = None
     if robot.file is not None:
@@ -272,6 +360,9 @@ def _skeleton(robot: RobotModel) -> tuple[Any, set[str]]:
     options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED
     loader.setOptions(options)
     tree = _described(path)
+    if swing:
+        for joint in tree.iterfind('joint/mimic/..'):
+            joint.remove(joint.find('mimic'))  # type: ignore[arg-type]
     text = ElementTree.tostring(tree, encoding='unicode')
     skeleton = loader.parseSkeletonString(text, dart.common.Uri(path.resolve().as_uri()))
     if skeleton is None:
@@ -398,7 +489,11 @@ def _parts(solid: Solid, settings: ContactSettings) -> list[_Part]:
     wide, long, high = map(float, solid.size)
     across = min(wide, long)
     if across > _DISH_M and across > _DISH_RATIO * high:
-        return _dish(wide, high, settings) if solid.is_round else _tray(wide, long, high, settings)
+        if not solid.is_round:
+            return _tray(wide, long, high, settings)
+        return _vessel(wide, high, settings.rim_m, settings.density)
+    if solid.is_open and solid.is_round:
+        return _vessel(wide, high, settings.wall_m, settings.density)
     volume = wide * long * high * (np.pi / 4 if solid.is_round else 1.0)
     mass = max(volume * settings.density, _LEAST_KG)
     if not solid.is_round:
@@ -421,13 +516,13 @@ def _prism(wide: float, high: float, middle: float, mass: float) -> list[_Part]:
     ]
 
 
-def _dish(wide: float, high: float, settings: ContactSettings) -> list[_Part]:
+def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Part]:
     """Round and open at the top."""
-    middle, half = (wide - _RIM_M) / 2, (high - _LIFT_M) / 2
+    middle, half = (wide - rim) / 2, (high - _LIFT_M) / 2
     length = middle * np.tan(np.pi / _SIDES) * 1.02
-    mass = np.pi * middle**2 * _FLOOR_M * settings.density
-    wall = (_RIM_M / 2, float(length), half)
-    wall_mass = 8 * float(np.prod(wall)) * settings.density
+    mass = np.pi * middle**2 * _FLOOR_M * density
+    wall = (rim / 2, float(length), half)
+    wall_mass = 8 * float(np.prod(wall)) * density
     turns = [_turned(k * 2 * np.pi / _SIDES) for k in range(_SIDES)]
     return [
         *_prism(2 * middle, _FLOOR_M, (_FLOOR_M - high) / 2, mass),
@@ -440,7 +535,7 @@ def _dish(wide: float, high: float, settings: ContactSettings) -> list[_Part]:
 
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Part]:
     """A box without a lid; it is heavy below."""
-    x, y, half, wall = wide / 2, long / 2, (high - _LIFT_M) / 2, _WALL_M / 2
+    x, y, half, wall = wide / 2, long / 2, (high - _LIFT_M) / 2, settings.wall_m / 2
     walls = (
         ((wall, y, half), (x - wall, 0.0)),
         ((wall, y, half), (wall - x, 0.0)),

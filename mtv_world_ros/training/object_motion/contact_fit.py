@@ -1,7 +1,7 @@
 """Friction, weight and the grip of fingers, from recordings of what commands did to objects.
 
-Settings of rigid bodies are tried on recorded episodes: those whose objects end nearest to where
-they really ended are kept. Nothing is taken from a simulator, and a robot's own recordings do.
+Settings of rigid bodies are tried on recorded episodes: those whose objects keep nearest to where
+they really were are kept. Nothing is taken from a simulator, and a robot's own recordings do.
 
 Shape letters: T steps, O objects, J joints, N settings, E episodes.
 """
@@ -20,18 +20,20 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.solids import fit_solid, Solid
+from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.network import COMMANDS_A_STEP
 from mtv_world_ros.model.object_motion.rigid_bodies import finger_travels
 from mtv_world_ros.parallel import run_all
+from mtv_world_ros.training.object_motion.finger_fit import fit_fingers, FreeGrippers
 from mtv_world_ros.training.object_motion.tracks import (
     fine_commands,
     first_frame,
     FirstFrame,
     read_each,
+    recorded_positions,
     tracks_of,
 )
 
@@ -43,8 +45,12 @@ _FITTED = (
     'table_friction',
     'density',
     'tray_kg',
+    'rim_m',
+    'wall_m',
 )
-_FACTORS = (1.6, 1.3, 1.15)
+_FACTORS = (1.6, 1.6, 1.3, 1.15)
+#: of these what grippers report says more, where fingers swing
+_OF_FINGERS = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
 #: errors below the first are as good, above the second as bad [m]
 _LEAST_M, _MOST_M = 0.003, 0.1
 
@@ -57,22 +63,24 @@ class ContactRecording:
         frame: the first.
         solids: O, as it shows them.
         positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
-        way: (O, 3) from the first to the last step, as recorded; NaN = not known [m].
+        grippers: before they close.
+        ways: (1 + T, O, 3) since the first step, as recorded; NaN = not known [m].
     """
 
     frame: FirstFrame
     solids: tuple[Solid | None, ...]
     positions: FloatArray
-    way: FloatArray
+    grippers: FreeGrippers
+    ways: FloatArray
 
     def errors(
         self, robot: RobotModel, response: ArmResponse, settings: ContactSettings
     ) -> FloatArray:
-        """Returns (O,) how far objects end from where they ended [m], NaN = not known."""
+        """Returns (1 + T, O) how far objects are from where they were [m], NaN = not known."""
         alone = settings.model_copy(update={'num_motions': 1})
         motions = ContactMotions(settings=alone, response=response, solids=self.solids)
         points = motions.advance(robot, self.positions, COMMANDS_A_STEP)[0][0]
-        return np.linalg.norm(points[-1] - points[0] - self.way, axis=-1)
+        return np.linalg.norm(points - points[0] - self.ways, axis=-1)
 
 
 def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
@@ -84,15 +92,24 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     episode = read_episode(path, views=tuple(views))
     track = tracks_of(episode, robot, views)[0]
     frame = first_frame(episode, robot, views)
-    known = track.known[0] & track.known[-1]
+    known = track.known[0] & track.known
+    times, positions = fine_commands(episode, robot, views)
+    assert episode.masks is not None and episode.joint_states is not None
+    stamps = episode.masks[views[0]].stamps_ns[0] + times * 1e9
+    recorded = recorded_positions(episode.joint_states, robot, stamps)
     return ContactRecording(
         frame=frame,
         solids=tuple(
-            fit_solid(frame.masks[:, item], point, frame.cameras, frame.poses)
-            for item, point in enumerate(frame.points())
+            fit_solid(
+                frame.masks[:, item], point, frame.cameras, frame.poses, is_open=is_vessel(name)
+            )
+            for item, (name, point) in enumerate(
+                zip(episode.info.objects, frame.points(), strict=True)
+            )
         ),
-        positions=fine_commands(episode, robot, views)[1],
-        way=np.where(known[:, None], track.points[-1] - track.points[0], np.nan),
+        positions=positions,
+        grippers=FreeGrippers.of(robot, positions, recorded),
+        ways=np.where(known[..., None], track.points - track.points[0], np.nan),
     )
 
 
@@ -134,10 +151,11 @@ def fit_contact(
     workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
 ) -> ContactSettings:
-    """Returns the settings with which solids end nearest to where objects ended.
+    """Returns the settings with which solids keep nearest to where objects were.
 
-    In each round every number is tried larger and smaller; those that help are changed, together
-    if that is better still, or else the one that helps most. Then the factors get smaller.
+    Fingers come first, see `fit_fingers`. Then, in each round, every other number is tried larger
+    and smaller; those that help are changed, together if that is better still, or else the one
+    that helps most. The factors get smaller.
 
     Args:
         recordings: E.
@@ -151,7 +169,7 @@ def fit_contact(
         TrainingError: no recording says where an object went.
         RobotError: see `RigidBodies`.
     """
-    if not any(np.isfinite(recording.way).any() for recording in recordings):
+    if not any(np.isfinite(recording.ways).any() for recording in recordings):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
 
     def losses(settings: Sequence[ContactSettings]) -> FloatArray:
@@ -163,17 +181,22 @@ def fit_contact(
             found[number, episode] = loss
         return found
 
-    best, loss = first, float(np.nanmean(losses([first])))
+    robot = load_robot(robot_file)
+    best = fit_fingers([recording.grippers for recording in recordings], robot, response, first)
+    swing = 'swing' if best.fingers_swing else 'do not swing'
+    report(f'fingers {swing}: {best.model_dump(mode="json", include=set(_OF_FINGERS))}')
+    fitted = [name for name in _FITTED if not (best.fingers_swing and name in _OF_FINGERS)]
+    loss = float(np.nanmean(losses([best])))
     report(f'begins at {loss:.3f}')
     for factor in _FACTORS:
         tried = [
             best.model_copy(update={name: getattr(best, name) * by})
-            for name in _FITTED
+            for name in fitted
             for by in (factor, 1 / factor)
         ]
         found = np.nanmean(losses(tried), axis=1)
         changes = {}
-        for number, name in enumerate(_FITTED):
+        for number, name in enumerate(fitted):
             better = 2 * number + int(found[2 * number + 1] < found[2 * number])
             if found[better] < loss:
                 changes[name] = getattr(tried[better], name)

@@ -12,7 +12,9 @@ import pytest
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.errors import CheckpointError, RobotError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion import predictor
 from mtv_world_ros.model.object_motion.contact_motions import check_robot, ContactMotions
@@ -73,7 +75,7 @@ def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recor
     assert points.shape == (1, len(recording.positions[::ROWS]), 2, 3)
     assert rotations.shape == (*points.shape, 3)
     way = points[0, -1] - points[0, 0]
-    assert np.linalg.norm(way[0] - recording.way[0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
+    assert np.linalg.norm(way[0] - recording.ways[-1, 0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
     assert np.linalg.norm(way[1]) < 0.01
 
 
@@ -88,7 +90,107 @@ def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
 def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
     slippery = motions_of(response, *recording.solids, grip_friction=0.02)
     points, _, _ = slippery.advance(robot, recording.positions, ROWS)
-    assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.way[0]) > 0.05
+    assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.ways[-1, 0]) > 0.05
+
+
+def shaken(robot, seconds: float = 2.0) -> np.ndarray:
+    """Commands (N, J) of arms that turn to and fro about their first joints, grippers open."""
+    positions = still(robot, seconds)
+    turn = 0.3 * np.sin(2 * np.pi * 1.5 * np.arange(len(positions)) * 0.02)
+    for tool in robot.tools:
+        positions[:, robot.joint_names.index(f'{tool.arm}_joint1')] += turn
+        positions[:, robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
+    return positions
+
+
+def courses_of(robot, response, positions, **changed):
+    motions = motions_of(response, **changed)
+    arms = RigidBodies(robot, response, (), motions.settings, 0.002, positions[0]).arms
+    (course,), _, _ = motions._courses([arms], response.follow(robot, positions)[0])
+    return arms, course
+
+
+def test_fingers_of_a_hand_that_gains_speed_stay_behind(robot, response):
+    arms, course = courses_of(robot, response, shaken(robot), fingers_swing=True)
+    off = (course.free - course.ways)[:, arms.fingers]
+    assert 0.001 < np.abs(off).max() < 0.03
+    # never outwards, where the stops are: left fingers open upwards, their mirrors downwards
+    openness = off * np.sign(course.ways[0, arms.fingers])
+    assert openness.max() < 1e-4
+    others = np.delete(course.free - course.ways, arms.fingers, axis=1)
+    assert (others == 0).all()
+
+
+def test_fingers_that_are_geared_do_not_swing(robot, response):
+    _, course = courses_of(robot, response, shaken(robot), fingers_swing=False)
+    np.testing.assert_array_equal(course.free, course.ways)
+
+
+@pytest.mark.parametrize('swing', [False, True])
+def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
+    """So that arms may pass by without them."""
+    positions = shaken(robot)
+    motions = motions_of(response, fingers_swing=swing)
+    bodies = RigidBodies(robot, response, (), motions.settings, 0.002, positions[0])
+    (course,), _, _ = motions._courses([bodies.arms], response.follow(robot, positions)[0])
+    bodies.arms.skeleton.setPositions(course.free[0])
+    worst = 0.0
+    for step in range(len(course.forces)):
+        forces = course.forces[step], course.ways[step], course.velocities[step]
+        bodies.step(bodies.arms.forces(*forces))
+        off = np.abs(bodies.arms.skeleton.getPositions() - course.free[step + 1])
+        worst = max(worst, off.max())
+    assert worst < 0.003
+
+
+def test_an_arm_feels_its_own_rotors_alone(robot, response, recording):
+    """The engine has none; its bodies come near to what joints feel."""
+    pose = recording.positions[0]
+    arms = RigidBodies(robot, response, (), SETTINGS, 0.002, pose).arms
+    arms.skeleton.setPositions(arms.ways(pose[None])[0])
+    names = [arms.skeleton.getDof(i).getName() for i in range(arms.skeleton.getNumDofs())]
+    strong = [f'{arm}_joint{number}' for arm in ('left', 'right') for number in (1, 2, 3)]
+    felt = np.diag(arms.skeleton.getMassMatrix())[[names.index(name) for name in strong]]
+    mass, _ = RobotMechanics(robot).inertia(pose, np.zeros(len(pose)))
+    wanted = np.diag(mass) + response.armature / response.compliance
+    wanted = wanted[[robot.joint_names.index(name) for name in strong]]
+    np.testing.assert_allclose(felt, wanted, rtol=0.12)
+
+
+def test_arms_hit_each_other(robot, response, recording):
+    """Both tools are sent to the middle; one alone gets there."""
+    rest, ends = recording.positions[0], recording.positions[0].copy()
+    for tool in robot.tools:
+        solver = ArmSolver(robot, tool)
+        pose = robot.tool_poses(rest[None])[robot.tools.index(tool), 0].copy()
+        pose[:3, 3] = 0.0, 0.2, 0.12
+        ends[solver.indices] = solver.solve(pose, ends[solver.indices])
+    share = np.clip(np.linspace(0, 1.5, 151), 0, 1)[:, None]
+    both = rest + share * (ends - rest)
+    alone = both.copy()
+    alone[:, len(rest) // 2 :] = rest[len(rest) // 2 :]
+    reached = []
+    for positions in (both, alone):
+        _, _, then = motions_of(response).advance(robot, positions, ROWS)
+        arms = RigidBodies(robot, response, (), SETTINGS, 0.002, rest).arms
+        reached.append(np.abs(then.states[0].positions[-1] - arms.ways(positions[-1:])[0]).max())
+    assert reached[0] > 0.05 > 0.01 > reached[1]
+
+
+@pytest.mark.parametrize(('is_open', 'height'), [(True, 0.02), (False, 0.07)])
+def test_what_falls_into_a_cup_lies_on_its_floor(robot, response, is_open, height):
+    cup = Solid(
+        centre=np.array([0.0, 0.3, 0.03]),
+        size=np.array([0.05, 0.05, 0.06]),
+        is_round=True,
+        is_open=is_open,
+    )
+    ball = Solid(centre=np.array([0.0, 0.3, 0.09]), size=np.full(3, 0.02))
+    bodies = RigidBodies(robot, response, (cup, ball), SETTINGS, 0.002)
+    for _ in range(400):
+        bodies.step(np.zeros(bodies.arms.skeleton.getNumDofs()))
+    assert bodies.poses()[1, 2, 3] == pytest.approx(height, abs=0.005)
+    assert bodies.poses()[0, 2, 3] == pytest.approx(0.03, abs=0.002)
 
 
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
@@ -214,7 +316,9 @@ def test_a_checkpoint_foresees_by_both(folder, robot, recording):
     (folder / CONTACT_FILE).unlink()
     alone = load_predictor(folder, robot)
     frame = recording.frame
-    both, networks = (one.find(frame.masks, frame.cameras, frame.poses) for one in (model, alone))
+    names = ['red block'] * len(recording.solids)
+    found = names, frame.masks, frame.cameras, frame.poses
+    both, networks = (one.find(*found) for one in (model, alone))
     moved, then = both.advance(recording.positions[:51])
     few, _ = networks.advance(recording.positions[:51])
     assert len(moved) == len(few) + 2 and len(both.sizes) == len(networks.sizes) + 2
