@@ -6,8 +6,8 @@
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
 checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
 first has `contact.json`. A row of a name judges by the share of the motions that succeed: half or
-more is a success. `shown` is the one motion that pictures show, `expected` the first one of the
-networks. Beside them stands the rule that imagines nothing: an object sticks to a gripper that
+more is a success; of `networks alone` and `bodies alone` only their own motions count. `shown` is
+the one motion that pictures show, `expected` the first one of the networks. Beside them stands the rule that imagines nothing: an object sticks to a gripper that
 closes near it. Differences are to the first row of networks; intervals: Wilson of shares, jackknife
 of AUROC, bootstrap of differences, over episodes. What is chosen by this must not be measured by
 it: kinds of the split `test` are refused. With `--recorded-arms` the networks and the rule are told
@@ -59,7 +59,7 @@ VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'
 HEAD = ('judged by', 'n', 'right', 'AUROC', 'false success', 'false failure', 'Brier of the share')
 #: what is said by networks: what follows their name
-SAID = ('', ', shown', ', expected')
+SAID = ('', ', networks alone', ', bodies alone', ', shown', ', expected')
 _DRAWS = 2000
 
 
@@ -158,7 +158,9 @@ def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:
         return []
     share = float(np.mean(succeeded))
     shown = objects.most_like(ahead, succeeded == (share >= 0.5))
-    return [share, float(succeeded[shown]), float(succeeded[0])]
+    count = 1 + tracked.model.num_disturbed
+    alone = [float(np.mean(part)) for part in (succeeded[:count], succeeded[count:]) if len(part)]
+    return [share, alone[0], alone[-1], float(succeeded[shown]), float(succeeded[0])]
 
 
 def ruled(plan: Plan, tracked: TrackedObjects) -> float:

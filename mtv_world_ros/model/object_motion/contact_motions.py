@@ -12,7 +12,9 @@ Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -51,6 +53,7 @@ class ContactMotions:
         speeds: (D,) of these arms, in the engine's order.
         swings: (2, K, F) how far fingers swing off their ways then, and how fast; see
             `FingerDrives`.
+        pose: (J,) near which the arms work, that of the first command.
     """
 
     settings: ContactSettings
@@ -60,9 +63,10 @@ class ContactMotions:
     arms: ArmState | None = None
     speeds: FloatArray | None = None
     swings: FloatArray | None = None
+    pose: FloatArray | None = None
 
     def advance(
-        self, robot: RobotModel, positions: FloatArray, rows: int
+        self, robot: RobotModel, positions: FloatArray, rows: int, threads: int = 1
     ) -> tuple[FloatArray, FloatArray, ContactMotions]:
         """Returns where objects are, and then.
 
@@ -70,6 +74,7 @@ class ContactMotions:
             robot: whose joints are commanded.
             positions: (1 + N, J) commands, `PERIOD_S` apart [rad or m].
             rows: periods between two of the rows that are returned.
+            threads: that compute motions.
 
         Returns:
             Centres (K, T + 1, O, 3) [m], NaN = not seen by two views, and rotations
@@ -81,28 +86,30 @@ class ContactMotions:
         """
         free = replace(self.response, floor=None)
         where, arms = free.follow(robot, positions, self.arms)
-        points, turned, states = [], [], []
+        pose = positions[0] if self.pose is None else self.pose
         worlds = [
-            RigidBodies(robot, self.response, solids, settings, _STEP_S, positions[0])
+            RigidBodies(robot, self.response, solids, settings, _STEP_S, pose)
             for settings, solids in map(self._disturbed, range(self.settings.num_motions))
         ]
         courses, speeds, swings = self._courses([one.arms for one in worlds], where)
-        for number, (bodies, course) in enumerate(zip(worlds, courses, strict=True)):
-            start = bodies.poses()[:, :3, :3]
+        starts = np.stack([bodies.poses()[:, :3, :3] for bodies in worlds])
+        for number, bodies in enumerate(worlds):
             if self.states:
                 bodies.state = self.states[number]
             else:
-                bodies.arms.skeleton.setPositions(course.free[0])
-            poses = _run(bodies, course, rows)
-            states.append(bodies.state)
-            points.append(poses[..., :3, 3])
-            turned.append(poses[..., :3, :3] @ np.swapaxes(start, -1, -2))
-        then = replace(self, states=tuple(states), arms=arms, speeds=speeds, swings=swings)
-        return (
-            self._of_all(np.stack(points), np.nan),
-            self._of_all(np.stack(turned), np.eye(3)),
-            then,
+                bodies.arms.skeleton.setPositions(courses[number].free[0])
+        with ThreadPoolExecutor(threads) as pool:  # the engine's steps do not hold the interpreter
+            poses = np.stack(list(pool.map(_run, worlds, courses, repeat(rows))))
+        turned = poses[..., :3, :3] @ np.swapaxes(starts, -1, -2)[:, None]
+        then = replace(
+            self,
+            states=tuple(bodies.state for bodies in worlds),
+            arms=arms,
+            speeds=speeds,
+            swings=swings,
+            pose=pose,
         )
+        return self._of_all(poses[..., :3, 3], np.nan), self._of_all(turned, np.eye(3)), then
 
     @property
     def centres(self) -> FloatArray:

@@ -265,7 +265,9 @@ class TrackedObjects:
         contact = self.contact
         if contact is not None:
             robot, every = self.model.robot, self.commands_a_step
-            points, rotations, contact = contact.advance(robot, positions, every)
+            points, rotations, contact = contact.advance(
+                robot, positions, every, torch.get_num_threads()
+            )
             motions += [
                 ObjectMotion(reference=contact.centres, points=way, rotations=turns)
                 for way, turns in zip(points, rotations, strict=True)
