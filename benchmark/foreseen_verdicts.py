@@ -5,7 +5,8 @@
 
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
 checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
-first has `contact.json`. A row of a name judges by the share of the motions that succeed: half or
+first has `contact.json`. A row of a name judges by the share of the motions that succeed, those of networks and of bodies
+counting as much: half or
 more is a success; of `networks alone` and `bodies alone` only their own motions count. `shown` is
 the one motion that pictures show, `expected` the first one of the networks. Beside them stands the rule that imagines nothing: an object sticks to a gripper that
 closes near it. Differences are to the first row of networks; intervals: Wilson of shares, jackknife
@@ -153,14 +154,13 @@ def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:
     )
     (ahead,) = objects.foresee([plan.positions])
     foreseen = foreseen_of(tracked.model.robot, ahead, len(ahead.motions[0].points))
-    succeeded = foreseen.succeeds(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
-    if succeeded is None:
+    ends = foreseen.ends(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
+    if ends is None:
         return []
-    share = float(np.mean(succeeded))
-    shown = objects.most_like(ahead, succeeded == (share >= 0.5))
+    shown = objects.most_like(ahead, ends.as_most)
     count = 1 + tracked.model.num_disturbed
-    alone = [float(np.mean(part)) for part in (succeeded[:count], succeeded[count:]) if len(part)]
-    return [share, alone[0], alone[-1], float(succeeded[shown]), float(succeeded[0])]
+    alone = [float(np.mean(part)) for part in (ends.done[:count], ends.done[count:]) if len(part)]
+    return [ends.share, alone[0], alone[-1], float(ends.done[shown]), float(ends.done[0])]
 
 
 def ruled(plan: Plan, tracked: TrackedObjects) -> float:

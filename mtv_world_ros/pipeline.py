@@ -541,5 +541,5 @@ class ImaginedEpisode:
         foreseen = self._foreseen(state, objects, num_left)
         if foreseen is None:
             return None
-        succeeded = self.pipeline.estimator.foresee(foreseen, self.instruction, state.memory)
-        return None if succeeded is None else succeeded == (np.mean(succeeded) >= 0.5)
+        ends = self.pipeline.estimator.foresee(foreseen, self.instruction, state.memory)
+        return None if ends is None else ends.as_most

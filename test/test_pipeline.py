@@ -325,7 +325,7 @@ class ThreeWays:
     def __init__(self, *ways: float) -> None:
         self._ways = ways
 
-    def find(self, masks, cameras, poses):
+    def find(self, names, masks, cameras, poses):
         return self
 
     def advance(self, positions):
@@ -379,7 +379,7 @@ class DriftingObjects:
     def __init__(self, log: list[int], num_steps: int = 0) -> None:
         self._log, self._num_steps = log, num_steps
 
-    def find(self, masks, cameras, poses):
+    def find(self, names, masks, cameras, poses):
         assert masks.shape[:2] == (len(cameras), 2) and len(poses) == len(cameras)
         self._log.append(0)
         return self
@@ -512,7 +512,7 @@ class SlidingModel:
     def __init__(self) -> None:
         self.sizes: list[tuple[int, ...]] = []
 
-    def find(self, masks, cameras, poses) -> SlidingObjects:
+    def find(self, names, masks, cameras, poses) -> SlidingObjects:
         self.sizes.append(masks.shape)
         pixels = centroids(masks)
         points = np.full((masks.shape[1], 3), np.nan)

@@ -30,11 +30,13 @@ class ObjectMotion:
         reference: (O, 3) where their centres were at the reference [m]; NaN = not known.
         points: (T, O, 3) where they are [m].
         rotations: (T, O, 3, 3) from the reference.
+        weight: how much it counts among others of the same plan.
     """
 
     reference: FloatArray
     points: FloatArray
     rotations: FloatArray
+    weight: float = 1.0
 
     def moves(self) -> BoolArray:
         """Returns (T, O) whether an object is elsewhere than at first, by more than an error."""
@@ -56,11 +58,7 @@ class ObjectMotion:
 
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
-        return ObjectMotion(
-            reference=self.reference,
-            points=self.points[frames],
-            rotations=self.rotations[frames],
-        )
+        return replace(self, points=self.points[frames], rotations=self.rotations[frames])
 
 
 class TrackedObjects(Protocol):
@@ -97,9 +95,13 @@ class ObjectMotionModel(Protocol):
     """Says where objects go under commanded joints."""
 
     def find(
-        self, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+        self,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
     ) -> TrackedObjects:
-        """Returns the objects of masks (V, O, H, W), seen by cameras at T_base_camera (4, 4)."""
+        """Returns the objects of O names and masks (V, O, H, W), seen at T_base_camera (4, 4)."""
         ...
 
     def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
@@ -163,7 +165,8 @@ class FoundObjects:
             fits &= among
         if not fits.any():
             return self.shown
-        unlike = _apart(ahead.motions).sum((1, 2))
+        weights = [motion.weight for motion in ahead.motions]
+        unlike = _apart(ahead.motions).sum(-1) @ np.array(weights)
         return int(np.argmin(np.where(fits, unlike, np.inf)))
 
     def pictures(

@@ -12,7 +12,7 @@ from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
-from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenMotions
+from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds, ForeseenMotions
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
@@ -125,13 +125,13 @@ class SuccessEstimator:
         except CannotTell as reason:
             return Judged(_abstains(reason, views, subjects), memory)
         starts = memory.points[:, 0]
-        succeeded = None if foreseen is None else foreseen.succeeds(task, bound, starts)
-        return Judged(self._judge(task, evidence, views, succeeded, is_real), memory)
+        ends = None if foreseen is None else foreseen.ends(task, bound, starts)
+        return Judged(self._judge(task, evidence, views, ends, is_real), memory)
 
     def foresee(
         self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
-    ) -> FloatArray | None:
-        """Returns (K,) whether the task is done at the end of motions; None = not known.
+    ) -> ForeseenEnds | None:
+        """Returns whether the task is done at the end of motions; None = not known.
 
         Args:
             foreseen: since the objects were found.
@@ -143,7 +143,7 @@ class SuccessEstimator:
         except CannotTell:
             return None
         starts = foreseen.points[0, 0] if memory is None else memory.points[:, 0]
-        return foreseen.succeeds(task, bound, starts)
+        return foreseen.ends(task, bound, starts)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """The task and its objects; a given task takes the objects in their order."""
@@ -160,11 +160,11 @@ class SuccessEstimator:
         task: TaskSpec,
         evidence: Evidence,
         views: Views,
-        succeeded: FloatArray | None,
+        ends: ForeseenEnds | None,
         is_real: bool,
     ) -> SuccessEstimate:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
-        features['foreseen'] = foreseen_feature(succeeded)
+        features['foreseen'] = foreseen_feature(ends)
         features['released'] = _released(task, views.footage.openings)
         basis = self._objection(task)
         weights = None if basis or self.calibration is None else self.calibration.given(is_real)
@@ -185,8 +185,9 @@ class SuccessEstimator:
                 f'J with the goal mask {g:.2f}, with the start mask {s:.2f}' for g, s in pairs
             ]
         reasons += evidence.notes
-        if succeeded is not None:
-            reasons.append(f'{sum(succeeded)} of {len(succeeded)} foreseen motions succeed')
+        if ends is not None:
+            counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
+            reasons.append(f'{counts}, {ends.share:.0%} by weight')
         if task.gripper == 'open' and views.footage.openings is None:
             reasons.append('gripper not checked')
         elif features['released'] == 0.0:

@@ -14,11 +14,34 @@ from math import nan
 
 import numpy as np
 
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.success.situation import CannotTell, TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForeseenEnds:
+    """Whether a task is done at the end of motions.
+
+    Attributes:
+        done: (K,) bool.
+        weights: (K,) how much each counts.
+    """
+
+    done: BoolArray
+    weights: FloatArray
+
+    @property
+    def share(self) -> float:
+        """Of the motions that succeed, by weight."""
+        return float(np.average(self.done, weights=self.weights))
+
+    @property
+    def as_most(self) -> BoolArray:
+        """(K,) which of them end as most do."""
+        return self.done == (self.share >= 0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +54,7 @@ class ForeseenMotions:
         rotations: (K, N, O, 3, 3) from row 0.
         sizes: (K, O, 3) extents [m].
         openings: (A, N) of the grippers, 0 closed to 1 open.
+        weights: (K,) how much each counts.
     """
 
     names: tuple[str, ...]
@@ -38,11 +62,12 @@ class ForeseenMotions:
     rotations: FloatArray
     sizes: FloatArray
     openings: FloatArray
+    weights: FloatArray
 
-    def succeeds(
+    def ends(
         self, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
-    ) -> FloatArray | None:
-        """Returns (K,) whether the task is done at the end of each; None = they do not tell.
+    ) -> ForeseenEnds | None:
+        """Returns whether the task is done at the end of each; None = they do not tell.
 
         Args:
             task: what is asked.
@@ -55,9 +80,10 @@ class ForeseenMotions:
         if not np.isfinite(self.points[:, :, list(items.values())]).all():
             return None
         try:
-            return np.array([self._done(k, task, items, starts) for k in range(len(self.points))])
+            done = [self._done(k, task, items, starts) for k in range(len(self.points))]
         except CannotTell:
             return None
+        return ForeseenEnds(done=np.array(done), weights=self.weights)
 
     def _done(
         self, number: int, task: TaskSpec, items: Mapping[str, int], starts: FloatArray
@@ -90,9 +116,10 @@ def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> For
         rotations=np.stack([motion.rotations[kept] for motion in objects.motions]),
         sizes=objects.tracked.sizes,
         openings=robot.gripper_openings(objects.positions[kept]),
+        weights=np.array([motion.weight for motion in objects.motions]),
     )
 
 
-def foreseen_feature(succeeded: FloatArray | None) -> float:
+def foreseen_feature(ends: ForeseenEnds | None) -> float:
     """Returns the share of the motions that succeed, -1 (none) to 1 (all); NaN = not known."""
-    return nan if succeeded is None else float(2 * np.mean(succeeded) - 1)
+    return nan if ends is None else 2 * ends.share - 1

@@ -26,7 +26,12 @@ def foreseen(*ends):
     sizes = np.broadcast_to([[0.05] * 3, [0.04] * 3], (len(points), 2, 3))
     openings = np.ones((2, points.shape[1]))
     return ForeseenMotions(
-        names=NAMES, points=points, rotations=turns, sizes=sizes, openings=openings
+        names=NAMES,
+        points=points,
+        rotations=turns,
+        sizes=sizes,
+        openings=openings,
+        weights=np.ones(len(points)),
     )
 
 
@@ -49,10 +54,19 @@ def held(*ends):
 def test_the_share_of_motions_that_end_at_the_goal_is_told():
     task, bound = matched()
     unknown = np.full((2, 3), np.nan)
-    done = held(GOAL, RED, GOAL, BLUE).succeeds(task, bound, unknown)
-    np.testing.assert_array_equal(done, [True, False, True, False])
-    assert foreseen_feature(done) == 0.0
-    assert foreseen_feature(held(GOAL).succeeds(task, bound, unknown)) == 1.0
+    ends = held(GOAL, RED, GOAL, BLUE).ends(task, bound, unknown)
+    np.testing.assert_array_equal(ends.done, [True, False, True, False])
+    assert foreseen_feature(ends) == 0.0
+    assert foreseen_feature(held(GOAL).ends(task, bound, unknown)) == 1.0
+
+
+def test_motions_count_by_weight():
+    task, bound = matched()
+    motions = replace(held(GOAL, RED, BLUE), weights=np.array([3.0, 1.0, 1.0]))
+    ends = motions.ends(task, bound, np.full((2, 3), np.nan))
+    assert ends.share == pytest.approx(0.6)
+    np.testing.assert_array_equal(ends.as_most, [True, False, False])
+    assert foreseen_feature(ends) == pytest.approx(0.2)
 
 
 def test_objects_that_were_not_found_leave_it_open():
@@ -60,7 +74,7 @@ def test_objects_that_were_not_found_leave_it_open():
     seen = held(GOAL)
     lost = replace(seen, points=np.where(np.array([True, False])[:, None], np.nan, seen.points))
     for motions in (lost, replace(seen, names=('green cup', 'bowl'))):
-        assert np.isnan(foreseen_feature(motions.succeeds(task, bound, np.zeros((2, 3)))))
+        assert np.isnan(foreseen_feature(motions.ends(task, bound, np.zeros((2, 3)))))
 
 
 def test_motions_that_fail_lower_an_estimate_whose_pictures_succeed():
@@ -74,7 +88,7 @@ def test_motions_that_fail_lower_an_estimate_whose_pictures_succeed():
             'doubtful': held(GOAL, RED, RED),
         }.items()
     }
-    assert '1 of 3 foreseen motions succeed' in found['doubtful'].reasons
+    assert '1 of 3 foreseen motions succeed, 33% by weight' in found['doubtful'].reasons
     assert found['doubtful'].probability < found['not told'].probability
     assert found['good'].probability > found['not told'].probability
     assert found['good'].features['foreseen'] == pytest.approx(1.0)

@@ -269,7 +269,12 @@ class TrackedObjects:
                 robot, positions, every, torch.get_num_threads()
             )
             motions += [
-                ObjectMotion(reference=contact.centres, points=way, rotations=turns)
+                ObjectMotion(
+                    reference=contact.centres,
+                    points=way,
+                    rotations=turns,
+                    weight=len(motions) / len(points),  # together as much as the networks
+                )
                 for way, turns in zip(points, rotations, strict=True)
             ]
         before = _Before(
