@@ -188,7 +188,7 @@ class Arms:
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         travels = finger_travels(robot)
         moves = [followers[name][0] if name in followers else '' for name in names]
-        self.fingers = np.flatnonzero([source in travels for source in moves])
+        self.fingers = [row for row, source in enumerate(moves) if source in travels]
         self._follows = np.zeros((len(names), len(robot.joint_names)))
         self._offsets = np.zeros(len(names))
         self._stiffness, self._damping = np.zeros(len(names)), np.zeros(len(names))
@@ -225,7 +225,7 @@ class Arms:
     @property
     def finger_drives(self) -> FingerDrives:
         """What the fingers hang on."""
-        dofs = [self.skeleton.getDof(int(number)) for number in self.fingers]
+        dofs = [self.skeleton.getDof(number) for number in self.fingers]
         return FingerDrives(
             stiffness=self._stiffness[self.fingers],
             damping=self._damping[self.fingers],
@@ -236,10 +236,10 @@ class Arms:
 
     def shares(self, columns: Sequence[int]) -> FloatArray:
         """Returns (F, C) what fingers make of joints: the mean of those that follow it."""
-        follows = self._follows[np.ix_(self.fingers, columns)]
-        return np.divide(1, follows, out=np.zeros_like(follows), where=follows != 0) / np.maximum(
-            (follows != 0).sum(axis=0), 1
-        )
+        follows = self._follows[self.fingers][:, list(columns)]
+        moves = follows != 0
+        turns = np.divide(1, follows, out=np.zeros_like(follows), where=moves)
+        return turns / np.maximum(moves.sum(axis=0), 1)
 
     def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
         """Tells whether the arms are where they are in free air, (D,) each."""
@@ -282,7 +282,7 @@ class Arms:
         return carried + self._stiffness * off + self._damping * slow
 
 
-def _rotors(arms: Any, armature: FloatArray, fingers: FloatArray) -> FloatArray:
+def _rotors(arms: Any, armature: FloatArray, fingers: Sequence[int]) -> FloatArray:
     """Inertias (D,) of bodies about their joints that come nearest to an armature (D,) of these.
 
     The engine has no rotors, which turn by their own joint alone: what turns with a body is felt
