@@ -120,6 +120,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-jiggle-0.05',
         'expert-tow-0.11',
         'expert-tow-0.13',
+        'expert-swoop-0.3',
+        'expert-swoop-0.36',
+        'expert-taut-0.57',
+        'expert-taut-0.6',
+        'expert-gnaw-0.06',
+        'expert-gnaw-0.08',
     ),
     'calibrate': (
         'expert',
@@ -206,22 +212,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-hurl-6',
         'expert-jumble-1',
         'expert-jumble-2',
-    ),
-    'test': (
-        'expert',
-        'expert-swoop-0.3',
-        'expert-swoop-0.36',
         'expert-thump-0.035',
         'expert-thump-0.04',
-        'expert-taut-0.57',
-        'expert-taut-0.6',
         'expert-lob-0.05',
         'expert-lob-0.07',
-        'expert-gnaw-0.06',
-        'expert-gnaw-0.08',
         'expert-smear-0.04',
         'expert-smear-0.05',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

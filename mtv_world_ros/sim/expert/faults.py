@@ -116,7 +116,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'swoop': _kind(
         'timing',
-        'test',
+        'train',
         0.36,
         0.5,
         'm',
@@ -138,7 +138,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'thump': _kind(
         'height',
-        'test',
+        'calibrate',
         0.035,
         0.06,
         'm',
@@ -271,7 +271,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'taut': _kind(
         'opening',
-        'test',
+        'train',
         0.58,
         1.0,
         '',
@@ -306,7 +306,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'gnaw': _kind(
         'release',
-        'test',
+        'train',
         0.06,
         0.12,
         'm',
@@ -314,7 +314,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'lob': _kind(
         'release',
-        'test',
+        'calibrate',
         0.05,
         0.2,
         'm',
@@ -481,7 +481,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'smear': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.04,
         0.1,
         'm',
