@@ -219,7 +219,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-smear-0.04',
         'expert-smear-0.05',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-swat-0.005',
+        'expert-swat-0.01',
+        'expert-dip-0.02',
+        'expert-dip-0.03',
+        'expert-slope-0.7',
+        'expert-slope-1',
+        'expert-swirl-0.045',
+        'expert-swirl-0.047',
+        'expert-jostle-0.07',
+        'expert-jostle-0.08',
+        'expert-toss-0.035',
+        'expert-toss-0.04',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -144,6 +144,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'what it holds is thumped on its goal, three times, this deep',
     ),
+    'dip': _kind(
+        'height',
+        'test',
+        0.02,
+        0.08,
+        'm',
+        'half-way to its goal, what it holds is dipped on the table, this deep',
+    ),
     # lateral
     'shift': _kind(
         'lateral',
@@ -178,6 +186,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.6,
         '',
         'share that lacks of how far the arm reaches from where it rests; it stops there',
+    ),
+    'slope': _kind(
+        'lateral',
+        'test',
+        0.8,
+        2.0,
+        '',
+        'share of its height over the grasp by which a place is off, to one side',
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
@@ -487,6 +503,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'it lets go this far before its goal; shut fingers press on the object and drag it on',
     ),
+    'swirl': _kind(
+        'collision',
+        'test',
+        0.045,
+        0.07,
+        'm',
+        'shut fingers go round the object and come this much nearer to it',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -509,6 +533,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.12,
         'm',
         'it first takes the other object next to its own, moves it this far and lets it go',
+    ),
+    'jostle': _kind(
+        'object',
+        'test',
+        0.07,
+        0.12,
+        'm',
+        'once done, shut fingers push what it has put the object on or beside, this far',
     ),
     'place': _kind(
         'place',
@@ -588,6 +620,14 @@ FAULTS: Mapping[str, FaultKind] = {
         9.0,
         '',
         'all is this share faster for as long as a gripper is shut',
+    ),
+    'swat': _kind(
+        'speed',
+        'test',
+        0.01,
+        0.1,
+        'm',
+        'shut fingers hit the object in one quick stroke, this far',
     ),
     # joint
     'zero': _kind(
@@ -723,6 +763,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'it comes down this far off and closes three times on its way to the right place',
+    ),
+    'toss': _kind(
+        'regrasp',
+        'test',
+        0.035,
+        0.1,
+        'm',
+        'it tosses the object this far aside, and takes it from where it let go',
     ),
     'jumble': _kind(
         'any', 'calibrate', 2, 4, '', 'number of way points that change places with the next one'
@@ -940,6 +988,11 @@ _OF_GRIPPERS = (
     'lob',
     'smear',
     'gnaw',
+    'dip',
+    'swat',
+    'swirl',
+    'jostle',
+    'toss',
 )
 #: joints of a wrist, the last ones of an arm
 _NUM_WRIST = 3

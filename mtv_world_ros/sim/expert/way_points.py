@@ -64,6 +64,11 @@ _KEEP_TEMPO = frozenset(
         'thump',
         'smear',
         'gnaw',
+        'dip',
+        'swat',
+        'swirl',
+        'jostle',
+        'toss',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -106,6 +111,10 @@ _NUM_GNAWS = 3
 _LOB_S = 0.3
 #: what is held is thumped on its goal: how far it is raised [m], how often, time of a stroke [s]
 _THUMP_M, _NUM_THUMPS, _THUMP_S = 0.05, 3, 0.12
+#: time in which shut fingers hit an object [s]
+_SWAT_S = 0.3
+#: shut fingers go round an object: how far off its middle they come down [m]
+_SWIRL_M = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -757,16 +766,7 @@ def _perch(stops: Stops, size: float, side: _Side) -> Stops:
     """
     lift, opened = _first(stops, 'lift'), _first(stops, 'open')
     closed, let_go, way = stops[lift - 1], stops[opened], size * _drawn_way(side)
-    goal, home = let_go.position, stops[-1].position
-    farthest = max(_PERCH_ARM_M, _PERCH_MORE_M + float(np.linalg.norm((goal - home)[:2])))
-    nears = [
-        place
-        for place in side.objects
-        if np.linalg.norm((place - closed.position)[:2]) > _VISIT_TO_M[1]
-        and np.linalg.norm((place - goal)[:2]) < _PERCH_GOAL_M
-        and np.linalg.norm((place - home)[:2]) < farthest
-    ]
-    at = min(nears, key=lambda p: np.linalg.norm((p - goal)[:2]), default=goal * (1, 1, 0))
+    at = _next_to_goal(stops, side, let_go.position * (1, 1, 0))
     # what lies on the table is twice as high as its centre
     over = at * (1, 1, 2) + way
     low = replace(
@@ -783,6 +783,21 @@ def _perch(stops: Stops, size: float, side: _Side) -> Stops:
         raised,
     ]
     return [*stops[: lift + 1], *perched, *stops[lift + 1 :]]
+
+
+def _next_to_goal(stops: Stops, side: _Side, other: FloatArray) -> FloatArray:
+    """Centre (3,) of the other object next to the goal; `other` where the arm is near none."""
+    own, goal = (stops[_first(stops, phase)].position for phase in ('close', 'open'))
+    home = stops[-1].position
+    farthest = max(_PERCH_ARM_M, _PERCH_MORE_M + float(np.linalg.norm((goal - home)[:2])))
+    nears = [
+        place
+        for place in side.objects
+        if np.linalg.norm((place - own)[:2]) > _VISIT_TO_M[1]
+        and np.linalg.norm((place - goal)[:2]) < _PERCH_GOAL_M
+        and np.linalg.norm((place - home)[:2]) < farthest
+    ]
+    return min(nears, key=lambda p: np.linalg.norm((p - goal)[:2]), default=other)
 
 
 def _scoop(stops: Stops, size: float, side: _Side) -> Stops:
@@ -972,6 +987,76 @@ def _swoop(stops: Stops, size: float, side: _Side) -> Stops:
     return [*comes, *goes, *stops[first + 2 :]]
 
 
+def _slope(stops: Stops, size: float, side: _Side) -> Stops:
+    """What is higher than the grasp is off to one side, by a share, so that it comes on a slant.
+
+    To another side, drawn anew, where the arm does not reach so far.
+    """
+    low, way = stops[_first(stops, 'grasp')].position[2], size * _drawn_way(side)
+    return [*(stop.moved((stop.position[2] - low) * way) for stop in stops[:-1]), stops[-1]]
+
+
+def _dip(stops: Stops, size: float, side: _Side) -> Stops:
+    """Half-way to its goal, what it holds is dipped on the table, and carried on."""
+    lift = _first(stops, 'lift')
+    closed, lifted, lower = stops[lift - 1], stops[lift], stops[_first(stops, 'lower')]
+    x, y, _ = (lifted.position + lower.position) / 2
+    low = np.array([x, y, closed.position[2] - size])
+    dipped = replace(lifted, phase='carry', position=low)
+    return [*stops[: lift + 1], dipped, *stops[lift + 1 :]]
+
+
+def _swat(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers hit the object in one quick stroke, and it is grasped where it was.
+
+    From another side, drawn anew, where the arm does not reach so far.
+    """
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    rise = above.position - grasp.position
+    over, down, hit, left = _pushed(grasp, size, rise, _drawn_way(side))
+    return [over, down, replace(hit, seconds=_SWAT_S), left, *stops]
+
+
+def _swirl(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers go once round the object, ever nearer to it; it is grasped where it was.
+
+    From another side, drawn anew, where the arm does not reach so far.
+    """
+    above, grasp = stops[0], stops[_first(stops, 'grasp')]
+    shares = np.linspace(0.0, 1.0, _NUM_CIRCLE + 1)
+    angles = side.play.uniform(0.0, 2 * np.pi) + side.sign * 2 * np.pi * shares
+    ways = (_SWIRL_M - size * shares) * np.array([np.cos(angles), np.sin(angles), 0 * angles])
+    down, *ring = (replace(grasp, phase='above', opening=0.0).moved(way) for way in ways.T)
+    rise = above.position - grasp.position
+    round_it = [replace(stop, seconds=_CIRCLE_S) for stop in ring]
+    return [down.moved(rise), down, *round_it, ring[-1].moved(rise), *stops]
+
+
+def _jostle(stops: Stops, size: float, side: _Side) -> Stops:
+    """Once done, shut fingers push the other object next to its goal, or what it put there.
+
+    From another side, drawn anew, where the arm does not reach so far.
+    """
+    end = _first(stops, 'retreat') + 1
+    opened, retreat = stops[end - 2 : end]
+    at = _next_to_goal(stops, side, opened.position)
+    there = replace(opened, phase='retreat', position=at, seconds=None)
+    rise = _up(retreat.position[2] - at[2])
+    return [*stops[:end], *_pushed(there, size, rise, _drawn_way(side)), *stops[end:]]
+
+
+def _toss(stops: Stops, size: float, side: _Side) -> Stops:
+    """It tosses the object this far aside, and takes it from where it let go.
+
+    To another side, drawn anew, where the arm does not reach so far.
+    """
+    first, way = stops[: _first(stops, 'lift')], size * _drawn_way(side)
+    raised = replace(first[-1], seconds=None).moved(_up(_TRY_LIFT_M))
+    swung = replace(raised, opening=first[-2].opening, seconds=_LOB_S).moved(way)
+    begin = [replace(stop, phase='above') for stop in (*first, raised, swung)]
+    return [*begin, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(way))]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1064,4 +1149,10 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'thump': _thump,
     'smear': _smear,
     'swoop': _swoop,
+    'slope': _slope,
+    'dip': _dip,
+    'swat': _swat,
+    'swirl': _swirl,
+    'jostle': _jostle,
+    'toss': _toss,
 }

@@ -247,6 +247,11 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'lob',
         'smear',
         'gnaw',
+        'dip',
+        'swat',
+        'swirl',
+        'jostle',
+        'toss',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -360,6 +365,7 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
         ('jiggle', 0.6, 40),
         ('smear', 0.35, 80),
         ('gnaw', 0.6, 80),
+        ('jostle', 0.8, 60),
     ],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
@@ -936,9 +942,93 @@ def test_open_fingers_close_as_they_pass_along_the_object(yaw):
     assert min(ends) < -0.05 and max(ends) > 0.05 and np.abs(ends).max() <= 0.1
 
 
+def test_what_is_higher_than_the_grasp_is_off_by_a_share_of_its_height():
+    stops, changed = changed_stops('expert-slope-0.5')
+    assert len(changed) == len(stops) and changed[-1] == stops[-1]
+    ways = np.array([b.position - a.position for a, b in zip(stops, changed, strict=True)])[:-1]
+    assert np.linalg.norm(ways[0]) == pytest.approx(0.05) and ways[0, 2] == 0
+    # in one direction; the grasp is right, and the goal is 2 cm higher
+    wanted = np.outer([1, 0, 0, 1, 1.2, 0.2, 0.2, 1.2], ways[0])
+    np.testing.assert_allclose(ways, wanted, atol=1e-12)
+    assert [stop.opening for stop in changed] == [stop.opening for stop in stops]
+
+
+def test_what_is_held_is_dipped_on_the_table_half_way():
+    stops, changed = changed_stops('expert-dip-0.02')
+    assert changed[:4] == stops[:4] and changed[5:] == stops[4:] and len(changed) == 10
+    np.testing.assert_allclose(changed[4].position, [-0.1, 0.3, 0.01], atol=1e-12)
+    assert (changed[4].phase, changed[4].opening) == ('carry', 0)
+
+
+def test_shut_fingers_hit_the_object_in_one_quick_stroke():
+    stops, changed = changed_stops('expert-swat-0.02')
+    assert changed[4:] == stops and all(stop.opening == 0 for stop in changed[:4])
+    assert [stop.seconds is None for stop in changed[:4]] == [True, True, False, True]
+    assert 0 < (changed[2].seconds or 0) < 0.4
+    ways = np.array([stop.position - stops[1].position for stop in changed[:4]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.1], atol=1e-12)
+    way = (ways[2] - ways[1]) / 0.06
+    assert np.linalg.norm(way) == pytest.approx(1)
+    np.testing.assert_allclose(ways[1:3], np.outer([-0.07, -0.01], way), atol=1e-12)
+
+
+def test_shut_fingers_go_once_round_the_object_and_come_nearer():
+    stops, changed = changed_stops('expert-swirl-0.04')
+    assert changed[11:] == stops and len(changed) == 20
+    assert all(stop.opening == 0 for stop in changed[:11])
+    ways = np.array([stop.position - stops[1].position for stop in changed[:11]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, *[0.0] * 9, 0.1], atol=1e-12)
+    np.testing.assert_allclose(ways[[0, -1], :2], ways[[1, -2], :2], atol=1e-12)
+    ring = ways[1:-1, :2]
+    np.testing.assert_allclose(np.linalg.norm(ring, axis=1), np.linspace(0.08, 0.04, 9))
+    turns = np.diff(np.unwrap(np.arctan2(ring[:, 1], ring[:, 0])))
+    np.testing.assert_allclose(np.abs(turns), np.pi / 4)
+    assert abs(turns.sum()) == pytest.approx(2 * np.pi)
+
+
+@pytest.mark.parametrize('is_near', [True, False])
+def test_what_is_next_to_the_goal_is_pushed_once_it_is_done(is_near):
+    stops, _ = changed_stops('expert')
+    other = np.array([-0.25, 0.35, 0.04]) if is_near else np.array([0.2, 0.3, 0.04])
+    faults = WayPointFaults(parse_variant('expert-jostle-0.05'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [stops[1].position, other])
+    assert changed[:8] == stops[:8] and changed[-1] == stops[-1] and len(changed) == 13
+    push = changed[8:12]
+    assert all(stop.opening == 0 for stop in push)
+    ways = np.array([stop.position for stop in push]) - (other if is_near else stops[6].position)
+    # up as high as it rose before
+    assert [push[0].position[2], push[3].position[2]] == pytest.approx([0.15, 0.15])
+    np.testing.assert_allclose(ways[1:3, 2], 0.0, atol=1e-12)
+    way = (ways[2] - ways[1]) / 0.09
+    assert np.linalg.norm(way) == pytest.approx(1)
+    np.testing.assert_allclose(ways[1:3], np.outer([-0.07, 0.02], way), atol=1e-12)
+
+
+def test_what_is_tossed_aside_is_taken_from_where_it_was_let_go():
+    stops, changed = changed_stops('expert-toss-0.05')
+    begin, rest = changed[:5], changed[5:]
+    assert len(rest) == len(stops) and rest[4:] == stops[4:]
+    assert [stop.opening for stop in begin] == [1, 1, 0, 0, 1]
+    ways = np.array([stop.position - stops[1].position for stop in begin])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.04, 0.04], atol=1e-12)
+    np.testing.assert_array_equal(ways[:4, :2], 0.0)
+    way = ways[4] * (1, 1, 0)
+    assert np.linalg.norm(way) == pytest.approx(0.05) and 0 < (begin[4].seconds or 0) < 0.5
+    moved = [b.position - a.position for a, b in zip(stops[:4], rest[:4], strict=True)]
+    np.testing.assert_allclose(moved, np.broadcast_to(way, (4, 3)), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
-    [('splay', 0.7), ('topple', 0.9), ('paw', 0.05), ('nibble', 0.06), ('decoy', 0.05)],
+    [
+        ('splay', 0.7),
+        ('topple', 0.9),
+        ('paw', 0.05),
+        ('nibble', 0.06),
+        ('decoy', 0.05),
+        ('swirl', 0.03),
+        ('swat', 0.03),
+    ],
 )
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
     expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
@@ -1134,6 +1224,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'thump',
         'taut',
         'smear',
+        'slope',
+        'dip',
+        'swat',
+        'swirl',
+        'jostle',
+        'toss',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1240,9 +1336,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-smear-0.03' has smear"
+    said = r"split test are not for training: 'expert-high-0.1-toss-0.03' has toss"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-smear-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-toss-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
