@@ -120,15 +120,19 @@ class _Swing:
         """The loss of fingers that do not swing."""
         return self._loss(np.zeros_like(self.dips))
 
-    def losses(self, stiffness: FloatArray, damping: FloatArray, mass: FloatArray) -> FloatArray:
-        """Returns (K,) losses of candidates (K, 1) [N/m, N s/m, kg], per metre of a finger."""
+    def hung(self, stiffness: FloatArray, damping: FloatArray, mass: FloatArray) -> FingerDrives:
+        """Returns the drives (K, F) of candidates (K, 1) [N/m, N s/m, kg], of a finger's metre."""
         unit = self.drives
-        drives = replace(
+        return replace(
             unit,
             stiffness=unit.stiffness * stiffness,
             damping=unit.damping * damping,
             mass=unit.mass + unit.stiffness * mass,
         )
+
+    def losses(self, stiffness: FloatArray, damping: FloatArray, mass: FloatArray) -> FloatArray:
+        """Returns (K,) losses of candidates, see `hung`."""
+        drives = self.hung(stiffness, damping, mass)
         start = np.zeros((2, len(stiffness), self.ways.shape[1]))
         swings, _ = drives.swings(self.pulls, self.ways, PERIOD_S / _SUBSTEPS, start)
         return np.array([self._loss(one[::_SUBSTEPS] @ self.means) for one in swings])

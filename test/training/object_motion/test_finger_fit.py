@@ -46,8 +46,7 @@ def recorded(robot, response, positions, settings) -> FreeGrippers:
     if settings.fingers_swing:
         swing = _swing(grippers, robot, response, settings)
         numbers = np.array([[getattr(settings, name)] for name in TRUE])[..., None]
-        drives = swing.drives
-        off = swing_of(drives, numbers, swing)
+        off = swing_of(swing, numbers)
         grippers.recorded[:, gripper_columns(robot)] += off
     return grippers
 
@@ -56,19 +55,10 @@ def gripper_columns(robot) -> list[int]:
     return [robot.joint_names.index(tool.gripper_joint) for tool in robot.tools]
 
 
-def swing_of(drives, numbers, swing) -> np.ndarray:
+def swing_of(swing, numbers) -> np.ndarray:
     """(1 + T, G) how far grippers are off [m]."""
-    from dataclasses import replace
-
-    stiffness, damping, mass = numbers
-    made = replace(
-        drives,
-        stiffness=drives.stiffness * stiffness,
-        damping=drives.damping * damping,
-        mass=drives.mass + drives.stiffness * mass,
-    )
     start = np.zeros((2, 1, swing.ways.shape[1]))
-    off, _ = made.swings(swing.pulls, swing.ways, 0.002, start)
+    off, _ = swing.hung(*numbers).swings(swing.pulls, swing.ways, 0.002, start)
     return np.stack([(off[0, ::10, 2 * k] - off[0, ::10, 2 * k + 1]) / 2 for k in range(2)], 1)
 
 
