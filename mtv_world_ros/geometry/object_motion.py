@@ -30,12 +30,15 @@ class ObjectMotion:
         reference: (O, 3) where their centres were at the reference [m]; NaN = not known.
         points: (T, O, 3) where they are [m].
         rotations: (T, O, 3, 3) from the reference.
+        openings: (T, A) of the grippers, 0 closed to 1 open, which what they touch may stop; None
+            = not foreseen.
         weight: how much it counts among others of the same plan.
     """
 
     reference: FloatArray
     points: FloatArray
     rotations: FloatArray
+    openings: FloatArray | None = None
     weight: float = 1.0
 
     def moves(self) -> BoolArray:
@@ -50,15 +53,24 @@ class ObjectMotion:
 
     def then(self, motion: ObjectMotion) -> ObjectMotion:
         """Returns both, one after the other; row 0 of the second is the last of the first."""
-        return replace(
-            self,
-            points=np.concatenate([self.points, motion.points[1:]]),
-            rotations=np.concatenate([self.rotations, motion.rotations[1:]]),
-        )
+        rows = zip(self._rows, motion._rows, strict=True)
+        return self._of([np.concatenate([before, after[1:]]) for before, after in rows])
 
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
-        return replace(self, points=self.points[frames], rotations=self.rotations[frames])
+        return self._of([rows[frames] for rows in self._rows])
+
+    @property
+    def _rows(self) -> list[FloatArray]:
+        """What there is of every frame."""
+        rows = [self.points, self.rotations]
+        return rows if self.openings is None else [*rows, self.openings]
+
+    def _of(self, rows: Sequence[FloatArray]) -> ObjectMotion:
+        points, rotations, *openings = rows
+        return replace(
+            self, points=points, rotations=rotations, openings=openings[0] if openings else None
+        )
 
 
 class TrackedObjects(Protocol):

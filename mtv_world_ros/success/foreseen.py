@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from math import nan
 
 import numpy as np
@@ -53,7 +54,7 @@ class ForeseenMotions:
         points: (K, N, O, 3) [m], NaN where not known.
         rotations: (K, N, O, 3, 3) from row 0.
         sizes: (K, O, 3) extents [m].
-        openings: (A, N) of the grippers, 0 closed to 1 open.
+        openings: (K, A, N) of the grippers, 0 closed to 1 open.
         weights: (K,) how much each counts.
     """
 
@@ -92,7 +93,8 @@ class ForeseenMotions:
         first = np.where(np.isfinite(starts), starts, points[0])
         points = np.concatenate([first[None], points])
         turns = np.concatenate([turns[:1], turns])
-        openings = np.concatenate([self.openings[:, :1], self.openings], axis=1)
+        openings = self.openings[number]
+        openings = np.concatenate([openings[:, :1], openings], axis=1)
         sizes = {
             role: tuple(map(float, task.sizes_m.get(role) or self.sizes[number, item]))
             for role, item in items.items()
@@ -107,15 +109,22 @@ class ForeseenMotions:
 
 
 def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> ForeseenMotions:
-    """Returns what was foreseen of objects, without the last chunk's steps after `num_steps`."""
+    """Returns what was foreseen of objects, without the last chunk's steps after `num_steps`.
+
+    Networks do not foresee what stops fingers, as a rim that they close on: they are told by
+    motions that do, in turn, if there are any, and else the grippers are as commanded.
+    """
     assert objects.positions is not None
     kept = slice(0, num_steps)
+    opened = [motion.openings for motion in objects.motions if motion.openings is not None]
+    stopped = cycle(opened or [robot.gripper_openings(objects.positions).T])
+    openings = [next(stopped) if m.openings is None else m.openings for m in objects.motions]
     return ForeseenMotions(
         names=objects.names,
         points=np.stack([motion.points[kept] for motion in objects.motions]),
         rotations=np.stack([motion.rotations[kept] for motion in objects.motions]),
         sizes=objects.tracked.sizes,
-        openings=robot.gripper_openings(objects.positions[kept]),
+        openings=np.stack([rows[kept].T for rows in openings]),
         weights=np.array([motion.weight for motion in objects.motions]),
     )
 

@@ -144,6 +144,23 @@ def found(*speeds: float) -> FoundObjects:
     )
 
 
+@pytest.mark.parametrize('openings', [None, np.array([[0.0], [0.5], [1.0]])])
+def test_motions_go_on_and_are_cut_with_all_that_they_know(openings):
+    points, turns = np.arange(9.0).reshape(3, 1, 3), np.tile(np.eye(3), (3, 1, 1, 1))
+    motion = ObjectMotion(
+        reference=points[0], points=points, rotations=turns, openings=openings, weight=2.0
+    )
+    both = motion.then(motion)
+    assert len(both.points) == len(both.rotations) == 5 and both.weight == 2.0
+    ends = both[np.array([0, -1])]
+    np.testing.assert_array_equal(ends.points, points[[0, -1]])
+    if openings is None:
+        assert both.openings is None and ends.openings is None
+    else:
+        np.testing.assert_array_equal(both.openings[:, 0], [0, 0.5, 1, 0.5, 1])
+        np.testing.assert_array_equal(ends.openings[:, 0], [0, 1])
+
+
 def plan(steps: int) -> np.ndarray:
     return np.zeros((steps + 1, 1))
 

@@ -1,12 +1,15 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 from drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED
 import numpy as np
 import pytest
 
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotion
+from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenMotions
+from mtv_world_ros.success.foreseen import foreseen_feature, foreseen_of, ForeseenMotions
 from mtv_world_ros.success.task import match_task
 
 TASKS = load_tasks(share_path('config', 'tasks'))
@@ -24,7 +27,7 @@ def foreseen(*ends):
     points = np.array([[[red, BLUE] for red in path(RED, end)] for end in ends], float)
     turns = np.broadcast_to(np.eye(3), (*points.shape, 3))
     sizes = np.broadcast_to([[0.05] * 3, [0.04] * 3], (len(points), 2, 3))
-    openings = np.ones((2, points.shape[1]))
+    openings = np.ones((len(points), 2, points.shape[1]))
     return ForeseenMotions(
         names=NAMES,
         points=points,
@@ -47,7 +50,7 @@ def held(*ends):
         moving,
         points=longer(moving.points, 1),
         rotations=longer(moving.rotations, 1),
-        openings=longer(moving.openings, 1),
+        openings=longer(moving.openings, 2),
     )
 
 
@@ -67,6 +70,50 @@ def test_motions_count_by_weight():
     assert ends.share == pytest.approx(0.6)
     np.testing.assert_array_equal(ends.as_most, [True, False, False])
     assert foreseen_feature(ends) == pytest.approx(0.2)
+
+
+def motion(share=None):
+    """Of nothing, in 3 steps, with grippers that end open by this share; None = not foreseen."""
+    openings = None if share is None else np.array([[1, 1], [1, 1], [1, share]], float)
+    nothing = np.zeros((3, 0, 3))
+    turns = np.zeros((3, 0, 3, 3))
+    return ObjectMotion(reference=nothing[0], points=nothing, rotations=turns, openings=openings)
+
+
+@pytest.mark.parametrize(
+    ('shares', 'told'),
+    [
+        ((None, None), [0.5, 0.5]),  # as commanded
+        ((None, None, None, 0.7, 0.8), [0.7, 0.8, 0.7, 0.7, 0.8]),
+    ],
+)
+def test_motions_that_foresee_no_fingers_are_told_by_others(shares, told):
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    tool = robot.tools[1]
+    positions = np.tile((robot.lower + robot.upper) / 2, (3, 1))
+    half = (tool.gripper_closed + tool.gripper_open) / 2
+    positions[-1, robot.joint_names.index(tool.gripper_joint)] = half
+
+    found = FoundObjects(
+        names=(),
+        frames=np.zeros((2, 4, 4, 3), np.uint8),
+        masks=np.zeros((2, 0, 4, 4), bool),
+        poses=np.tile(np.eye(4), (2, 1, 1)),
+        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3))),
+        motions=tuple(map(motion, shares)),
+        positions=positions,
+    )
+    np.testing.assert_allclose(foreseen_of(robot, found, 3).openings[:, 1, -1], told)
+    assert foreseen_of(robot, found, 2).openings.shape == (len(shares), 2, 2)
+
+
+def test_fingers_that_are_stopped_are_not_open():
+    task, bound = matched()
+    moved = held(GOAL, GOAL)
+    openings = moved.openings.copy()
+    openings[1, 0, -3:] = 0.7
+    ends = replace(moved, openings=openings).ends(task, bound, np.full((2, 3), np.nan))
+    np.testing.assert_array_equal(ends.done, [True, False])
 
 
 def test_objects_that_were_not_found_leave_it_open():

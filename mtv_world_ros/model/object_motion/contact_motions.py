@@ -41,6 +41,21 @@ _STANDS_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BodyMotions:
+    """Where everything is; row 0 is now.
+
+    Attributes:
+        points: (K, T + 1, O, 3) centres [m], NaN = not seen by two views.
+        rotations: (K, T + 1, O, 3, 3) since they were found.
+        joints: (K, T + 1, J) of the robot, which what it touches may stop [rad or m].
+    """
+
+    points: FloatArray
+    rotations: FloatArray
+    joints: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ContactMotions:
     """Solids on their way; what one chunk hands to the next.
 
@@ -67,19 +82,14 @@ class ContactMotions:
 
     def advance(
         self, robot: RobotModel, positions: FloatArray, rows: int, threads: int = 1
-    ) -> tuple[FloatArray, FloatArray, ContactMotions]:
-        """Returns where objects are, and then.
+    ) -> tuple[BodyMotions, ContactMotions]:
+        """Returns where everything is at each of 1 + T rows, and then.
 
         Args:
             robot: whose joints are commanded.
             positions: (1 + N, J) commands, `PERIOD_S` apart [rad or m].
             rows: periods between two of the rows that are returned.
             threads: that compute motions.
-
-        Returns:
-            Centres (K, T + 1, O, 3) [m], NaN = not seen by two views, and rotations
-            (K, T + 1, O, 3, 3) since they were found, row 0 where they are now; and the motions
-            after it.
 
         Raises:
             RobotError: see `check_robot`.
@@ -99,7 +109,8 @@ class ContactMotions:
             else:
                 bodies.arms.skeleton.setPositions(courses[number].free[0])
         with ThreadPoolExecutor(threads) as pool:  # the engine's steps do not hold the interpreter
-            poses = np.stack(list(pool.map(_run, worlds, courses, repeat(rows))))
+            found = list(pool.map(_run, worlds, courses, repeat(rows)))
+        poses, joints = map(np.stack, zip(*found, strict=True))
         turned = poses[..., :3, :3] @ np.swapaxes(starts, -1, -2)[:, None]
         then = replace(
             self,
@@ -109,7 +120,11 @@ class ContactMotions:
             swings=swings,
             pose=pose,
         )
-        return self._of_all(poses[..., :3, 3], np.nan), self._of_all(turned, np.eye(3)), then
+        points, rotations = (
+            self._of_all(poses[..., :3, 3], np.nan),
+            self._of_all(turned, np.eye(3)),
+        )
+        return BodyMotions(points=points, rotations=rotations, joints=joints), then
 
     @property
     def centres(self) -> FloatArray:
@@ -236,13 +251,14 @@ def _between(rows: FloatArray) -> FloatArray:
     return mixed.reshape(-1, rows.shape[1])
 
 
-def _run(bodies: RigidBodies, course: _Course, every: int) -> FloatArray:
-    """Poses (T + 1, S, 4, 4) of the solids, as the arms are driven.
+def _run(bodies: RigidBodies, course: _Course, every: int) -> tuple[FloatArray, FloatArray]:
+    """Poses (T + 1, S, 4, 4) of the solids and joints (T + 1, J), as the arms are driven.
 
     Where nothing is touched and nothing moves, the arms pass by without any dynamics: in free air
     they are on their way by definition.
     """
-    poses, state, still = [bodies.poses()], bodies.state, 0
+    poses, joints = [bodies.poses()], [bodies.arms.joints]
+    state, still = bodies.state, 0
     for period, first in enumerate(range(0, len(course.forces), _SUBSTEPS), 1):
         last = first + _SUBSTEPS
         still = still + 1 if bodies.is_at_rest else 0
@@ -259,4 +275,5 @@ def _run(bodies: RigidBodies, course: _Course, every: int) -> FloatArray:
                 state = bodies.state
             else:  # the engine has lost them: they go on from where they were last
                 bodies.state, poses[-1] = state, poses[-2]
-    return np.stack(poses)
+            joints.append(bodies.arms.joints)
+    return np.stack(poses), np.stack(joints)

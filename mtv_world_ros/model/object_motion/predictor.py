@@ -265,17 +265,18 @@ class TrackedObjects:
         contact = self.contact
         if contact is not None:
             robot, every = self.model.robot, self.commands_a_step
-            points, rotations, contact = contact.advance(
-                robot, positions, every, torch.get_num_threads()
-            )
+            bodies, contact = contact.advance(robot, positions, every, torch.get_num_threads())
             motions += [
                 ObjectMotion(
                     reference=contact.centres,
                     points=way,
                     rotations=turns,
-                    weight=len(motions) / len(points),  # together as much as the networks
+                    openings=robot.gripper_openings(joints).T,
+                    weight=len(motions) / len(bodies.points),  # together as much as the networks
                 )
-                for way, turns in zip(points, rotations, strict=True)
+                for way, turns, joints in zip(
+                    bodies.points, bodies.rotations, bodies.joints, strict=True
+                )
             ]
         before = _Before(
             memory=memory, tools=tools[:, -2], gaps=gaps[:, -2], arms=arms, steps=first + count

@@ -211,6 +211,7 @@ class Arms:
                 armature = settings.finger_mass_kg * way
             self._stiffness[row], self._damping[row] = stiffness, damping
             self._armature[row] = armature
+        self._means = np.linalg.pinv(self._follows)
         self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
         fingers = {names[row] for row in self.fingers}
         for skeleton in (self.skeleton, self._ghost):
@@ -236,10 +237,12 @@ class Arms:
 
     def shares(self, columns: Sequence[int]) -> FloatArray:
         """Returns (F, C) what fingers make of joints: the mean of those that follow it."""
-        follows = self._follows[self.fingers][:, list(columns)]
-        moves = follows != 0
-        turns = np.divide(1, follows, out=np.zeros_like(follows), where=moves)
-        return turns / np.maximum(moves.sum(axis=0), 1)
+        return self._means[np.ix_(columns, self.fingers)].T
+
+    @property
+    def joints(self) -> FloatArray:
+        """(J,) where the robot's joints are [rad or m]."""
+        return self._means @ (self.skeleton.getPositions() - self._offsets)
 
     def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
         """Tells whether the arms are where they are in free air, (D,) each."""

@@ -79,7 +79,7 @@ class ContactRecording:
         """Returns (1 + T, O) how far objects are from where they were [m], NaN = not known."""
         alone = settings.model_copy(update={'num_motions': 1})
         motions = ContactMotions(settings=alone, response=response, solids=self.solids)
-        points = motions.advance(robot, self.positions, COMMANDS_A_STEP)[0][0]
+        points = motions.advance(robot, self.positions, COMMANDS_A_STEP)[0].points[0]
         return np.linalg.norm(points - points[0] - self.ways, axis=-1)
 
 

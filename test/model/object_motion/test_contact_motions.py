@@ -71,7 +71,8 @@ def still(robot, seconds: float) -> np.ndarray:
 
 def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recording):
     motions = motions_of(response, *recording.solids)
-    points, rotations, _ = motions.advance(robot, recording.positions, ROWS)
+    moved, _ = motions.advance(robot, recording.positions, ROWS)
+    points, rotations = moved.points, moved.rotations
     assert points.shape == (1, len(recording.positions[::ROWS]), 2, 3)
     assert rotations.shape == (*points.shape, 3)
     way = points[0, -1] - points[0, 0]
@@ -79,17 +80,27 @@ def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recor
     assert np.linalg.norm(way[1]) < 0.01
 
 
+def test_fingers_are_where_what_they_hold_stops_them(robot, response, recording):
+    """Whatever they are commanded to."""
+    motions = motions_of(response, *recording.solids)
+    joints = motions.advance(robot, recording.positions, ROWS)[0].joints[0]
+    widest = robot.gripper_openings(joints) - robot.gripper_openings(recording.positions[::ROWS])
+    assert 0.3 < widest.max() < 0.8
+    opened = robot.gripper_openings(joints)[:, -1]
+    np.testing.assert_allclose(opened, 1, atol=0.02)
+
+
 def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
     opened = recording.positions.copy()
     for tool in robot.tools:
         opened[:, robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
-    points, _, _ = motions_of(response, *recording.solids).advance(robot, opened, ROWS)
+    points = motions_of(response, *recording.solids).advance(robot, opened, ROWS)[0].points
     assert np.ptp(points[0, ..., 2], axis=0).max() < 0.005
 
 
 def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
     slippery = motions_of(response, *recording.solids, grip_friction=0.02)
-    points, _, _ = slippery.advance(robot, recording.positions, ROWS)
+    points = slippery.advance(robot, recording.positions, ROWS)[0].points
     assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.ways[-1, 0]) > 0.05
 
 
@@ -171,7 +182,7 @@ def test_arms_hit_each_other(robot, response, recording):
     alone[:, len(rest) // 2 :] = rest[len(rest) // 2 :]
     reached = []
     for positions in (both, alone):
-        _, _, then = motions_of(response).advance(robot, positions, ROWS)
+        _, then = motions_of(response).advance(robot, positions, ROWS)
         arms = RigidBodies(robot, response, (), SETTINGS, 0.002, rest).arms
         reached.append(np.abs(then.states[0].positions[-1] - arms.ways(positions[-1:])[0]).max())
     assert reached[0] > 0.05 > 0.01 > reached[1]
@@ -200,46 +211,45 @@ def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
     step = RigidBodies.step
     monkeypatch.setattr(RigidBodies, 'step', lambda self, f: (steps.append(0), step(self, f)))
     motions = motions_of(response, *recording.solids)
-    points, _, _ = motions.advance(robot, recording.positions, ROWS)
+    points = motions.advance(robot, recording.positions, ROWS)[0].points
     short = len(steps)
     monkeypatch.setattr(RigidBodies, 'passes', lambda *_: False)
     steps.clear()
-    whole, _, _ = motions.advance(robot, recording.positions, ROWS)
+    whole = motions.advance(robot, recording.positions, ROWS)[0].points
     assert short < 0.75 * len(steps)
     np.testing.assert_allclose(points[0, -1], whole[0, -1], atol=0.005)
 
 
 def test_chunks_go_on_where_the_last_one_ended(robot, response, recording):
     motions, half = motions_of(response, *recording.solids), 34 * ROWS
-    whole, _, _ = motions.advance(robot, recording.positions, ROWS)
-    first, _, then = motions.advance(robot, recording.positions[: half + 1], ROWS)
-    second, turned, _ = then.advance(robot, recording.positions[half:], ROWS)
-    np.testing.assert_allclose(first[0], whole[0, :35], atol=1e-4)
-    np.testing.assert_allclose(second[0, 0], first[0, -1], atol=1e-9)
-    assert np.linalg.norm(second[0, -1] - whole[0, -1], axis=-1).max() < 0.02
-    assert turned.shape[1] == second.shape[1]
+    whole = motions.advance(robot, recording.positions, ROWS)[0].points
+    first, then = motions.advance(robot, recording.positions[: half + 1], ROWS)
+    second, _ = then.advance(robot, recording.positions[half:], ROWS)
+    np.testing.assert_allclose(first.points[0], whole[0, :35], atol=1e-4)
+    np.testing.assert_allclose(second.points[0, 0], first.points[0, -1], atol=1e-9)
+    np.testing.assert_allclose(second.joints[0, 0], first.joints[0, -1], atol=1e-9)
+    assert np.linalg.norm(second.points[0, -1] - whole[0, -1], axis=-1).max() < 0.02
+    assert second.rotations.shape[:3] == second.points.shape[:3]
 
 
 def test_arms_that_touch_nothing_go_as_they_are_expected_to(robot, response, recording):
     """Nor does the table stop them in these one and a half seconds."""
     commands = recording.positions[:76]
-    points, _, then = motions_of(response, AWAY).advance(robot, commands, ROWS)
-    assert np.abs(points[0] - AWAY.centre).max() < 0.001
-    expected = replace(response, floor=None).follow(robot, commands)[0][-1]
-    arms = then.states[0].positions[-1]
-    # both fingers and the joints are in an order of the engine: any of them may be the one
-    for value in expected:
-        assert np.abs(arms - value).min() < 0.002
+    moved, then = motions_of(response, AWAY).advance(robot, commands, ROWS)
+    assert np.abs(moved.points[0] - AWAY.centre).max() < 0.001
+    expected = replace(response, floor=None).follow(robot, commands)[0]
+    np.testing.assert_allclose(moved.joints[0], expected[::ROWS], atol=0.002)
+    assert len(then.states[0].positions[-1]) == len(expected[0]) + 2  # fingers count each
 
 
 def test_motions_differ_within_the_errors_of_masks(robot, response):
     motions = motions_of(response, AWAY, num_motions=4)
-    points, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    points = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
     starts = points[:, 0, 0]
     np.testing.assert_allclose(starts[0], AWAY.centre, atol=1e-9)
     assert 0 < np.abs(starts[1:, :2] - AWAY.centre[:2]).max() < 0.006
     assert len({size.tobytes() for size in motions.sizes[:, 0]}) == 4
-    again, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    again = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
     np.testing.assert_array_equal(again, points)
 
 
@@ -253,22 +263,23 @@ def test_what_is_wide_and_low_is_hollow(robot, response, is_round):
         is_round=is_round,
     )
     block = replace(AWAY, centre=AWAY.centre + [0, 0, 0.005], size=np.full(3, 0.03))
-    points, _, _ = motions_of(response, dish, block).advance(robot, still(robot, 1.0), ROWS)
+    points = motions_of(response, dish, block).advance(robot, still(robot, 1.0), ROWS)[0].points
     assert points[0, -1, 1, 2] == pytest.approx(0.006 + 0.015, abs=0.003)
     assert np.linalg.norm(points[0, -1, 1, :2] - AWAY.centre[:2]) < 0.01
 
 
 def test_an_object_that_was_not_seen_is_not_known(robot, response):
     motions = motions_of(response, None, AWAY)
-    points, rotations, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    moved, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    points, rotations = moved.points, moved.rotations
     assert np.isnan(points[:, :, 0]).all() and np.isfinite(points[:, :, 1]).all()
     assert np.isfinite(rotations).all()
     assert np.isnan(motions.sizes[:, 0]).all() and np.isnan(motions.centres[0]).all()
     motions = motions_of(response, None)
-    points, _, _ = motions.advance(robot, still(robot, 0.2), ROWS)
+    points = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
     assert points.shape == (1, 3, 1, 3) and motions.sizes.shape == (1, 1, 3)
     nothing = motions_of(response)
-    points, _, _ = nothing.advance(robot, still(robot, 0.2), ROWS)
+    points = nothing.advance(robot, still(robot, 0.2), ROWS)[0].points
     assert points.shape == (1, 3, 0, 3) and nothing.centres.shape == (0, 3)
 
 
