@@ -29,7 +29,7 @@ from mtv_world_ros.model.object_motion.finger_swing import together
 from mtv_world_ros.model.object_motion.rigid_bodies import Arms, BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
-_SUBSTEPS = 10
+_SUBSTEPS = 5
 _STEP_S = PERIOD_S / _SUBSTEPS
 #: periods for which everything is still before arms only pass by
 _STILL_PERIODS = 5
@@ -266,6 +266,7 @@ def _run(bodies: RigidBodies, course: _Course, every: int) -> tuple[FloatArray, 
             course.free[first], course.fast[first]
         )
         if not (is_free and bodies.passes(course.free[last], course.fast[last])):
+            bodies.notice_touch()
             for step in range(first, last):
                 forces = course.forces[step], course.ways[step], course.velocities[step]
                 bodies.step(bodies.arms.forces(*forces))

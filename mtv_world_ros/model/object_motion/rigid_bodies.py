@@ -1,8 +1,8 @@
 """A table, a robot and solids as rigid bodies of the engine DART (dartsim.github.io).
 
-Its contacts are a linear complementarity problem with Coulomb friction; bodies do not sink into
-each other. Of two bodies that rub, the lower friction counts. Everything is made of boxes and
-balls, of which the engine itself finds contacts best; a robot with meshes needs another way.
+Bodies do not sink into each other, and rub by Coulomb's law. Of two that rub, the lower friction
+counts. Everything is made of boxes and balls, of which the engine itself finds contacts best; a
+robot with meshes needs another way.
 
 Shape letters: J joints, D degrees of freedom of the description, O solids, A tools.
 """
@@ -46,6 +46,8 @@ _SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
 _REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 _ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
 _LEAST_KG = 0.01
+#: how exactly friction is solved while fingers touch something: repetitions, relative error
+_SWEEPS, _TOLERANCE = 50, 1e-5
 #: half the extents of the table [m]
 _TABLE_M = (1.5, 1.5, 0.1)
 
@@ -115,9 +117,16 @@ class RigidBodies:
         self._option = solver.getCollisionOption()
         for pair in _same_arm(self.arms.skeleton):
             self._option.collisionFilter.addBodyNodePairToBlackList(*pair)
-        self._of_arms, self._others = (detector.createCollisionGroup() for _ in range(2))
+        self._touched = np.zeros(len(solids), np.bool_)
+        self._pyramid, self._cone = solver.getBoxedLcpSolver(), _cone()
+        groups = [detector.createCollisionGroup() for _ in range(3 + len(solids))]
+        self._of_arms, self._of_fingers, self._others, *self._of_solids = groups
         for node in _moving_nodes(self.arms.skeleton):
             self._of_arms.addShapeFrame(node)
+        for node in self.arms.finger_nodes:
+            self._of_fingers.addShapeFrame(node)
+        for group, solid in zip(self._of_solids, self._solids, strict=True):
+            group.addShapeFramesOf(solid)
         for skeleton in (_table(settings), *self._solids):
             self._others.addShapeFramesOf(skeleton)
             self._world.addSkeleton(skeleton)
@@ -138,6 +147,23 @@ class RigidBodies:
             return False
         skeleton.setVelocities(velocity)
         return True
+
+    def notice_touch(self) -> None:
+        """Gives what fingers touch by now the friction of grips, and the rest that of the table.
+
+        So what is gripped holds to fingers and slides on others. While anything is touched,
+        friction is solved as a cone; else as a pyramid along x and y, which is quicker.
+        """
+        touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
+        for number in np.flatnonzero(touched != self._touched):
+            grip, table = self._settings.grip_friction, self._settings.table_friction
+            body = self._solids[number].getBodyNode(0)
+            for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
+                node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
+        if touched.any() != self._touched.any():
+            solver = self._cone if touched.any() else self._pyramid
+            self._world.getConstraintSolver().setBoxedLcpSolver(solver)
+        self._touched = touched
 
     def step(self, forces: FloatArray) -> None:
         """Goes on by a step with forces (D,) on the arms."""
@@ -222,6 +248,16 @@ class Arms:
             for skeleton in (self.skeleton, self._ghost):
                 joint = skeleton.getJoint(names[row])
                 _add_drive(joint, float(rotors[row]), is_finger=names[row] in fingers)
+
+    @property
+    def finger_nodes(self) -> list[Any]:
+        """Shapes of the fingers."""
+        joints = {self.skeleton.getDof(number).getName() for number in self.fingers}
+        return [
+            node
+            for node in _moving_nodes(self.skeleton)
+            if node.getBodyNodePtr().getParentJoint().getName() in joints
+        ]
 
     @property
     def finger_drives(self) -> FingerDrives:
@@ -330,6 +366,13 @@ def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
         for one, other in combinations(range(len(bodies)), 2)
         if movers[one] & movers[other]
     ]
+
+
+def _cone() -> Any:
+    """What solves contacts with friction that is the same in all directions."""
+    options = dart.constraint.NsgsFrictionSolver.Options()
+    options.maxSweeps, options.tolerance = _SWEEPS, _TOLERANCE
+    return dart.constraint.NsgsFrictionSolver(options)
 
 
 def _detector(arms: Any) -> Any:
@@ -463,7 +506,7 @@ def _body(number: int, solid: Solid, settings: ContactSettings) -> Any:
     middle = sum(part.mass * part.pose[:3, 3] for part in parts) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
-        _add_part(body, part, settings.grip_friction)
+        _add_part(body, part, settings.table_friction)
         turn, arm = part.pose[:3, :3], part.pose[:3, 3] - middle
         inertia += turn @ part.inertia @ turn.T
         inertia += part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
