@@ -16,7 +16,7 @@ from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion import predictor
+from mtv_world_ros.model.object_motion import contact_motions, predictor
 from mtv_world_ros.model.object_motion.contact_motions import check_robot, ContactMotions
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.predictor import (
@@ -40,6 +40,8 @@ SETTINGS = ContactSettings(
     tray_kg=0.4,
     num_motions=1,
 )
+#: of the engine [s]
+STEP_S = contact_motions._STEP_S
 #: out of the arms' reach
 AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
 
@@ -116,7 +118,7 @@ def shaken(robot, seconds: float = 2.0) -> np.ndarray:
 
 def courses_of(robot, response, positions, **changed):
     motions = motions_of(response, **changed)
-    arms = RigidBodies(robot, response, (), motions.settings, 0.002, positions[0]).arms
+    arms = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0]).arms
     (course,), _, _ = motions._courses([arms], response.follow(robot, positions)[0])
     return arms, course
 
@@ -142,7 +144,7 @@ def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
     """So that arms may pass by without them."""
     positions = shaken(robot)
     motions = motions_of(response, fingers_swing=swing)
-    bodies = RigidBodies(robot, response, (), motions.settings, 0.002, positions[0])
+    bodies = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0])
     (course,), _, _ = motions._courses([bodies.arms], response.follow(robot, positions)[0])
     bodies.arms.skeleton.setPositions(course.free[0])
     worst = 0.0
@@ -151,13 +153,13 @@ def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
         bodies.step(bodies.arms.forces(*forces))
         off = np.abs(bodies.arms.skeleton.getPositions() - course.free[step + 1])
         worst = max(worst, off.max())
-    assert worst < 0.003
+    assert worst < 0.005
 
 
 def test_an_arm_feels_its_own_rotors_alone(robot, response, recording):
     """The engine has none; its bodies come near to what joints feel."""
     pose = recording.positions[0]
-    arms = RigidBodies(robot, response, (), SETTINGS, 0.002, pose).arms
+    arms = RigidBodies(robot, response, (), SETTINGS, STEP_S, pose).arms
     arms.skeleton.setPositions(arms.ways(pose[None])[0])
     names = [arms.skeleton.getDof(i).getName() for i in range(arms.skeleton.getNumDofs())]
     strong = [f'{arm}_joint{number}' for arm in ('left', 'right') for number in (1, 2, 3)]
@@ -183,7 +185,7 @@ def test_arms_hit_each_other(robot, response, recording):
     reached = []
     for positions in (both, alone):
         _, then = motions_of(response).advance(robot, positions, ROWS)
-        arms = RigidBodies(robot, response, (), SETTINGS, 0.002, rest).arms
+        arms = RigidBodies(robot, response, (), SETTINGS, STEP_S, rest).arms
         reached.append(np.abs(then.states[0].positions[-1] - arms.ways(positions[-1:])[0]).max())
     assert reached[0] > 0.05 > 0.01 > reached[1]
 
@@ -197,11 +199,35 @@ def test_what_falls_into_a_cup_lies_on_its_floor(robot, response, is_open, heigh
         is_open=is_open,
     )
     ball = Solid(centre=np.array([0.0, 0.3, 0.09]), size=np.full(3, 0.02))
-    bodies = RigidBodies(robot, response, (cup, ball), SETTINGS, 0.002)
-    for _ in range(400):
+    bodies = RigidBodies(robot, response, (cup, ball), SETTINGS, STEP_S)
+    for _ in range(round(0.8 / STEP_S)):
         bodies.step(np.zeros(bodies.arms.skeleton.getNumDofs()))
-    assert bodies.poses()[1, 2, 3] == pytest.approx(height, abs=0.005)
+    # the engine hardly lifts out what sinks in within the step of an impact
+    assert bodies.poses()[1, 2, 3] == pytest.approx(height, abs=0.008)
     assert bodies.poses()[0, 2, 3] == pytest.approx(0.03, abs=0.002)
+
+
+def test_what_fingers_touch_holds_to_them_and_slides_on_others(robot, response):
+    """Of two that rub, the lower friction counts."""
+    rest = still(robot, 0.0)[0]
+    for tool in robot.tools:
+        rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
+    between = replace(AWAY, centre=robot.tool_poses(rest[None])[0, 0, :3, 3])
+    bodies = RigidBodies(robot, response, (AWAY, between), SETTINGS, STEP_S, rest)
+
+    def frictions():
+        bodies.notice_touch()
+        nodes = [solid.getBodyNode(0).getShapeNode(0) for solid in bodies._solids]
+        return [node.getDynamicsAspect().getFrictionCoeff() for node in nodes]
+
+    def solver():
+        return bodies._world.getConstraintSolver().getBoxedLcpSolver()
+
+    table, grip = SETTINGS.table_friction, SETTINGS.grip_friction
+    assert frictions() == [table, grip] and solver() is bodies._cone
+    aside = rest + np.where([name.endswith('joint1') for name in robot.joint_names], 1.0, 0.0)
+    bodies.arms.skeleton.setPositions(bodies.arms.ways(aside[None])[0])
+    assert frictions() == [table, table] and solver() is bodies._pyramid
 
 
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
