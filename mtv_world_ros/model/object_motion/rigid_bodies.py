@@ -237,7 +237,7 @@ class Arms:
                 armature = settings.finger_mass_kg * way
             self._stiffness[row], self._damping[row] = stiffness, damping
             self._armature[row] = armature
-        self._means = np.linalg.pinv(self._follows)
+        self._means = np.asarray(np.linalg.pinv(self._follows), np.float64)
         self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
         fingers = {names[row] for row in self.fingers}
         for skeleton in (self.skeleton, self._ghost):
