@@ -13,11 +13,9 @@ from mtv_world_ros.assembly import checkpoint_path, robot_path
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.predictor import (
     CONTACT_FILE,
     load_predictor,
-    load_response,
 )
 from mtv_world_ros.training.object_motion import contact_fit
 from mtv_world_ros.training.object_motion.contact_fit import (
@@ -29,16 +27,6 @@ from mtv_world_ros.training.object_motion.contact_fit import (
 
 VIEWS = ('low', 'high')
 DEMO = share_path('resource', 'demo_episode')
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(robot_path('yam_bimanual'))
-
-
-@pytest.fixture(scope='module')
-def response(robot):
-    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
 
 
 @pytest.fixture

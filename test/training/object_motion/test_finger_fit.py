@@ -5,24 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.model.object_motion.predictor import load_response
 from mtv_world_ros.training.object_motion.contact_fit import first_settings
 from mtv_world_ros.training.object_motion.finger_fit import _swing, fit_fingers, FreeGrippers
 
 TRUE = {'finger_stiffness': 80.0, 'finger_damping': 6.0, 'finger_mass_kg': 0.08}
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-
-
-@pytest.fixture(scope='module')
-def response(robot):
-    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
 
 
 def shaken(robot, seed: int) -> np.ndarray:

@@ -16,7 +16,6 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.object_motion.network import (
     _rotation,
     Memory,
@@ -50,11 +49,6 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(scope='module')
