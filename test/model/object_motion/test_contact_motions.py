@@ -230,6 +230,20 @@ def test_what_fingers_touch_holds_to_them_and_slides_on_others(robot, response):
     assert frictions() == [table, table] and solver() is bodies._pyramid
 
 
+@pytest.mark.parametrize('degrees', [0, 45])
+def test_friction_is_the_same_in_all_directions_where_fingers_touch(robot, response, degrees):
+    bodies = RigidBodies(robot, response, (replace(AWAY, yaw=0.0),), SETTINGS, STEP_S)
+    bodies._world.getConstraintSolver().setBoxedLcpSolver(bodies._cone)
+    turn, speed = np.radians(degrees), 0.6
+    velocity = [0, 0, 0, speed * np.cos(turn), speed * np.sin(turn), 0]
+    start = bodies.poses()[0, :2, 3]
+    bodies._solids[0].setVelocities(velocity)
+    for _ in range(round(0.5 / STEP_S)):
+        bodies.step(np.zeros(bodies.arms.skeleton.getNumDofs()))
+    way = np.linalg.norm(bodies.poses()[0, :2, 3] - start)
+    assert way == pytest.approx(speed**2 / 2 / SETTINGS.table_friction / 9.81, rel=0.1)
+
+
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
     robot, response, recording, monkeypatch
 ):
