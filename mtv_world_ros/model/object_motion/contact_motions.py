@@ -152,14 +152,8 @@ class ContactMotions:
         self, arms: Sequence[Arms], where: FloatArray
     ) -> tuple[list[_Course], FloatArray, FloatArray]:
         """What the arms of K motions are to do; `speeds` and `swings` after it."""
-        coarse, fingers = arms[0].ways(where), arms[0].fingers
-        times = np.arange(len(coarse)) * PERIOD_S
-        first = np.zeros(coarse.shape[1]) if self.speeds is None else self.speeds
-        curve = CubicSpline(times, coarse, bc_type=((1, first), 'not-a-knot'))  # type: ignore[arg-type]
-        ways = curve(np.arange((len(coarse) - 1) * _SUBSTEPS + 1) * _STEP_S)
-        velocities = np.concatenate([first[None], np.diff(ways, axis=0) / _STEP_S])
-        carried = arms[0].carried(coarse, curve(times, 1), curve(times, 2))
-        forces, pulls = (_between(rows) for rows in carried)
+        fingers = arms[0].fingers
+        ways, velocities, forces, pulls = driven(arms[0], where, _SUBSTEPS, self.speeds)
         start = np.zeros((2, len(arms), len(fingers))) if self.swings is None else self.swings
         drives = together([one.finger_drives for one in arms])
         swings, then = drives.swings(pulls, ways[:, fingers], _STEP_S, start)
@@ -244,11 +238,35 @@ class _Course:
     fast: FloatArray
 
 
-def _between(rows: FloatArray) -> FloatArray:
-    """Rows (1 + T, D), a period apart, at the steps of the engine but the last."""
-    share = np.arange(_SUBSTEPS)[:, None] / _SUBSTEPS
-    mixed = rows[:-1, None] * (1 - share) + rows[1:, None] * share
-    return mixed.reshape(-1, rows.shape[1])
+def driven(
+    arms: Arms, where: FloatArray, substeps: int, speeds: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Returns what moves arms in free air, at N = T * `substeps` steps of the engine.
+
+    Args:
+        arms: any.
+        where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
+        substeps: of a period.
+        speeds: (D,) at first; None = at rest.
+
+    Returns:
+        Ways (1 + N, D) of drives, velocities (1 + N, D), forces (N, D), and those with which hands
+        pull their fingers (N, F).
+    """
+    coarse, step_s = arms.ways(where), PERIOD_S / substeps
+    times = np.arange(len(coarse)) * PERIOD_S
+    first = np.zeros(coarse.shape[1]) if speeds is None else speeds
+    curve = CubicSpline(times, coarse, bc_type=((1, first), 'not-a-knot'))  # type: ignore[arg-type]
+    ways = curve(np.arange((len(coarse) - 1) * substeps + 1) * step_s)
+    velocities = np.concatenate([first[None], np.diff(ways, axis=0) / step_s])
+    share = np.arange(substeps)[:, None] / substeps
+
+    def between(rows: FloatArray) -> FloatArray:
+        mixed = rows[:-1, None] * (1 - share) + rows[1:, None] * share
+        return mixed.reshape(-1, rows.shape[1])
+
+    forces, pulls = arms.carried(coarse, curve(times, 1), curve(times, 2))
+    return ways, velocities, between(forces), between(pulls)
 
 
 def _run(bodies: RigidBodies, course: _Course, every: int) -> tuple[FloatArray, FloatArray]:

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.model.object_motion.contact_motions import driven
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
 from mtv_world_ros.model.object_motion.rigid_bodies import RigidBodies
@@ -150,11 +150,7 @@ def _swing(
     unit = settings.model_copy(update={'finger_stiffness': 1.0, 'finger_damping': 1.0})
     arms = RigidBodies(robot, response, (), unit, PERIOD_S, grippers.positions[0]).arms
     where, _ = replace(response, floor=None).follow(robot, grippers.positions)
-    coarse, times = arms.ways(where), np.arange(len(where)) * PERIOD_S
-    curve = CubicSpline(times, coarse, bc_type=((1, np.zeros(coarse.shape[1])), 'not-a-knot'))  # type: ignore[arg-type]
-    pulls = arms.carried(coarse, curve(times, 1), curve(times, 2))[1]
-    fine = np.linspace(0, times[-1], (len(times) - 1) * _SUBSTEPS + 1)
-    pulls = np.stack([np.interp(fine[:-1], times, column) for column in pulls.T], axis=1)
+    ways, _, _, pulls = driven(arms, where, _SUBSTEPS)
     drives = arms.finger_drives
     travels = {
         robot.joint_names.index(tool.gripper_joint): abs(tool.gripper_open - tool.gripper_closed)
@@ -166,7 +162,7 @@ def _swing(
     return _Swing(
         drives=replace(drives, mass=drives.mass - drives.stiffness * settings.finger_mass_kg),
         pulls=pulls,
-        ways=curve(fine)[:, arms.fingers],
+        ways=ways[:, arms.fingers],
         means=arms.shares(columns) / scale,
         dips=(grippers.recorded - where)[:, columns] / scale,
     )
