@@ -31,7 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--episodes', type=int, default=200, help='at most, spread evenly')
-    parser.add_argument('--motions', type=int, default=5, help='that are foreseen later')
+    parser.add_argument('--motions', type=int, default=4, help='that are foreseen later')
     parser.add_argument('--workers', type=int, default=1, help='processes')
     add_overwrite(parser)
     parser.set_defaults(handler=_fit)

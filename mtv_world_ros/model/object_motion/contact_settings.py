@@ -21,4 +21,4 @@ class ContactSettings(Schema):
     rim_m: Positive = Field(default=0.01, description='thickness of the rim of plates and bowls')
     wall_m: Positive = Field(default=0.005, description='of the walls of cups and of boxes')
     table_m: float = Field(default=0.0, description='its height in the base frame [m]')
-    num_motions: int = Field(default=5, ge=1, le=64, description='the last ones disturbed')
+    num_motions: int = Field(default=4, ge=1, le=64, description='the last ones disturbed')
