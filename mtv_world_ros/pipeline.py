@@ -303,7 +303,8 @@ class ImaginedEpisode:
         Args:
             frames: (V, T, H', W', 3) uint8 RGB after `observation`, at the model's frame rate and
                 any size.
-            positions: (1 + T, J) commanded [rad or m]; row 0 where the robot stood before.
+            positions: (1 + T, J) measured [rad or m]; row 0 where the robot stood before. So a
+                gripper that something holds apart is not taken to be open.
             cameras: as they are at the last frame, at the model's size; None = as before.
         """
         spec, state = self.pipeline.spec, self._rollouts[0]

@@ -104,13 +104,7 @@ def _score(
         kept = len(indices) - 1
         if kept < 1:
             continue
-        ids = recording.object_ids
-        stretch = Stretch(
-            index=index,
-            start=int(indices[0]),
-            frames=recording.frames[:, indices],
-            object_ids=None if ids is None else ids[:, indices],
-        )
+        stretch = Stretch.of(recording, index, indices)
         truth = true_masks(stretch, segmenter, recording.objects, recording.objects, use_ids=False)
         predicted = chunk.predicted[:, :kept]
         scores = score_frames(predicted, truth, segmenter)

@@ -10,13 +10,13 @@ import numpy as np
 from mtv_world_ros.data.recording import commands_until, frame_indices, Recording
 from mtv_world_ros.data_types import (
     ByteArray,
+    FloatArray,
     JointTrajectory,
     Observation,
     SuccessEstimate,
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 
@@ -33,12 +33,26 @@ class Stretch:
         start: recorded frame it starts from.
         frames: (V, 1 + T, H, W, 3) recorded frames on the model's clock, frame 0 the start.
         object_ids: (V, 1 + T, H, W) true masks as identities, None where not recorded.
+        positions: (1 + T, J) measured at these frames [rad or m].
     """
 
     index: int
     start: int
     frames: ByteArray
     object_ids: ByteArray | None
+    positions: FloatArray
+
+    @classmethod
+    def of(cls, recording: Recording, index: int, rows: np.ndarray) -> Stretch:
+        """Returns the stretch of 1 + T recorded frames."""
+        ids = recording.object_ids
+        return cls(
+            index=index,
+            start=int(rows[0]),
+            frames=recording.frames[:, rows],
+            object_ids=None if ids is None else ids[:, rows],
+            positions=recording.positions[rows],
+        )
 
     @property
     def num_frames(self) -> int:
@@ -85,16 +99,8 @@ def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Str
 def _cut(
     recording: Recording, start: int, count: int, spec: WorldModelSpec, index: int
 ) -> Stretch | None:
-    frames = frame_indices(recording, start, spec, count)
-    if frames is None:
-        return None
-    ids = recording.object_ids
-    return Stretch(
-        index=index,
-        start=start,
-        frames=recording.frames[:, frames],
-        object_ids=None if ids is None else ids[:, frames],
-    )
+    rows = frame_indices(recording, start, spec, count)
+    return None if rows is None else Stretch.of(recording, index, rows)
 
 
 def imagine_stretch(
@@ -125,11 +131,8 @@ def imagine_stretch(
 
 def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) -> SuccessEstimate:
     """Returns what the estimate says at the end of a stretch's recorded frames."""
-    trajectory = _commands(pipeline, recording, stretch)
     episode = _begin(pipeline, recording, stretch)
-    times = np.arange(stretch.num_frames + 1) / pipeline.spec.fps
-    positions = resample(trajectory, recording.positions[stretch.start], times)
-    return episode.observe(stretch.frames[:, 1:], positions).success
+    return episode.observe(stretch.frames[:, 1:], stretch.positions).success
 
 
 def _commands(pipeline: Pipeline, actions: Recording, stretch: Stretch) -> JointTrajectory:

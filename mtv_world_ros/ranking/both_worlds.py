@@ -50,7 +50,7 @@ class BothWorlds:
 
     def course(self) -> Course:
         """Returns how the rollout went."""
-        commands = [chunk.positions[1:] for chunk in self.real]
+        commands = [chunk.commands for chunk in self.real]
         gaps = command_gaps(commands, [chunk.positions for chunk in self.imagined])
         overlaps = np.full((0, len(gaps)), nan)
         names: tuple[str, ...] = ()

@@ -169,11 +169,13 @@ class SeenChunk:
 
     Attributes:
         frames: (V, T, H, W, 3) uint8 RGB at the model's rate.
-        positions: (1 + T, J) commanded, row 0 where the robot stood [rad or m].
+        positions: (1 + T, J) measured, row 0 before the first frame [rad or m].
+        commands: (T, J) at the frames [rad or m].
     """
 
     frames: ByteArray
     positions: FloatArray
+    commands: FloatArray
 
 
 class SimulatedWorld:
@@ -225,7 +227,8 @@ class SimulatedWorld:
         self.chunks.append(
             SeenChunk(
                 frames=np.stack([found.frames for found in shown], axis=1),
-                positions=np.concatenate([before.positions[None], commands[rows]]),
+                positions=np.stack([found.positions for found in (before, *shown)]),
+                commands=commands[rows],
             )
         )
         self.commands.append(commands)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,9 +7,11 @@ import pytest
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
+    observe_stretch,
     predicted_frames,
     stretches,
 )
+from mtv_world_ros.pipeline import ImaginedEpisode
 
 
 def test_observed_stretches_are_chunks_from_real_frames(recordings, make_pipeline):
@@ -17,6 +20,26 @@ def test_observed_stretches_are_chunks_from_real_frames(recordings, make_pipelin
     assert [(s.start, s.num_frames) for s in found] == [(0, 4), (8, 4)]
     assert (found[1].frames[:, 0] == recordings[0].frames[:, 8]).all()
     assert (found[1].frames[:, 4] == recordings[0].frames[:, 16]).all()
+    np.testing.assert_array_equal(found[1].positions, recordings[0].positions[8:17:2])
+
+
+def test_recorded_frames_are_judged_with_the_joints_that_were_measured(
+    recordings, make_pipeline, monkeypatch
+):
+    """What stops a gripper shows there, and not in the commands."""
+    judged = []
+
+    def observe(self, frames, positions):
+        judged.append((frames, positions))
+        return SimpleNamespace(success='estimate')
+
+    monkeypatch.setattr(ImaginedEpisode, 'observe', observe)
+    pipeline = make_pipeline()
+    stretch = stretches(recordings[0], pipeline.spec, 'observe')[1]
+    assert observe_stretch(pipeline, recordings[0], stretch) == 'estimate'
+    ((frames, positions),) = judged
+    np.testing.assert_array_equal(frames, stretch.frames[:, 1:])
+    np.testing.assert_array_equal(positions, recordings[0].positions[8:17:2])
 
 
 def test_last_stretch_of_at_least_half_a_chunk_is_kept(recordings, make_pipeline):

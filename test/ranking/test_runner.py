@@ -94,6 +94,16 @@ def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
         RolloutRunner(runner.pipeline, beyond).simulate(job)
 
 
+def test_frames_come_with_joints_as_measured_and_as_commanded(runner, expert):
+    (job,) = make_jobs(('expert',), (TASK,), 1, 0, expert)
+    world = runner.simulate(job).world
+    for chunk in world.chunks:
+        assert len(chunk.positions) == 1 + chunk.frames.shape[1] == 1 + len(chunk.commands)
+    np.testing.assert_array_equal(world.chunks[-1].positions[-1], world.observation.positions)
+    lag = np.abs(world.chunks[0].positions[1:] - world.chunks[0].commands)
+    assert 1e-4 < lag.max() < 0.5
+
+
 def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, expert):
     """What it names is followed and judged in both worlds."""
     shown = []
