@@ -51,6 +51,8 @@ _FITTED = (
 _FACTORS = (1.6, 1.6, 1.3, 1.3, 1.15)
 #: of these what grippers report says more, where fingers swing
 _OF_FINGERS = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
+#: standard errors by which a change must help: one in twenty that does nothing is taken
+_SURE = 1.64
 #: errors below the first are as good, above the second as bad [m]
 _LEAST_M, _MOST_M = 0.003, 0.1
 
@@ -154,8 +156,8 @@ def fit_contact(
     """Returns the settings with which solids keep nearest to where objects were.
 
     Fingers come first, see `fit_fingers`. Then, in each round, every other number is tried larger
-    and smaller; those that help are changed, together if that is better still, or else the one
-    that helps most. The factors get smaller.
+    and smaller; those that help by more than chance are changed, together if that is better still,
+    or else the one that helps most. The factors get smaller.
 
     Args:
         recordings: E.
@@ -186,31 +188,37 @@ def fit_contact(
     swing = 'swing' if best.fingers_swing else 'do not swing'
     report(f'fingers {swing}: {best.model_dump(mode="json", include=set(_OF_FINGERS))}')
     fitted = [name for name in _FITTED if not (best.fingers_swing and name in _OF_FINGERS)]
-    loss = float(np.nanmean(losses([best])))
-    report(f'begins at {loss:.3f}')
+    (loss,) = losses([best])
+    report(f'begins at {np.nanmean(loss):.3f}')
     for factor in _FACTORS:
         tried = [
             best.model_copy(update={name: getattr(best, name) * by})
             for name in fitted
             for by in (factor, 1 / factor)
         ]
-        found = np.nanmean(losses(tried), axis=1)
+        found = losses(tried)
+        gains = np.array([_sure_gain(loss - one) for one in found])
         changes = {}
         for number, name in enumerate(fitted):
-            better = 2 * number + int(found[2 * number + 1] < found[2 * number])
-            if found[better] < loss:
+            better = 2 * number + int(gains[2 * number + 1] > gains[2 * number])
+            if gains[better] > 0:
                 changes[name] = getattr(tried[better], name)
         if changes:
             together = best.model_copy(update=changes)
-            together_loss = float(np.nanmean(losses([together])))
-            alone = int(np.argmin(found))
+            (of_all,), alone = losses([together]), int(np.argmax(gains))
             best, loss = (
-                (together, together_loss)
-                if together_loss <= found[alone]
-                else (tried[alone], float(found[alone]))
+                (together, of_all)
+                if np.nanmean(of_all) <= np.nanmean(found[alone])
+                else (tried[alone], found[alone])
             )
-        report(f'by {factor}: {loss:.3f} with {best.model_dump(mode="json")}')
+        report(f'by {factor}: {np.nanmean(loss):.3f} with {best.model_dump(mode="json")}')
     return best
+
+
+def _sure_gain(gains: FloatArray) -> float:
+    """The lower end of the mean of what episodes (E,) gain; a few of them may gain a lot."""
+    known = gains[np.isfinite(gains)]
+    return float(known.mean() - _SURE * known.std() / np.sqrt(len(known)))
 
 
 class _Trial:

@@ -63,6 +63,12 @@ def test_the_search_leaves_what_loses_the_block(robot, response, monkeypatch):
     assert ends < begins
 
 
+def test_what_helps_in_one_episode_of_many_is_chance():
+    assert contact_fit._sure_gain(np.array([0.1, np.nan])) == pytest.approx(0.1)
+    assert contact_fit._sure_gain(np.array([0.1, 0.2, 0.1, 0.2])) > 0.1
+    assert contact_fit._sure_gain(np.array([0.0, -0.01, 0.01, 0.5])) < 0
+
+
 def test_recordings_that_say_nothing_are_refused(robot, response, tmp_path):
     recordings, skipped = read_recordings([DEMO, tmp_path], robot, VIEWS)
     assert len(recordings) == 1 and list(skipped) == [str(tmp_path)]
