@@ -120,11 +120,12 @@ class ContactMotions:
             swings=swings,
             pose=pose,
         )
-        points, rotations = (
-            self._of_all(poses[..., :3, 3], np.nan),
-            self._of_all(turned, np.eye(3)),
+        motions = BodyMotions(
+            points=self._of_all(poses[..., :3, 3], np.nan),
+            rotations=self._of_all(turned, np.eye(3)),
+            joints=joints,
         )
-        return BodyMotions(points=points, rotations=rotations, joints=joints), then
+        return motions, then
 
     @property
     def centres(self) -> FloatArray:
