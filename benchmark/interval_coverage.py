@@ -190,18 +190,17 @@ def coverage(
 
 
 def mild_ranking(rng: np.random.Generator, num: int) -> tuple[np.ndarray, ...]:
-    """True and judged rates of ten policies, and outcomes (P, K, E) on n scenes of each task."""
+    """True and judged rates of ten policies; outcomes and estimates (P, K, E) of n scenes each."""
     true = np.linspace(0.1, 0.9, _POLICIES)
     judged = np.clip(0.2 + 0.6 * true + rng.normal(0, 0.12, _POLICIES), 0.02, 0.98)
     shape = (_POLICIES, _TASKS, num)
-    real, said = (
-        (rng.random(shape) < rates[:, None, None]).astype(float) for rates in (true, judged)
-    )
+    real = (rng.random(shape) < true[:, None, None]).astype(float)
+    said = rng.beta(*(2 * np.stack([judged, 1 - judged])[..., None, None]), shape)
     return true, judged, real, said
 
 
 def differing_ranking(rng: np.random.Generator, num: int) -> tuple[np.ndarray, ...]:
-    """The same of 4 to 30 policies of one task: U-shaped, all alike, in two groups.
+    """The same of 4 to 30 policies of one task, and outcomes in both: U-shaped, alike, two groups.
 
     The worlds' rates have a correlation of .3, .7 or .95 (.998: a nearly perfect judge). Of the
     luck of a rollout, .3 is the scene's, the same for all policies and both worlds, and .3 the

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,10 @@ from mtv_world_ros.evaluation.report.rollout_clips import make_clip
 from mtv_world_ros.evaluation.results import rollout_bytes, StoredRollout
 from mtv_world_ros.pipeline import ObservedChunk
 from mtv_world_ros.prediction import Prediction
-from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, Course, OBJECTS_PART, THRESHOLD
+from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, Course, OBJECTS_PART
 from mtv_world_ros.ranking.worlds import SeenChunk
 from mtv_world_ros.rendering.images import resize_frames
+from mtv_world_ros.success.verdict import verdict
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: an object has parted where its overlap is too small in so many frames in a row
@@ -77,8 +78,7 @@ class BothWorlds:
                 (
                     end
                     for end in ends
-                    if isfinite(seen.get(end, nan)) and isfinite(imagined.get(end, nan))
-                    if (seen[end] >= THRESHOLD) != (imagined[end] >= THRESHOLD)
+                    if {verdict(seen.get(end, nan)), verdict(imagined.get(end, nan))} == {0.0, 1.0}
                 ),
                 nan,
             ),

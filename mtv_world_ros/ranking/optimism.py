@@ -46,7 +46,7 @@ MEASURES = {
     'mmrv_noise_free': 'MMRV noise-free',
     'auroc': 'AUROC',
     'false_success': 'false success',
-    'abstention': 'abstains',
+    'abstention': 'no verdict',
     'contact_flips': 'flips, contact',
     'flips': 'flips, all',
     'over_rule': 'AUROC - rule',
@@ -158,7 +158,7 @@ class Optimism:
     def _agreement(self, results: Sequence[Result], judge: str) -> dict[str, Score]:
         """Pearson r and MMRV over the policies."""
         true = outcomes(results, lambda r: float(r.final))
-        judged = outcomes(results, lambda r: judged_by(r, judge).success)
+        judged = outcomes(results, lambda r: judged_by(r, judge).probability)
         count = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
         found = {}
         for name, score in rate_agreement(judged, true).items():

@@ -11,7 +11,7 @@ from mtv_world_ros.sim.expert.faults import FAULTS
 
 REMARK = (
     'Cells: value [95 % interval] count. False success: real failures called a success, of those '
-    'that were judged. AUROC: of the rollouts that were judged. Flips: a command whose true '
+    'with a verdict. AUROC: of the rollouts with an estimate. Flips: a command whose true '
     "outcome differs from the expert's in the same scene; how often the imagined last frame is "
     'nearer to what really happened than to what happened under the expert, over the pixels in '
     'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
@@ -72,7 +72,7 @@ def _by_kind(name: str, found: Optimism) -> Table:
                 _cell(scores['flips']),
             ]
         )
-    head = ['kind', 'n', 'true', 'AUROC/rule', 'false success', 'rule', 'abst', 'flips']
+    head = ['kind', 'n', 'true', 'AUROC/rule', 'false success', 'rule', 'open', 'flips']
     caption = f'{name}, by fault kind (* shows in the path of the arm)'
     return Table(caption=caption, head=head, rows=rows)
 

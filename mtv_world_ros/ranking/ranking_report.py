@@ -18,15 +18,16 @@ from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
 from mtv_world_ros.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
 from mtv_world_ros.ranking.rollout_cards import rollout_cards
-from mtv_world_ros.ranking.rollout_jobs import THRESHOLD
+from mtv_world_ros.success.verdict import FAILURE_BELOW, SUCCESS_FROM
 
 TITLE = 'Policy ranking'
 #: hues of the report's style sheet
 _NUM_HUES = 6
 _MEANING = (
-    "Success in the simulator: the task's relations hold on true object poses at the end. Success "
-    'in imagination is an estimate of at least {threshold} at the end of the imagined episode, '
-    'which starts from the same first pictures. Scripted policies go by time and do not look: '
+    "Success in the simulator: the task's relations hold on true object poses at the end. In "
+    'imagination, which starts from the same first pictures, an estimate is made at the end: a '
+    f'rate is the mean of the estimates; a verdict is success from {SUCCESS_FROM} on, failure '
+    f'below {FAILURE_BELOW}, and open between. Scripted policies go by time and do not look: '
     'only the world that their commands meet differs. Policies that look may also send other '
     'commands in each world.'
 )
@@ -59,16 +60,16 @@ def tables(summary: Summary) -> list[Table]:
 def remarks(summary: Summary) -> list[str]:
     """Returns what has to be known to read the numbers."""
     found = [
-        _MEANING.format(threshold=THRESHOLD),
+        _MEANING,
         _CEILING.format(seen=JUDGES['seen'].capitalize()),
         _agreement_remark(summary),
-        _abstention_remark(summary),
+        _unknown_remark(summary),
         _INTERVALS,
         OPTIMISM_REMARK if summary.optimism else '',
     ]
     if any('uncalibrated' in ' '.join(result.imagined.reasons) for result in summary.results):
         found.append(
-            'The estimates are not calibrated: the threshold is a stated one, not a fitted one.'
+            'The estimates are not calibrated: their weights are stated ones, not fitted ones.'
         )
     cut = sum(not result.is_over for result in summary.results)
     if cut:
@@ -105,14 +106,13 @@ def _agreement_remark(summary: Summary) -> str:
     return ''
 
 
-def _abstention_remark(summary: Summary) -> str:
-    rate = summary.abstained('imagined')
-    if not rate.hits:
-        return ''
+def _unknown_remark(summary: Summary) -> str:
     per_task = {
-        task: sum(summary.judged_rate(p, task, 'imagined').num_abstained for p in summary.policies)
+        task: sum(summary.judged_rate(p, task, 'imagined').num_unknown for p in summary.policies)
         for task in summary.tasks
     }
+    if not any(per_task.values()):
+        return ''
     blind = [
         task
         for task in summary.tasks
@@ -120,9 +120,9 @@ def _abstention_remark(summary: Summary) -> str:
     ]
     by_task = ', '.join(f'{task}: {count}' for task, count in per_task.items())
     text = (
-        f'The estimator abstained in {rate.hits} of {rate.count} imagined episodes '
-        f'({by_task}). Rates, r and MMRV are of the others alone; if it abstains more on '
-        'failures, imagined rates are too high.'
+        f'{sum(per_task.values())} of {len(summary.results)} imagined episodes have no estimate '
+        f'({by_task}). Rates, r and MMRV are of the others alone; if failures lack one more '
+        'often, imagined rates are too high.'
     )
     if blind:
         text += f' It judged nothing of {", ".join(blind)}; that task is in no imagined rate.'
@@ -130,10 +130,11 @@ def _abstention_remark(summary: Summary) -> str:
 
 
 def _rate(rate: Rate) -> str:
+    unknown = f'{rate.num_unknown} without an estimate'
     if not rate.count:
-        return f'{DASH} ({rate.num_abstained} abstained)' if rate.num_abstained else DASH
+        return f'{DASH} ({unknown})' if rate.num_unknown else DASH
     text = f'{rate.value:.2f} {_interval(rate.interval)} of {rate.count}'
-    return f'{text}, {rate.num_abstained} abstained' if rate.num_abstained else text
+    return f'{text}, {unknown}' if rate.num_unknown else text
 
 
 def _interval(interval: tuple[float, float], digits: int = 2) -> str:
@@ -221,7 +222,7 @@ def _confusion(summary: Summary) -> Table:
         caption='Single rollouts: what was said, and what was true',
         head=[
             'judged on', 'success, true', 'success, false', 'failure, false', 'failure, true',
-            'abstained', 'false-success rate',
+            'no verdict', 'false-success rate',
         ],
         rows=rows,
     )  # fmt: skip

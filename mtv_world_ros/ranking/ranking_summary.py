@@ -42,14 +42,14 @@ class Rate:
     """How often a policy succeeded.
 
     Attributes:
-        hits: successes.
-        count: rollouts that were judged.
-        num_abstained: that were not.
+        hits: successes; as estimates expect them, their sum.
+        count: rollouts with an outcome or estimate.
+        num_unknown: without.
     """
 
-    hits: int
+    hits: float
     count: int
-    num_abstained: int = 0
+    num_unknown: int = 0
 
     @property
     def value(self) -> float:
@@ -58,7 +58,7 @@ class Rate:
 
     @property
     def interval(self) -> Interval:
-        """95 % Wilson interval."""
+        """95 % Wilson interval; of estimates, which scatter less than outcomes, a wide one."""
         return wilson(self.hits, self.count)
 
     def as_json(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class Rate:
             'interval': self.interval,
             'hits': self.hits,
             'judged': self.count,
-            'abstained': self.num_abstained,
+            'unknown': self.num_unknown,
         }
 
 
@@ -155,10 +155,10 @@ class Summary:
         return Rate(hits=sum(result.final for result in found), count=len(found))
 
     def judged_rate(self, policy: str, task: str | None, judge: str) -> Rate:
-        """Returns how often it succeeded by an estimate; abstentions are counted apart."""
-        found = [judged_by(result, judge).success for result in self.chosen(policy, task)]
+        """Returns how often it succeeds by the estimates, their mean; NaN is counted apart."""
+        found = [judged_by(result, judge).probability for result in self.chosen(policy, task)]
         known = [value for value in found if isfinite(value)]
-        return Rate(hits=int(sum(known)), count=len(known), num_abstained=len(found) - len(known))
+        return Rate(hits=sum(known), count=len(known), num_unknown=len(found) - len(known))
 
     def agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
         """Returns r and MMRV of a judge's rates with the simulator's, over the policies."""
@@ -195,7 +195,7 @@ class Summary:
     def _agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
         tasks = self.tasks if task is None else (task,)
         true = self._outcomes(tasks, lambda result: float(result.final))
-        judged = self._outcomes(tasks, lambda result: judged_by(result, judge).success)
+        judged = self._outcomes(tasks, lambda result: judged_by(result, judge).probability)
         num = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
         return {
             name: Agreement(
@@ -220,8 +220,8 @@ class Summary:
         )
 
     def abstained(self, judge: str) -> Rate:
-        """Returns how often a judge abstained."""
-        missing = sum(not isfinite(judged_by(r, judge).probability) for r in self.results)
+        """Returns how often a judge gave no verdict."""
+        missing = sum(not isfinite(judged_by(r, judge).success) for r in self.results)
         return Rate(hits=missing, count=len(self.results))
 
     def confusion(self, judge: str) -> dict[str, int]:

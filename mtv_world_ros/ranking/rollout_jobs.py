@@ -14,6 +14,7 @@ from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import EXPERT, parse_variant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import tasks_named
+from mtv_world_ros.success.verdict import verdict
 
 #: from the expert to one that never finishes; in between, faults of several kinds and sizes
 DEFAULT_POLICIES = (
@@ -31,8 +32,6 @@ DEFAULT_POLICIES = (
 DEFAULT_TASKS = ('place_block_a2b_left', 'place_bread_plate', 'stack_blocks_two')
 #: scenes drawn until the expert reaches everything in one
 _MAX_ATTEMPTS = 25
-#: probability from which an estimate counts as a success
-THRESHOLD = 0.5
 #: commands that differ by more have parted [rad or m]
 COMMANDS_PART = 0.02
 #: an object has parted where its masks in the two worlds overlap by less in every view, J
@@ -111,8 +110,8 @@ class Judged:
 
     @property
     def success(self) -> float:
-        """1 or 0 by `THRESHOLD`; NaN where it abstains."""
-        return float(self.probability >= THRESHOLD) if isfinite(self.probability) else nan
+        """1 or 0; NaN where there is no verdict, see `verdict`."""
+        return verdict(self.probability)
 
 
 def _number(value: float | None) -> float:

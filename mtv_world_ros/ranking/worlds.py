@@ -158,9 +158,12 @@ class ImaginedWorld:
         )
 
     def is_done(self) -> bool | None:
-        """Tells what the estimate says at the end of the last answer; None = it abstains."""
-        success = Judged.of(self.success).success
-        return bool(success) if isfinite(success) else None
+        """Tells whether the estimate is a success at the end of the last answer.
+
+        None = it abstains.
+        """
+        judged = Judged.of(self.success)
+        return judged.success == 1 if isfinite(judged.probability) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from mtv_world_ros.ranking.rollout_jobs import Job, Result
 POLICIES = (
     ('good', (1, 1, 1, 1), (0.9, 0.8, 0.7, 0.6)),
     ('fair', (1, 1, 0, 0), (0.9, 0.1, 0.2, nan)),
-    ('bad', (0, 0, 0, 0), (0.1, 0.6, 0.2, 0.3)),
+    ('bad', (0, 0, 0, 0), (0.1, 0.8, 0.2, 0.3)),
 )
 
 
@@ -30,20 +30,22 @@ def summary(make_result):
     )  # fmt: skip
 
 
-def test_rates_count_abstentions_apart(summary):
+def test_rates_are_means_of_estimates_and_verdicts_may_be_open(summary):
     fair = summary.judged_rate('fair', None, 'imagined')
-    assert (fair.hits, fair.count, fair.num_abstained) == (1, 3, 1)
+    assert (fair.hits, fair.count, fair.num_unknown) == (pytest.approx(1.2), 3, 1)
+    assert fair.value == pytest.approx(0.4)
     assert summary.true_rate('fair', None).value == 0.5
     assert summary.policies == ('good', 'fair', 'bad')
-    assert summary.abstained('imagined').hits == 1 and summary.abstained('seen').hits == 0
-    counts = {'success_success': 5, 'success_failure': 1, 'failure_success': 1}
+    # .6 and .7 are neither; one has no estimate
+    assert summary.abstained('imagined').hits == 3 and summary.abstained('seen').hits == 0
+    counts = {'success_success': 3, 'success_failure': 1, 'failure_success': 1}
     assert summary.confusion('imagined') == {**counts, 'failure_failure': 4}
 
 
 def test_agreement_is_that_of_the_rates(summary):
-    # rates judged 1, 1/3, 1/4 against true 1, 1/2, 0: by hand .375 / sqrt(.337963 * .5)
+    # rates judged .75, .4, .35 against true 1, .5, 0: by hand .2 / sqrt(.095 * .5)
     found = summary.agreement('imagined', None)
-    assert found['pearson'].value == pytest.approx(0.9122, abs=1e-4)
+    assert found['pearson'].value == pytest.approx(0.9177, abs=1e-4)
     assert found['mmrv'].value == 0.0 and found['mmrv'].num_policies == 3
     low, high = found['pearson'].interval
     assert low <= found['pearson'].noise_free <= high
@@ -67,7 +69,7 @@ def test_speed_compares_both_worlds(summary):
 
 def test_the_page_says_what_the_numbers_hide(summary, make_result):
     text = ' '.join(remarks(summary))
-    assert 'abstained in 1 of 12 imagined episodes (stack_blocks_two: 1)' in text
+    assert '1 of 12 imagined episodes have no estimate (stack_blocks_two: 1)' in text
     assert '1 rollouts have no result' in text and 'x_00000_<b>: gone' in text
     blind = Summary(
         results=[make_result(p, 0, p == 'a', nan) for p in 'ab'],
@@ -91,11 +93,11 @@ def test_the_page_says_that_two_policies_prove_nothing(make_result):
 def test_files_hold_the_same_numbers_and_the_page_is_whole(summary, tmp_path):
     path = write_ranking(summary, tmp_path)
     held = json.loads((tmp_path / 'ranking.json').read_text())
-    assert held['policies']['fair']['rates']['all tasks']['imagined']['abstained'] == 1
+    assert held['policies']['fair']['rates']['all tasks']['imagined']['unknown'] == 1
     assert held['agreement']['imagined']['all tasks']['pearson']['value'] == pytest.approx(
-        0.9122, abs=1e-4
+        0.9177, abs=1e-4
     )
-    assert '0.33 [0.06, 0.79] of 3, 1 abstained' in (tmp_path / 'ranking.md').read_text()
+    assert '0.40 [0.08, 0.83] of 3, 1 without an estimate' in (tmp_path / 'ranking.md').read_text()
     page = path.read_text()
     assert '&lt;b&gt;' in page and '<b>' not in page
     charts = re.findall(r'<svg.*?</svg>', page, re.DOTALL)

@@ -21,10 +21,11 @@ from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliab
 from mtv_world_ros.evaluation.report.charts import reliability_chart
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.success.calibration import HorizonCurve, Weights
+from mtv_world_ros.success.verdict import FAILURE_BELOW, SUCCESS_FROM
 
 _COLUMNS = {
-    'num_abstained': 'abstained',
-    'abstention_rate': 'abstention rate',
+    'num_abstained': 'no verdict',
+    'abstention_rate': 'share without a verdict',
     'brier': 'Brier',
     'ece': 'ECE',
     'auroc': 'AUROC',
@@ -41,7 +42,7 @@ _ROWS = {
     ALWAYS: 'to say "success" always',
 }
 _GROUP_COLUMNS = (
-    'episodes', 'succeed', 'mean estimate', 'accuracy', 'false-success rate', 'abstained',
+    'episodes', 'succeed', 'mean estimate', 'accuracy', 'false-success rate', 'no verdict',
 )  # fmt: skip
 
 
@@ -92,9 +93,10 @@ def _summary(found: Calibrated) -> str:
     return (
         f'{len(found.samples)} imagined episodes of {len(calibration.tasks)} tasks, of which '
         f'{num_successes} really succeed; {calibration.num_seeds} seed(s) each, masks by '
-        f'`{calibration.segmenter}`, L2 {calibration.l2:g}. Scores are of the episodes in which '
-        'the estimate did not abstain; the false-success rate is the share of real failures that '
-        'were called a success.'
+        f'`{calibration.segmenter}`, L2 {calibration.l2:g}. Scores are of the episodes with an '
+        'estimate; accuracies and the false-success rate, the share of real failures that were '
+        f'called a success, of those with a verdict: a success from {SUCCESS_FROM} on, a failure '
+        f'below {FAILURE_BELOW}.'
     )
 
 

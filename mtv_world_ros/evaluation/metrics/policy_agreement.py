@@ -101,7 +101,8 @@ def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRat
     """Returns `pearson` and `mmrv` of the policies' success rates, over all tasks.
 
     Args:
-        judged: (P, K, E) outcomes of P policies on E episodes of each of K tasks; NaN = none.
+        judged: (P, K, E) outcomes of P policies on E episodes of each of K tasks, or estimates
+            of them, 0 to 1; NaN = none.
         true: (P, K, E) true outcomes.
     """
     observed = {name: score(rates(judged), rates(true)) for name, (score, _) in _SCORES.items()}

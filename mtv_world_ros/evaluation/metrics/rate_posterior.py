@@ -38,8 +38,9 @@ def draw_rates(
     """Returns draws (2, D, P) of the judged and true rates of P policies on endless scenes.
 
     Args:
-        judged: (P, K, E) outcomes on E scenes of each of K tasks, each 0 or 1; NaN = none. All
-            policies meet the same scenes; the tasks are taken as given, not as drawn.
+        judged: (P, K, E) outcomes on E scenes of each of K tasks, each 0 or 1, or estimates in
+            between; NaN = none. All policies meet the same scenes; the tasks are taken as given,
+            not as drawn.
         true: (P, K, E) true outcomes.
         num_draws: D.
         seed: of the draws.
@@ -111,6 +112,10 @@ def _observed(outcomes: FloatArray) -> tuple[FloatArray, FloatArray]:
     share = np.einsum('apke,bpke->ab', own, own) * num_policies / (num_policies - 1)
     scale = np.maximum(np.sqrt((whole**2).sum((1, 2, 3))), 1e-9)
     share /= scale[:, None] * scale
+    # estimates scatter less than outcomes of the same rate, which scatter just so much
+    most = (count[..., None] * mean * (1 - mean)).sum((1, 2, 3))
+    scatter = scale / np.maximum(np.sqrt(most), 1e-9)
+    share *= scatter[:, None] * scatter
     hits, trials = filled.sum((2, 3)), count.sum(2)
     rates = (hits + 0.5) / (trials + 1)
     alone = np.sqrt(_arcsine_variance(rates, trials))

@@ -10,6 +10,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.evaluation.metrics.statistics import wilson
+from mtv_world_ros.success.verdict import verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,28 +35,29 @@ NUM_CHART_BINS = 5
 def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
     """Returns counts and scores of the estimates; None = unknown.
 
-    All but `abstention_rate` are of those that did not abstain. The false-success rate is the
-    share of real failures that were called a success (above one half).
+    The false-success rate is the share of real failures that were called a success. It and the
+    accuracies are of those with a `verdict`, the others of those with a probability.
     """
     known = [item for item in judgements if item.outcome in ('success', 'failure')]
-    judged = [item for item in known if np.isfinite(item.probability)]
-    probability = np.array([item.probability for item in judged])
-    real = np.array([item.outcome == 'success' for item in judged], bool)
-    called = probability > 0.5
-    hit, avoided = _mean(called[real]), _mean(~called[~real])
+    probability = np.array([item.probability for item in known])
+    real = np.array([item.outcome == 'success' for item in known], bool)
+    said = np.array([verdict(item.probability) for item in known])
+    called, decided, judged = said == 1, np.isfinite(said), np.isfinite(probability)
+    hit, avoided = _mean(called[real & decided]), _mean(~called[~real & decided])
     balanced = None if hit is None or avoided is None else (hit + avoided) / 2
+    abstained, estimates, outcomes = ~decided, probability[judged], real[judged]
     return {
         'num_outcomes_known': len(known),
-        'num_abstained': len(known) - len(judged),
-        'abstention_rate': _mean(np.array([np.isnan(item.probability) for item in known])),
-        'real_success_rate': _mean(np.array([item.outcome == 'success' for item in known])),
-        'estimated_success_rate': _mean(probability),
-        'accuracy': _mean(called == real),
+        'num_abstained': int(abstained.sum()),
+        'abstention_rate': _mean(abstained),
+        'real_success_rate': _mean(real),
+        'estimated_success_rate': _mean(estimates),
+        'accuracy': _mean((called == real)[decided]),
         'balanced_accuracy': balanced,
-        'brier': _mean((probability - real) ** 2),
-        'ece': expected_calibration_error(probability, real) if len(judged) else None,
-        'auroc': area_under_roc(probability, real),
-        'false_success_rate': _mean(called[~real]),
+        'brier': _mean((estimates - outcomes) ** 2),
+        'ece': expected_calibration_error(estimates, outcomes) if len(estimates) else None,
+        'auroc': area_under_roc(estimates, outcomes),
+        'false_success_rate': _mean(called[~real & decided]),
     }
 
 

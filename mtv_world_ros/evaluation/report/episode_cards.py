@@ -18,6 +18,7 @@ from mtv_world_ros.evaluation.report.headline import all_views, letter, mark
 from mtv_world_ros.evaluation.report.read_back import Evaluated, picks, ranked_by
 from mtv_world_ros.evaluation.report.rollout_clips import Clip, make_clip
 from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.success.verdict import verdict
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: of all embedded videos [bytes]; base64 adds a third
@@ -139,11 +140,12 @@ def _bin(score: float) -> str:
 
 def _estimate(result: EpisodeResult) -> str:
     """Whether the success estimate is right; empty where the outcome is not known."""
-    if not isfinite(result.probability):
+    said = verdict(result.probability)
+    if not isfinite(said):
         return 'abstains'
     if result.outcome not in ('success', 'failure'):
         return ''
-    return 'right' if (result.probability >= 0.5) == (result.outcome == 'success') else 'wrong'
+    return 'right' if said == (result.outcome == 'success') else 'wrong'
 
 
 def _about(name: str, evaluations: Sequence[Evaluated]) -> str:

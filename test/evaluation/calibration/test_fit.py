@@ -89,6 +89,14 @@ def test_what_abstains_counts_in_the_abstention_rate_alone():
     assert agreement([])['ece'] is None and agreement([])['auroc'] is None
 
 
+def test_an_open_verdict_counts_in_scores_of_estimates_but_not_of_verdicts():
+    found = agreement(judgements([0.9, 0.6, 0.2, 0.7], [1, 1, 0, 0]))
+    assert found['num_abstained'] == 2 and found['abstention_rate'] == 0.5
+    assert found['accuracy'] == 1.0 and found['false_success_rate'] == 0.0
+    assert found['estimated_success_rate'] == pytest.approx(0.6)
+    assert found['brier'] == pytest.approx((0.01 + 0.16 + 0.04 + 0.49) / 4)
+
+
 def test_one_outcome_alone_has_no_auroc_and_no_balanced_accuracy():
     found = agreement(judgements([0.9, 0.8], [1, 1]))
     assert found['auroc'] is None and found['balanced_accuracy'] is None

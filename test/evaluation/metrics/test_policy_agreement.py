@@ -81,6 +81,16 @@ def test_without_noise_r_is_larger_than_observed_and_mmrv_is_smaller():
     assert found['mmrv'].observed > found['mmrv'].noise_free
 
 
+def test_estimates_scatter_less_than_outcomes_so_that_less_is_taken_out_of_their_r():
+    rng = np.random.default_rng(4)
+    chance = np.linspace(0.1, 0.9, 10)[:, None, None]
+    true, outcomes = (rng.random((2, 10, 1, 20)) < chance).astype(float)
+    estimates = np.broadcast_to(chance, true.shape) + rng.uniform(-0.05, 0.05, true.shape)
+    loose, near = (rate_agreement(judged, true)['pearson'] for judged in (outcomes, estimates))
+    assert near.observed > loose.observed
+    assert near.noise_free - near.observed < loose.noise_free - loose.observed
+
+
 def test_imagination_that_is_the_truth_has_no_interval_of_width_zero():
     """Without any scene the score is the same, so nothing is known of its spread."""
     real = np.random.default_rng(1).integers(0, 2, (5, 2, 10)).astype(float)
