@@ -1,4 +1,4 @@
-"""Skips what this machine cannot run, with the reason, and counts it in the closing lines."""
+"""The bundled robot; skips of what this machine cannot run, with the reason, which are counted."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ from pathlib import Path
 import shutil
 
 import pytest
+
+from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 
 
 def _no_gpu() -> str:
@@ -43,6 +49,20 @@ OBSTACLES = {
     'native_ros': _no_native_ros,
     'control_msgs': _no_control_msgs,
 }
+
+
+@pytest.fixture(scope='session')
+def robot() -> RobotModel:
+    """The bundled robot with two arms."""
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='session')
+def response(robot: RobotModel) -> ArmResponse:
+    """How it follows commands, as the bundled checkpoint found."""
+    from mtv_world_ros.model.object_motion.predictor import load_response
+
+    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -7,7 +7,6 @@ from small_episodes import (
     make_pipeline,
     oracle,
     recordings,
-    robot,
 )
 
 __all__ = [
@@ -17,5 +16,4 @@ __all__ = [
     'make_pipeline',
     'oracle',
     'recordings',
-    'robot',
 ]

@@ -60,12 +60,6 @@ def scene(shift: float, view: str, grey: int) -> tuple[ByteArray, ByteArray]:
 
 
 @pytest.fixture(scope='session')
-def robot() -> RobotModel:
-    """The bundled two-armed robot."""
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-
-
-@pytest.fixture(scope='session')
 def make_episode(robot: RobotModel) -> Callable[..., Path]:
     """Records an episode of 19 frames at 10 Hz; the red block moves `speed` px a frame."""
     middle = (robot.lower + robot.upper) / 2

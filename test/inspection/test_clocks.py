@@ -5,8 +5,6 @@ import pytest
 
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.inspection.clocks import (
     check_commands,
     check_joint_states,
@@ -18,11 +16,6 @@ from mtv_world_ros.inspection.clocks import (
 
 START = 1_700_000_000_000_000_000
 FRAMES = START + np.arange(60) * 100_000_000  # 10 Hz, 5.9 s
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 def angle(seconds):

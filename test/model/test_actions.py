@@ -10,9 +10,7 @@ import pinocchio as pin
 import pytest
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.actions import (
     ActionEncoding,
     check_control,
@@ -22,11 +20,6 @@ from mtv_world_ros.model.actions import (
     TOKENIZER,
     tool_features,
 )
-
-
-@pytest.fixture(scope='module')
-def robot() -> RobotModel:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(scope='module')

@@ -7,7 +7,6 @@ import pytest
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.ranking.rollout_runner import RolloutConfig, RolloutRunner
@@ -40,11 +39,6 @@ class PerfectWorldModel:
         seen = [self._sim.step(row, 1 / SPEC.fps) for row in positions[1:]]
         frames = np.stack([[found.images[view] for found in seen] for view in SPEC.views])
         return np.stack([resize_frames(view, SPEC.width, SPEC.height) for view in frames])
-
-
-@pytest.fixture(scope='session')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(scope='session')

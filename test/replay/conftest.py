@@ -1,6 +1,6 @@
 """The small episodes, for every test of the replay."""
 
-from small_episodes import episodes, make_episode, make_pipeline, oracle, recordings, robot
+from small_episodes import episodes, make_episode, make_pipeline, oracle, recordings
 
 __all__ = [
     'episodes',
@@ -8,5 +8,4 @@ __all__ = [
     'make_pipeline',
     'oracle',
     'recordings',
-    'robot',
 ]

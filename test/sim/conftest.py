@@ -1,15 +1,8 @@
 import pytest
 
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.world.opengl import missing_opengl
 from mtv_world_ros.sim.world.workcell import workcell_of
-
-
-@pytest.fixture(scope='session')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(scope='session')

@@ -10,7 +10,6 @@ from sources import make_source
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 TINY = {
@@ -39,11 +38,6 @@ def episode() -> Path:
 @pytest.fixture(scope='session')
 def tiny() -> TrainingConfig:
     return load_training_config('small', TINY)
-
-
-@pytest.fixture(scope='session')
-def robot() -> RobotModel:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(scope='session')

@@ -239,24 +239,23 @@ class Arms:
             self._armature[row] = armature
         self._means = np.asarray(np.linalg.pinv(self._follows), np.float64)
         self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
-        fingers = {names[row] for row in self.fingers}
+        self._finger_joints = {names[row] for row in self.fingers}
         for skeleton in (self.skeleton, self._ghost):
-            _settle(skeleton, described, fingers, settings)
+            _settle(skeleton, described, self._finger_joints, settings)
         self.skeleton.setPositions(self.ways(pose[None])[0])
         rotors = _rotors(self.skeleton, self._armature, self.fingers)
         for row in np.flatnonzero(self._driven):
             for skeleton in (self.skeleton, self._ghost):
                 joint = skeleton.getJoint(names[row])
-                _add_drive(joint, float(rotors[row]), is_finger=names[row] in fingers)
+                _add_drive(joint, float(rotors[row]), is_finger=names[row] in self._finger_joints)
 
     @property
     def finger_nodes(self) -> list[Any]:
         """Shapes of the fingers."""
-        joints = {self.skeleton.getDof(number).getName() for number in self.fingers}
         return [
             node
             for node in _moving_nodes(self.skeleton)
-            if node.getBodyNodePtr().getParentJoint().getName() in joints
+            if node.getBodyNodePtr().getParentJoint().getName() in self._finger_joints
         ]
 
     @property

@@ -22,7 +22,6 @@ from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.predictor import (
     CONTACT_FILE,
     load_predictor,
-    load_response,
     save_contact,
 )
 from mtv_world_ros.model.object_motion.rigid_bodies import RigidBodies
@@ -44,16 +43,6 @@ SETTINGS = ContactSettings(
 STEP_S = contact_motions._STEP_S
 #: out of the arms' reach
 AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-
-
-@pytest.fixture(scope='module')
-def response(robot):
-    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
 
 
 @pytest.fixture(scope='module')

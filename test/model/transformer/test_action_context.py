@@ -14,8 +14,6 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
@@ -209,11 +207,6 @@ def test_without_actions_or_their_size_it_says_so() -> None:
         model(**values)
     with pytest.raises(CheckpointError, match='needs transformer.action_dim'):
         build(SMALL, control='ee_mlp')
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
 
 
 @pytest.fixture(params=ACTION_CONTROLS)
