@@ -120,12 +120,14 @@ class SuccessEstimator:
         subjects = [
             views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
         ]
+        starts = memory.points[:, 0]
+        ends = None if foreseen is None else foreseen.ends(task, bound, starts)
         try:
             evidence = gather(views, task, bound, self._picture_masks)
         except CannotTell as reason:
-            return Judged(_abstains(reason, views, subjects), memory)
-        starts = memory.points[:, 0]
-        ends = None if foreseen is None else foreseen.ends(task, bound, starts)
+            if ends is None:
+                return Judged(_abstains(reason, views, subjects), memory)
+            evidence = Evidence.none(reason)
         return Judged(self._judge(task, evidence, views, ends, is_real), memory)
 
     def foresee(
@@ -169,16 +171,18 @@ class SuccessEstimator:
         basis = self._objection(task)
         weights = None if basis or self.calibration is None else self.calibration.given(is_real)
         probability = weights.probability if weights else stated_probability
+        margins = [features['margin'] + shift for shift in (-spread, 0.0, spread)]
+        if evidence.worst is None:  # between the worst and the best that pictures could show
+            margins = [-MAX_MARGIN, nan, MAX_MARGIN]
         low, middle, high = (
-            capped(
-                probability({**features, 'margin': clipped(features['margin'] + shift)}),
-                features,
-            )
-            for shift in (-spread, 0.0, spread)
+            capped(probability({**features, 'margin': clipped(margin)}), features)
+            for margin in margins
         )
         first = [view_mean(views.start_jaccard(item)) for item in evidence.goal_jaccard]
         reached = [view_mean(values) for values in evidence.goal_jaccard.values()]
-        reasons = [f'{task.name}: {_margin_text(evidence.worst, spread, task)}']
+        reasons = []
+        if evidence.worst is not None:
+            reasons.append(f'{task.name}: {_margin_text(evidence.worst, spread, task)}')
         if reached:
             pairs = zip(reached, first, strict=True)
             reasons += [

@@ -21,6 +21,7 @@ from mtv_world_ros.success.relations import (
     Within,
 )
 from mtv_world_ros.success.rollout_memory import Grasp
+from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -46,7 +47,8 @@ class Evidence:
     """What one rollout says about one task.
 
     Attributes:
-        worst: the condition nearest to failing, or furthest from holding.
+        worst: the condition nearest to failing, or furthest from holding; None = pictures do not
+            tell.
         features: by `FEATURES`, larger = likelier; NaN = says nothing about this task. And
             `moved`, 0 where an object that has to move is where it was.
         sigma: standard error of the worst margin, in units of its softness.
@@ -54,11 +56,18 @@ class Evidence:
         notes: assumptions made on the way.
     """
 
-    worst: Margin
+    worst: Margin | None
     features: Mapping[str, float]
     sigma: float
     goal_jaccard: Mapping[int, FloatArray]
     notes: tuple[str, ...]
+
+    @classmethod
+    def none(cls, reason: CannotTell) -> Evidence:
+        """Returns what is left where pictures do not tell."""
+        features = dict.fromkeys((*FEATURES, 'moved'), nan)
+        notes = (f'pictures do not tell: {reason}',)
+        return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
 
 
 def gather(

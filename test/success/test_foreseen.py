@@ -72,6 +72,21 @@ def test_motions_count_by_weight():
     assert foreseen_feature(ends) == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize(('end', 'low', 'high'), [(GOAL, 0.6, 1.0), (RED, 0.0, 0.4)])
+def test_where_pictures_do_not_tell_the_motions_do(end, low, high):
+    """An object that one of two views loses is not known; what is foreseen of it is."""
+    status = (('absent', 'ok'), ('ok', 'ok'))
+    lost = masks(path(RED, GOAL), [BLUE] * 9, status)
+    shown = footage(lost, masks([RED], [BLUE]))
+    estimator = SuccessEstimator(TASKS)
+    assert np.isnan(estimator.estimate(shown, LEFT).estimate.probability)
+    found = estimator.estimate(shown, LEFT, foreseen=held(end)).estimate
+    assert low <= found.probability <= high
+    assert found.interval[0] < found.probability < found.interval[1]
+    assert "pictures do not tell: 'red block'" in found.reasons[0]
+    assert np.isnan(found.features['margin']) and np.isfinite(found.features['foreseen'])
+
+
 def motion(share=None):
     """Of nothing, in 3 steps, with grippers that end open by this share; None = not foreseen."""
     openings = None if share is None else np.array([[1, 1], [1, 1], [1, share]], float)
