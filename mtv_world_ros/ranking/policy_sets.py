@@ -126,6 +126,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-taut-0.6',
         'expert-gnaw-0.06',
         'expert-gnaw-0.08',
+        'expert-swat-0.005',
+        'expert-swat-0.01',
+        'expert-slope-0.7',
+        'expert-slope-1',
+        'expert-jostle-0.07',
+        'expert-jostle-0.08',
     ),
     'calibrate': (
         'expert',
@@ -218,22 +224,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-lob-0.07',
         'expert-smear-0.04',
         'expert-smear-0.05',
-    ),
-    'test': (
-        'expert',
-        'expert-swat-0.005',
-        'expert-swat-0.01',
         'expert-dip-0.02',
         'expert-dip-0.03',
-        'expert-slope-0.7',
-        'expert-slope-1',
         'expert-swirl-0.045',
         'expert-swirl-0.047',
-        'expert-jostle-0.07',
-        'expert-jostle-0.08',
         'expert-toss-0.035',
         'expert-toss-0.04',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -146,7 +146,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'dip': _kind(
         'height',
-        'test',
+        'calibrate',
         0.02,
         0.08,
         'm',
@@ -189,7 +189,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'slope': _kind(
         'lateral',
-        'test',
+        'train',
         0.8,
         2.0,
         '',
@@ -505,7 +505,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'swirl': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.045,
         0.07,
         'm',
@@ -536,7 +536,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'jostle': _kind(
         'object',
-        'test',
+        'train',
         0.07,
         0.12,
         'm',
@@ -623,7 +623,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'swat': _kind(
         'speed',
-        'test',
+        'train',
         0.01,
         0.1,
         'm',
@@ -766,7 +766,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'toss': _kind(
         'regrasp',
-        'test',
+        'calibrate',
         0.035,
         0.1,
         'm',
