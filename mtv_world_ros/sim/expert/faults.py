@@ -152,6 +152,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'half-way to its goal, what it holds is dipped on the table, this deep',
     ),
+    'sag': _kind(
+        'height',
+        'test',
+        0.35,
+        0.5,
+        '',
+        'share of how far it reaches out by which the arm hangs too low',
+    ),
     # lateral
     'shift': _kind(
         'lateral',
@@ -208,6 +216,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         's',
         'time constant with which the joints of the wrist follow',
+    ),
+    'nod': _kind(
+        'wrist',
+        'test',
+        0.5,
+        0.6,
+        'rad',
+        'down at the object, it leans to and fro, up to this far, before the fingers close',
     ),
     # opening
     'loose': _kind(
@@ -511,6 +527,22 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'shut fingers go round the object and come this much nearer to it',
     ),
+    'peck': _kind(
+        'collision',
+        'test',
+        0.025,
+        0.05,
+        'm',
+        'shut fingers peck at the object from above, off its middle, this deep',
+    ),
+    'haul': _kind(
+        'collision',
+        'test',
+        0.04,
+        0.12,
+        'm',
+        'shut fingers press on the object and drag it this far, and it is grasped there',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -629,6 +661,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'shut fingers hit the object in one quick stroke, this far',
     ),
+    'kick': _kind(
+        'speed',
+        'test',
+        0.06,
+        0.3,
+        'rad',
+        'standard deviation of how far an arm jerks as its gripper opens or closes',
+    ),
     # joint
     'zero': _kind(
         'joint',
@@ -695,6 +735,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.5,
         '',
         'share of its motion by which every joint takes along the next one of its arm',
+    ),
+    'cog': _kind(
+        'joint',
+        'test',
+        0.15,
+        0.5,
+        'rad',
+        'one joint skips by this, once, and is off from there on',
     ),
     # regrasp
     'retry': _kind(
@@ -953,7 +1001,7 @@ _RESTS_M = 1e-6
 _TREMBLE_HZ = 2.5
 #: length of a chunk of commands [s]
 _CHUNK_S = 0.8
-#: part of a plan in which one joint comes to stand still, as shares of it
+#: part of a plan in which one joint comes to stand still, or skips, as shares of it
 _BRAKES = (0.1, 0.7)
 #: of arms that swing, as a share of the critical damping
 _DAMPING = 0.2
@@ -993,6 +1041,9 @@ _OF_GRIPPERS = (
     'swirl',
     'jostle',
     'toss',
+    'kick',
+    'peck',
+    'haul',
 )
 #: joints of a wrist, the last ones of an arm
 _NUM_WRIST = 3
@@ -1204,7 +1255,7 @@ def _one_joint(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): one joint moves less than the others, or not at all; or all lose way or add some."""
+    """(T, J): one joint moves less than the others, not at all, or skips; or all lose way."""
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -1214,6 +1265,10 @@ def _one_joint(
     if variant.size('clamp'):
         own = _own(rng)
         positions = _clamp(positions, grippers, variant.size('clamp'), own)
+    if variant.size('cog'):
+        own = _own(rng)
+        positions = _cog(positions, grippers, variant.size('cog'), period, own)
+        positions = np.clip(positions, robot.lower, robot.upper)
     if variant.size('tow'):
         own = _own(rng)
         positions = _tow(positions, grippers, len(robot.tools), variant.size('tow'), own)
@@ -1264,6 +1319,9 @@ def _errors(
         error += _tremble(rows, joints, variant.size('tremble'), period, rng)
     if variant.size('spike'):
         error += _spikes(rows, joints, variant.size('spike'), period, rng)
+    if variant.size('kick'):
+        is_open = robot.gripper_openings(positions) > 0.5
+        error += _kicks(is_open, joints, variant.size('kick'), period, _own(rng))
     if variant.size('couple'):
         shut = 1 - robot.gripper_openings(positions).T
         drawn = _own(rng).normal(0.0, variant.size('couple'), joints)
@@ -1650,6 +1708,21 @@ def _clamp(
     return whole
 
 
+def _cog(
+    positions: FloatArray,
+    grippers: list[int],
+    angle: float,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): one of the arm joints that move skips to one side, and is off from there on."""
+    joint, whole = _moving(positions, grippers, rng), positions.copy()
+    first = int(rng.uniform(*_BRAKES) * len(positions))
+    since = np.maximum(np.arange(len(whole)) - first, 0) * period
+    whole[:, joint] += rng.choice((-angle, angle)) * np.minimum(since / _JUMP_S, 1.0)
+    return whole
+
+
 def _tow(
     positions: FloatArray,
     grippers: list[int],
@@ -1678,8 +1751,30 @@ def _spikes(
     """(T, J) errors: a few short triangles, anywhere in the plan; none between them."""
     rng = _own(rng)
     middles = rng.uniform(0.1, 0.9, _NUM_SPIKES) * num
+    return _triangles(num, middles, num_joints, deviation, period, rng)
+
+
+def _kicks(
+    is_open: BoolArray, num_joints: int, deviation: float, period: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J) errors: whenever a gripper (G, T) opens or closes, its arm jerks, once."""
+    num_grippers, num = is_open.shape
+    changes = (np.flatnonzero(np.diff(own)).astype(np.float64) for own in is_open)
+    arm = num_joints // num_grippers
+    return np.hstack([_triangles(num, rows, arm, deviation, period, rng) for rows in changes])
+
+
+def _triangles(
+    num: int,
+    middles: FloatArray,
+    num_joints: int,
+    deviation: float,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J) errors: short triangles about some rows, each as large as drawn for each joint."""
     away = np.abs(np.arange(num)[:, None] - middles) * period / (_SPIKE_S / 2)
-    return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (_NUM_SPIKES, num_joints))
+    return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
 
 
 def _freeze(positions: FloatArray, num: int, rng: np.random.Generator) -> FloatArray:

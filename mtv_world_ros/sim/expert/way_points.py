@@ -69,6 +69,9 @@ _KEEP_TEMPO = frozenset(
         'swirl',
         'jostle',
         'toss',
+        'nod',
+        'peck',
+        'haul',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -115,6 +118,11 @@ _THUMP_M, _NUM_THUMPS, _THUMP_S = 0.05, 3, 0.12
 _SWAT_S = 0.3
 #: shut fingers go round an object: how far off its middle they come down [m]
 _SWIRL_M = 0.08
+#: down at the object, it leans to and fro: how often, time from one side to the other [s], and how
+#: far at least, as a share
+_NUM_NODS, _NOD_S, _LEAST_NOD = 3, 0.2, 0.6
+#: shut fingers peck at an object from above: how often, how far off its middle [m]
+_NUM_PECKS, _PECK_BESIDE_M = 3, 0.015
 
 
 @dataclass(frozen=True, slots=True)
@@ -1057,6 +1065,48 @@ def _toss(stops: Stops, size: float, side: _Side) -> Stops:
     return [*begin, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(way))]
 
 
+def _sag(stops: Stops, size: float, side: _Side) -> Stops:
+    """The farther the arm reaches out from where it rests, the lower it hangs."""
+    home = stops[-1].position
+    reaches = (float(np.linalg.norm((stop.position - home)[:2])) for stop in stops)
+    return [stop.moved(_up(-size * far)) for stop, far in zip(stops, reaches, strict=True)]
+
+
+def _nod(stops: Stops, size: float, side: _Side) -> Stops:
+    """Down at the object, it leans to and fro with open fingers before they close.
+
+    To either side by an angle up to this, drawn anew where the wrist does not lean so far.
+    """
+    first = _first(stops, 'close')
+    grasp = replace(stops[first - 1], phase='above', seconds=_NOD_S)
+    left, right = size * side.play.uniform(_LEAST_NOD, 1.0, 2)
+    leans = (grasp.lean + lean for lean in (*(left, -right) * _NUM_NODS, 0.0))
+    return [*stops[:first], *(replace(grasp, lean=lean) for lean in leans), *stops[first:]]
+
+
+def _peck(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers peck at the object from above, off its middle; it is grasped where it was.
+
+    At other places, drawn anew, where the arm does not reach so far.
+    """
+    above = replace(stops[0], opening=0.0)
+    down = replace(stops[_first(stops, 'grasp')], phase='above', opening=0.0).moved(_up(-size))
+    ways = (_PECK_BESIDE_M * _drawn_way(side) for _ in range(_NUM_PECKS))
+    return [*(stop.moved(way) for way in ways for stop in (above, down, above)), *stops]
+
+
+def _haul(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers press on the object and drag it away; it is grasped where it should be then.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    grasp, way = stops[_first(stops, 'grasp')], size * _drawn_way(side)
+    above = replace(stops[0], opening=0.0)
+    down = replace(grasp, phase='above', opening=0.0)
+    dragged = [above, down, down.moved(way), above.moved(way)]
+    return [*dragged, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(way))]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1155,4 +1205,8 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'swirl': _swirl,
     'jostle': _jostle,
     'toss': _toss,
+    'sag': _sag,
+    'nod': _nod,
+    'peck': _peck,
+    'haul': _haul,
 }

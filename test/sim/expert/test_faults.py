@@ -252,6 +252,9 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'swirl',
         'jostle',
         'toss',
+        'kick',
+        'peck',
+        'haul',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1018,6 +1021,85 @@ def test_what_is_tossed_aside_is_taken_from_where_it_was_let_go():
     np.testing.assert_allclose(moved, np.broadcast_to(way, (4, 3)), atol=1e-12)
 
 
+def test_the_farther_an_arm_reaches_out_the_lower_it_hangs():
+    stops, changed = changed_stops('expert-sag-0.1')
+    ways = np.array([b.position - a.position for a, b in zip(stops, changed, strict=True)])
+    np.testing.assert_array_equal(ways[:, :2], 0.0)
+    # 0.28 m from where it rests to the object, 0.2 m to the goal
+    lower = [*[np.hypot(0.02, 0.02)] * 4, *[0.02] * 4, 0]
+    np.testing.assert_allclose(ways[:, 2], -np.array(lower), atol=1e-12)
+    assert [stop.opening for stop in changed] == [stop.opening for stop in stops]
+
+
+def test_the_wrist_leans_to_and_fro_before_the_fingers_close():
+    stops, changed = changed_stops('expert-nod-0.3')
+    assert changed[:2] == stops[:2] and changed[9:] == stops[2:] and len(changed) == 16
+    nods = changed[2:9]
+    leans = np.array([stop.lean for stop in nods])
+    assert leans[-1] == 0 and np.ptp(np.sign(leans[:2])) == 2
+    assert (np.abs(leans[:6]) > 0.17).all() and (np.abs(leans) <= 0.3).all()
+    np.testing.assert_array_equal(leans[:6], np.tile(leans[:2], 3))
+    assert all(0 < (stop.seconds or 0) < 0.4 and stop.opening == 1 for stop in nods)
+    for stop in nods:
+        np.testing.assert_array_equal(stop.position, stops[1].position)
+
+
+def test_an_arm_jerks_as_its_gripper_opens_or_closes(expert):
+    expert_plan, kick = plan(expert, 'expert'), plan(expert, 'expert-kick-0.05')
+    openings = expert.robot.gripper_openings(expert_plan)
+    used = int(np.argmax(np.ptp(openings, axis=1)))
+    closes, opens = np.flatnonzero(np.diff(openings[used] > 0.5))
+    error, arms = kick - expert_plan, np.array(arm_columns(expert)).reshape(2, -1)
+    moved = np.flatnonzero(np.abs(error).max(axis=0) > 1e-9)
+    assert set(moved) == set(arms[used])
+    for change in (closes, opens):
+        peak = error[change, arms[used]]
+        np.testing.assert_allclose(error[change - 5, arms[used]], peak / 2, atol=1e-9)
+        np.testing.assert_allclose(error[change + 5, arms[used]], peak / 2, atol=1e-9)
+        assert 0.01 < np.abs(peak).max() < 0.25
+    away = np.abs(np.arange(len(error))[:, None] - [closes, opens]).min(axis=1)
+    assert np.abs(error[away >= 10]).max() < 1e-9
+
+
+def test_shut_fingers_peck_at_the_object_from_above_off_its_middle():
+    stops, changed = changed_stops('expert-peck-0.02')
+    assert changed[9:] == stops and len(changed) == 18
+    assert all(stop.opening == 0 for stop in changed[:9])
+    ways = np.array([stop.position - stops[1].position for stop in changed[:9]])
+    np.testing.assert_allclose(ways[:, 2], [0.1, -0.02, 0.1] * 3, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(ways[:, :2], axis=1), 0.015)
+    pecks = ways[:, :2].reshape(3, 3, 2)
+    np.testing.assert_allclose(pecks, np.broadcast_to(pecks[:, :1], pecks.shape))
+    assert len(np.unique(pecks[:, 0, 0].round(6))) == 3
+
+
+def test_what_shut_fingers_drag_away_is_grasped_where_it_should_be_then():
+    stops, changed = changed_stops('expert-haul-0.05')
+    dragged, rest = changed[:4], changed[4:]
+    assert len(rest) == len(stops) and rest[4:] == stops[4:]
+    assert all(stop.opening == 0 for stop in dragged)
+    ways = np.array([stop.position - stops[1].position for stop in dragged])
+    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.1], atol=1e-12)
+    np.testing.assert_array_equal(ways[:2, :2], 0.0)
+    way = ways[2]
+    assert np.linalg.norm(way) == pytest.approx(0.05)
+    np.testing.assert_allclose(ways[3, :2], way[:2])
+    moved = [b.position - a.position for a, b in zip(stops[:4], rest[:4], strict=True)]
+    np.testing.assert_allclose(moved, np.broadcast_to(way, (4, 3)), atol=1e-12)
+
+
+def test_a_joint_that_skips_is_off_from_there_on(expert):
+    error = plan(expert, 'expert-cog-0.1') - plan(expert, 'expert')
+    (joint,) = np.flatnonzero(np.abs(error).max(axis=0) > 1e-9)
+    assert joint in arm_columns(expert)
+    own = np.abs(error[:, joint])
+    first = int(np.argmax(own > 1e-9))
+    # not before a tenth of the plan; the skip takes 0.1 s
+    assert 0.1 * len(own) <= first < 0.75 * len(own)
+    np.testing.assert_allclose(own[first + 5 :], 0.1)
+    assert np.ptp(np.sign(error[first:, joint])) == 0
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [
@@ -1028,6 +1110,8 @@ def test_what_is_tossed_aside_is_taken_from_where_it_was_let_go():
         ('decoy', 0.05),
         ('swirl', 0.03),
         ('swat', 0.03),
+        ('nod', 0.2),
+        ('peck', 0.02),
     ],
 )
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
@@ -1230,6 +1314,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'swirl',
         'jostle',
         'toss',
+        'sag',
+        'nod',
+        'peck',
+        'haul',
+        'kick',
+        'cog',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1336,9 +1426,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-toss-0.03' has toss"
+    said = r"split test are not for training: 'expert-high-0.1-haul-0.03' has haul"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-toss-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-haul-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
