@@ -14,6 +14,7 @@ from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
+from mtv_world_ros.parallel import threads_each
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
 from mtv_world_ros.policies.policy_config import (
@@ -117,7 +118,8 @@ def load_pipeline(
         task: the task to judge, by name or YAML file; default: the one the instruction matches.
         device: `cpu`, `cuda`, ...
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
-        num_threads: threads of the model on a CPU; 0 = all cores but one, at least one.
+        num_threads: threads of the model on a CPU; 0 = all cores but one, at least one. As many
+            processes, or one a core, compute motions of rigid bodies.
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
         describer: YAML file of what names the objects of the first real frame; empty = the
             words of the instruction.
@@ -162,7 +164,7 @@ def load_pipeline(
         horizon=load_horizon(checkpoint_path(checkpoint)),
         object_motion=None
         if loaded.object_motion is None
-        else load_predictor(loaded.object_motion, model),
+        else load_predictor(loaded.object_motion, model, num_threads or threads_each(1)),
     )
 
 

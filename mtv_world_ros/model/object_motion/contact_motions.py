@@ -11,10 +11,8 @@ Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import repeat
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -25,7 +23,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.finger_swing import together
+from mtv_world_ros.model.object_motion.helpers import Helpers
 from mtv_world_ros.model.object_motion.rigid_bodies import Arms, BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
@@ -81,7 +79,11 @@ class ContactMotions:
     pose: FloatArray | None = None
 
     def advance(
-        self, robot: RobotModel, positions: FloatArray, rows: int, threads: int = 1
+        self,
+        robot: RobotModel,
+        positions: FloatArray,
+        rows: int,
+        helpers: Helpers | None = None,
     ) -> tuple[BodyMotions, ContactMotions]:
         """Returns where everything is at each of 1 + T rows, and then.
 
@@ -89,41 +91,28 @@ class ContactMotions:
             robot: whose joints are commanded.
             positions: (1 + N, J) commands, `PERIOD_S` apart [rad or m].
             rows: periods between two of the rows that are returned.
-            threads: that compute motions.
+            helpers: that compute motions beside this process; None = it does so alone.
 
         Raises:
             RobotError: see `check_robot`.
         """
         free = replace(self.response, floor=None)
         where, arms = free.follow(robot, positions, self.arms)
-        pose = positions[0] if self.pose is None else self.pose
-        worlds = [
-            RigidBodies(robot, self.response, solids, settings, _STEP_S, pose)
-            for settings, solids in map(self._disturbed, range(self.settings.num_motions))
-        ]
-        courses, speeds, swings = self._courses([one.arms for one in worlds], where)
-        starts = np.stack([bodies.poses()[:, :3, :3] for bodies in worlds])
-        for number, bodies in enumerate(worlds):
-            if self.states:
-                bodies.state = self.states[number]
-            else:
-                bodies.arms.skeleton.setPositions(courses[number].free[0])
-        with ThreadPoolExecutor(threads) as pool:  # the engine's steps do not hold the interpreter
-            found = list(pool.map(_run, worlds, courses, repeat(rows)))
-        poses, joints = map(np.stack, zip(*found, strict=True))
-        turned = poses[..., :3, :3] @ np.swapaxes(starts, -1, -2)[:, None]
+        begun = self if self.pose is not None else replace(self, pose=positions[0])
+        move = partial(begun._moved, robot, where, rows)
+        numbers = range(self.settings.num_motions)
+        moved = list(map(move, numbers)) if helpers is None else helpers.map(move, numbers)
         then = replace(
-            self,
-            states=tuple(bodies.state for bodies in worlds),
+            begun,
+            states=tuple(one.state for one in moved),
             arms=arms,
-            speeds=speeds,
-            swings=swings,
-            pose=pose,
+            speeds=moved[0].speeds,
+            swings=np.stack([one.swings for one in moved], axis=1),
         )
         motions = BodyMotions(
-            points=self._of_all(poses[..., :3, 3], np.nan),
-            rotations=self._of_all(turned, np.eye(3)),
-            joints=joints,
+            points=self._of_all(np.stack([one.points for one in moved]), np.nan),
+            rotations=self._of_all(np.stack([one.rotations for one in moved]), np.eye(3)),
+            joints=np.stack([one.joints for one in moved]),
         )
         return motions, then
 
@@ -149,22 +138,26 @@ class ContactMotions:
         filled[:, :, known] = found
         return filled
 
-    def _courses(
-        self, arms: Sequence[Arms], where: FloatArray
-    ) -> tuple[list[_Course], FloatArray, FloatArray]:
-        """What the arms of K motions are to do; `speeds` and `swings` after it."""
-        fingers = arms[0].fingers
-        ways, velocities, forces, pulls = driven(arms[0], where, _SUBSTEPS, self.speeds)
-        start = np.zeros((2, len(arms), len(fingers))) if self.swings is None else self.swings
-        drives = together([one.finger_drives for one in arms])
-        swings, then = drives.swings(pulls, ways[:, fingers], _STEP_S, start)
-        courses = []
-        for off, speed in zip(swings, start[1], strict=True):
-            free, fast = ways.copy(), velocities.copy()
-            free[:, fingers] += off
-            fast[:, fingers] += np.concatenate([speed[None], np.diff(off, axis=0) / _STEP_S])
-            courses.append(_Course(ways, velocities, forces, free, fast))
-        return courses, velocities[-1], then
+    def _moved(self, robot: RobotModel, where: FloatArray, rows: int, number: int) -> _Moved:
+        """One of the K motions, of arms whose joints are at (1 + N, J)."""
+        settings, solids = self._disturbed(number)
+        bodies = RigidBodies(robot, self.response, solids, settings, _STEP_S, self.pose)
+        begin = None if self.swings is None else self.swings[:, number]
+        course, speeds, swings = course_of(bodies.arms, where, self.speeds, begin)
+        found = bodies.poses()[:, :3, :3]
+        if self.states:
+            bodies.state = self.states[number]
+        else:
+            bodies.arms.skeleton.setPositions(course.free[0])
+        poses, joints = _run(bodies, course, rows)
+        return _Moved(
+            points=poses[..., :3, 3],
+            rotations=poses[..., :3, :3] @ np.swapaxes(found, -1, -2),
+            joints=joints,
+            state=bodies.state,
+            speeds=speeds,
+            swings=swings,
+        )
 
     def _disturbed(self, number: int) -> tuple[ContactSettings, list[Solid]]:
         """Settings and solids of a motion; those of the first are as they are."""
@@ -221,7 +214,7 @@ def _disturbed(solid: Solid, table: float, share: float, rng: np.random.Generato
 
 
 @dataclass(frozen=True, slots=True)
-class _Course:
+class Course:
     """What arms are to do, at steps of the engine.
 
     Attributes:
@@ -237,6 +230,51 @@ class _Course:
     forces: FloatArray
     free: FloatArray
     fast: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    """One motion of S solids, and what the next chunk goes on from.
+
+    Attributes:
+        points: (T + 1, S, 3) [m].
+        rotations: (T + 1, S, 3, 3) since they were found.
+        joints: (T + 1, J) [rad or m].
+        state: of all bodies.
+        speeds: (D,) of the arms if nothing were touched.
+        swings: (2, F), see `ContactMotions`.
+    """
+
+    points: FloatArray
+    rotations: FloatArray
+    joints: FloatArray
+    state: BodyState
+    speeds: FloatArray
+    swings: FloatArray
+
+
+def course_of(
+    arms: Arms,
+    where: FloatArray,
+    speeds: FloatArray | None = None,
+    swings: FloatArray | None = None,
+) -> tuple[Course, FloatArray, FloatArray]:
+    """Returns what arms are to do; speeds (D,) and swings (2, F) after it.
+
+    Args:
+        arms: any.
+        where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
+        speeds: (D,) at first; None = at rest.
+        swings: (2, F) of the fingers at first, see `ContactMotions`; None = none.
+    """
+    fingers = arms.fingers
+    ways, velocities, forces, pulls = driven(arms, where, _SUBSTEPS, speeds)
+    start = np.zeros((2, len(fingers))) if swings is None else swings
+    off, then = arms.finger_drives.swings(pulls, ways[:, fingers], _STEP_S, start)
+    free, fast = ways.copy(), velocities.copy()
+    free[:, fingers] += off
+    fast[:, fingers] += np.concatenate([start[1:], np.diff(off, axis=0) / _STEP_S])
+    return Course(ways, velocities, forces, free, fast), velocities[-1], then
 
 
 def driven(
@@ -270,7 +308,7 @@ def driven(
     return ways, velocities, between(forces), between(pulls)
 
 
-def _run(bodies: RigidBodies, course: _Course, every: int) -> tuple[FloatArray, FloatArray]:
+def _run(bodies: RigidBodies, course: Course, every: int) -> tuple[FloatArray, FloatArray]:
     """Poses (T + 1, S, 4, 4) of the solids and joints (T + 1, J), as the arms are driven.
 
     Where nothing is touched and nothing moves, the arms pass by without any dynamics: in free air

@@ -27,6 +27,7 @@ from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+from mtv_world_ros.model.object_motion.helpers import Helpers
 from mtv_world_ros.model.object_motion.network import (
     COMMANDS_A_STEP,
     Memory,
@@ -79,6 +80,7 @@ class ObjectMotionPredictor:
             networks alone.
         num_disturbed: motions beside the expected one, from places and sizes within the error of
             what masks tell, and with the errors that the networks expect of themselves.
+        helpers: that compute motions of rigid bodies beside this process; None = none do.
     """
 
     def __init__(
@@ -87,9 +89,10 @@ class ObjectMotionPredictor:
         robot: RobotModel,
         contact: ContactSettings | None = None,
         num_disturbed: int = 12,
+        helpers: Helpers | None = None,
     ) -> None:
         self.members, self.robot, self.contact = tuple(members), robot, contact
-        self.num_disturbed = num_disturbed
+        self.num_disturbed, self.helpers = num_disturbed, helpers
         networks = [member.network.eval() for member in members]
         self.network = networks[0] if len(networks) == 1 else stacked(networks)
         rng = np.random.default_rng(0)
@@ -265,7 +268,7 @@ class TrackedObjects:
         contact = self.contact
         if contact is not None:
             robot, every = self.model.robot, self.commands_a_step
-            bodies, contact = contact.advance(robot, positions, every, torch.get_num_threads())
+            bodies, contact = contact.advance(robot, positions, every, self.model.helpers)
             motions += [
                 ObjectMotion(
                     reference=contact.centres,
@@ -418,8 +421,13 @@ def add_members(folder: Path, others: Sequence[Path]) -> None:
                     shutil.copyfile(other / name, partial / name)
 
 
-def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
+def load_predictor(folder: Path, robot: RobotModel, processes: int = 1) -> ObjectMotionPredictor:
     """Reads what `train-motion` wrote.
+
+    Args:
+        folder: that it wrote.
+        robot: of the same joints.
+        processes: at most, this one among them, that compute motions of rigid bodies.
 
     Raises:
         CheckpointError: see `load_network`, `load_response`, `load_contact`.
@@ -434,9 +442,12 @@ def load_predictor(folder: Path, robot: RobotModel) -> ObjectMotionPredictor:
             if response and other.response and other.response.as_json() == response.as_json():
                 response = other.response
         members.append(Member(network=load_network(each), response=response))
+    helpers = None
     if contact is not None:
         _check_contact(contact, robot, members[0].response, folder)
-    return ObjectMotionPredictor(members, robot, contact)
+        count = min(processes, contact.num_motions) - 1
+        helpers = Helpers(count) if count > 0 else None
+    return ObjectMotionPredictor(members, robot, contact, helpers=helpers)
 
 
 def load_contact(folder: Path) -> ContactSettings | None:

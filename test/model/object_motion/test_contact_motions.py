@@ -17,7 +17,11 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion import contact_motions, predictor
-from mtv_world_ros.model.object_motion.contact_motions import check_robot, ContactMotions
+from mtv_world_ros.model.object_motion.contact_motions import (
+    check_robot,
+    ContactMotions,
+    course_of,
+)
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.predictor import (
     CONTACT_FILE,
@@ -108,8 +112,7 @@ def shaken(robot, seconds: float = 2.0) -> np.ndarray:
 def courses_of(robot, response, positions, **changed):
     motions = motions_of(response, **changed)
     arms = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0]).arms
-    (course,), _, _ = motions._courses([arms], response.follow(robot, positions)[0])
-    return arms, course
+    return arms, course_of(arms, response.follow(robot, positions)[0])[0]
 
 
 def test_fingers_of_a_hand_that_gains_speed_stay_behind(robot, response):
@@ -134,7 +137,7 @@ def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
     positions = shaken(robot)
     motions = motions_of(response, fingers_swing=swing)
     bodies = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0])
-    (course,), _, _ = motions._courses([bodies.arms], response.follow(robot, positions)[0])
+    course = course_of(bodies.arms, response.follow(robot, positions)[0])[0]
     bodies.arms.skeleton.setPositions(course.free[0])
     worst = 0.0
     for step in range(len(course.forces)):
@@ -231,6 +234,16 @@ def test_friction_is_the_same_in_all_directions_where_fingers_touch(robot, respo
         bodies.step(np.zeros(bodies.arms.skeleton.getNumDofs()))
     way = np.linalg.norm(bodies.poses()[0, :2, 3] - start)
     assert way == pytest.approx(speed**2 / 2 / SETTINGS.table_friction / 9.81, rel=0.1)
+
+
+def test_motions_are_the_same_in_one_process_and_in_two(robot, response, recording, helpers):
+    motions, half = motions_of(response, AWAY, num_motions=3), 8 * ROWS
+    for positions in recording.positions[: half + 1], recording.positions[half : 2 * half]:
+        alone, then = motions.advance(robot, positions, ROWS)
+        shared, motions = motions.advance(robot, positions, ROWS, helpers)
+        for name in ('points', 'rotations', 'joints'):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
+        np.testing.assert_array_equal(then.swings, motions.swings)
 
 
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mtv_world_ros.model.object_motion.finger_swing import FingerDrives, together
+from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
 
 STEP = 0.002
 #: two fingers that face each other, both at their outer stop when open
@@ -46,19 +46,3 @@ def test_it_goes_on_from_part_to_part():
     second, last = DRIVES.swings(pulls[150:], at(0.03, 250), STEP, then)
     np.testing.assert_allclose(np.concatenate([first, second[1:]]), whole, atol=1e-15)
     np.testing.assert_allclose(last, end, atol=1e-15)
-
-
-def test_motions_are_computed_together_as_alone():
-    stiff = FingerDrives(
-        stiffness=2 * DRIVES.stiffness,
-        damping=DRIVES.damping,
-        mass=DRIVES.mass,
-        lower=DRIVES.lower,
-        upper=DRIVES.upper,
-    )
-    pulls = np.random.default_rng(1).normal(0, 1, (200, 2))
-    both, _ = together([DRIVES, stiff]).swings(pulls, at(0.03, 200), STEP, np.zeros((2, 2, 2)))
-    assert both.shape == (2, 201, 2)
-    for one, drives in zip(both, (DRIVES, stiff), strict=True):
-        np.testing.assert_array_equal(one, drives.swings(pulls, at(0.03, 200), STEP, STILL)[0])
-    assert np.abs(both[0]).max() > np.abs(both[1]).max()
