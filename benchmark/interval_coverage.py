@@ -195,7 +195,8 @@ def mild_ranking(rng: np.random.Generator, num: int) -> tuple[np.ndarray, ...]:
     judged = np.clip(0.2 + 0.6 * true + rng.normal(0, 0.12, _POLICIES), 0.02, 0.98)
     shape = (_POLICIES, _TASKS, num)
     real = (rng.random(shape) < true[:, None, None]).astype(float)
-    said = rng.beta(*(2 * np.stack([judged, 1 - judged])[..., None, None]), shape)
+    mean = judged[:, None, None]
+    said = rng.beta(2 * mean, 2 * (1 - mean), shape)
     return true, judged, real, said
 
 

@@ -62,7 +62,9 @@ def response(robot: RobotModel) -> ArmResponse:
     """How it follows commands, as the bundled checkpoint found."""
     from mtv_world_ros.model.object_motion.predictor import load_response
 
-    return load_response(checkpoint_path('bundled') / 'object_motion', robot)
+    found = load_response(checkpoint_path('bundled') / 'object_motion', robot)
+    assert found is not None
+    return found
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -65,7 +65,7 @@ class Evidence:
     @classmethod
     def none(cls, reason: CannotTell) -> Evidence:
         """Returns what is left where pictures do not tell."""
-        features = dict.fromkeys((*FEATURES, 'moved'), nan)
+        features: dict[str, float] = {name: nan for name in (*FEATURES, 'moved')}
         notes = (f'pictures do not tell: {reason}',)
         return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
 
