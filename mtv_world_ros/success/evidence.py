@@ -39,7 +39,7 @@ CARRY_ERROR_M = 0.025
 #: larger J of the start with the goal mask count as this much
 MAX_START_JACCARD = 0.5
 #: what the features are called, in order; the last is not of the masks, see `foreseen`
-FEATURES = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry', 'foreseen')
+FEATURES: tuple[str, ...] = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry', 'foreseen')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +65,7 @@ class Evidence:
     @classmethod
     def none(cls, reason: CannotTell) -> Evidence:
         """Returns what is left where pictures do not tell."""
-        features: dict[str, float] = {name: nan for name in (*FEATURES, 'moved')}
+        features = dict.fromkeys((*FEATURES, 'moved'), nan)
         notes = (f'pictures do not tell: {reason}',)
         return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
 
