@@ -39,7 +39,15 @@ CARRY_ERROR_M = 0.025
 #: larger J of the start with the goal mask count as this much
 MAX_START_JACCARD = 0.5
 #: what the features are called, in order; the last is not of the masks, see `foreseen`
-FEATURES: tuple[str, ...] = ('margin', 'mean_margin', 'goal', 'contained', 'grasp', 'carry', 'foreseen')
+FEATURES: tuple[str, ...] = (
+    'margin',
+    'mean_margin',
+    'goal',
+    'contained',
+    'grasp',
+    'carry',
+    'foreseen',
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
