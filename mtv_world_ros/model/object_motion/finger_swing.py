@@ -3,7 +3,7 @@
 What a gripper reports is the mean of its fingers, so two that swing to the same side do not show,
 though both are millimetres off when they come down beside an object.
 
-Shape letters: T steps, F fingers.
+Shape letters: K drives, T steps, F fingers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mtv_world_ros.data_types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FingerDrives:
-    """Drives of F fingers, in the units of their joints; all (F,).
+    """Drives of fingers, in the units of their joints; all (F,), or (K, F) to compare K drives.
 
     Attributes:
         stiffness: [N/m or N m/rad].
@@ -36,13 +36,13 @@ class FingerDrives:
     def swings(
         self, pulls: FloatArray, ways: FloatArray, step_s: float, start: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns how far fingers are off their ways (1 + T, F), and how it ends.
+        """Returns how far fingers are off their ways (..., 1 + T, F), and how it ends.
 
         Args:
             pulls: (T, F) forces of the moving hand [N or N m].
             ways: (1 + T, F) of fingers that do not swing [m or rad].
             step_s: between rows.
-            start: (2, F) how far they are off in the first row, and how fast that grows.
+            start: (2, ..., F) how far they are off in the first row, and how fast that grows.
         """
         off, speed = start
         rows = [off]
@@ -54,4 +54,4 @@ class FingerDrives:
             speed = np.where((off < least) | (off > most), 0.0, speed)
             off = np.minimum(np.maximum(off, least), most)
             rows.append(off)
-        return np.stack(rows), np.stack([off, speed])
+        return np.stack(rows, axis=-2), np.stack([off, speed])

@@ -1,7 +1,8 @@
 """Processes that compute beside this one: the engine's steps hold the interpreter.
 
-Both sides are here: `Helpers` gives work, `main` does it in a process of its own. Work and answers
-are pickled through pipes; a helper ends with its input, however this process ends.
+Both sides are here: `Helpers` gives work, `main` does it in a process of its own, which ends with
+the line between them, however this process ends. The main module is not imported again, as
+processes of `multiprocessing` would: whoever loads a pipeline need not guard it.
 """
 
 from __future__ import annotations
@@ -9,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 import logging
-import os
-import pickle
-import select
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 import signal
 import subprocess
 import sys
@@ -72,7 +72,7 @@ class Helpers:
         """Starts helpers at first, and finds out which are ready by now."""
         if self._starting is None:
             self._starting = [_Helper(function) for _ in range(self._count)]
-        for helper in [one for one in self._starting if one.has_answered]:
+        for helper in [one for one in self._starting if one.line.poll()]:
             self._starting.remove(helper)
             if helper.answer() is not None:
                 self._ready.append(helper)
@@ -82,27 +82,25 @@ class _Helper:
     """One process; the answer to no jobs tells that it has imported what the function needs."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._jobs, self._answers = self._process.stdin, self._process.stdout
+        self.line, end = Pipe()
+        with end:
+            number = end.fileno()
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', __name__, str(number)],
+                stdin=subprocess.DEVNULL,
+                pass_fds=[number],
+            )
         self.give(function, ())
 
-    @property
-    def has_answered(self) -> bool:
-        return bool(select.select([self._answers], [], [], 0)[0])
-
     def give(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> None:
-        with suppress(BrokenPipeError):  # it has died: there will be no answer
-            pickle.dump((function, jobs), self._jobs)
-            self._jobs.flush()
+        with suppress(OSError):  # it has died: there will be no answer
+            self.line.send((function, jobs))
 
     def answer(self) -> Answers | None:
         """Waits for what the jobs give; None = it has died."""
         try:
-            return pickle.load(self._answers)  # noqa: S301 (of a process of our own)
-        except (EOFError, pickle.UnpicklingError):
+            return self.line.recv()
+        except (EOFError, OSError):
             return None
 
 
@@ -114,17 +112,12 @@ def _answers(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Answers:
 
 
 def main() -> None:
-    """Computes what comes in until the input ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side stops it
-    with os.fdopen(os.dup(1), 'wb') as answers:
-        os.dup2(2, 1)  # what a library prints is no answer
+    """Computes what comes in until the other side is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side ends it
+    with Connection(int(sys.argv[1])) as line, suppress(EOFError, OSError):
         while True:
-            try:
-                function, jobs = pickle.load(sys.stdin.buffer)  # noqa: S301 (the other side)
-            except EOFError:
-                return
-            pickle.dump(_answers(function, jobs), answers)
-            answers.flush()
+            function, jobs = line.recv()
+            line.send(_answers(function, jobs))
 
 
 if __name__ == '__main__':

@@ -37,8 +37,8 @@ def test_this_process_goes_on_alone_when_the_other_dies(helpers, caplog):
     assert helpers.map(factorial, [3, 4]) == [6, 24]
 
 
-def test_a_helper_ends_with_its_input(helpers):
+def test_a_helper_ends_with_its_line(helpers):
     other = helpers.map(eval, WHO)[1]
     (helper,) = helpers._ready
-    helper._jobs.close()
-    assert helper._process.wait(10) == 0 and helper._process.pid == other
+    helper.line.close()
+    assert helper.process.wait(10) == 0 and helper.process.pid == other
