@@ -110,12 +110,10 @@ def _observed(outcomes: FloatArray) -> tuple[FloatArray, FloatArray]:
     own = np.where(is_known, whole - slope / slope.mean(1, keepdims=True) * common, 0.0)
     num_policies = outcomes.shape[1]
     share = np.einsum('apke,bpke->ab', own, own) * num_policies / (num_policies - 1)
-    scale = np.maximum(np.sqrt((whole**2).sum((1, 2, 3))), 1e-9)
-    share /= scale[:, None] * scale
-    # estimates scatter less than outcomes of the same rate, which scatter just so much
+    # outcomes scatter just so much; estimates of the same rate less
     most = (count[..., None] * mean * (1 - mean)).sum((1, 2, 3))
-    scatter = scale / np.maximum(np.sqrt(most), 1e-9)
-    share *= scatter[:, None] * scatter
+    scale = np.maximum(np.sqrt(most), 1e-9)
+    share /= scale[:, None] * scale
     hits, trials = filled.sum((2, 3)), count.sum(2)
     rates = (hits + 0.5) / (trials + 1)
     alone = np.sqrt(_arcsine_variance(rates, trials))
