@@ -132,6 +132,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-slope-1',
         'expert-jostle-0.07',
         'expert-jostle-0.08',
+        'expert-peck-0.02',
+        'expert-peck-0.03',
+        'expert-haul-0.03',
+        'expert-haul-0.04',
+        'expert-kick-0.05',
+        'expert-kick-0.08',
     ),
     'calibrate': (
         'expert',
@@ -230,22 +236,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-swirl-0.047',
         'expert-toss-0.035',
         'expert-toss-0.04',
-    ),
-    'test': (
-        'expert',
         'expert-sag-0.3',
         'expert-sag-0.4',
         'expert-nod-0.4',
         'expert-nod-0.5',
-        'expert-peck-0.02',
-        'expert-peck-0.03',
-        'expert-haul-0.03',
-        'expert-haul-0.04',
-        'expert-kick-0.05',
-        'expert-kick-0.08',
         'expert-cog-0.15',
         'expert-cog-0.2',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -154,7 +154,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'sag': _kind(
         'height',
-        'test',
+        'calibrate',
         0.35,
         0.5,
         '',
@@ -219,7 +219,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'nod': _kind(
         'wrist',
-        'test',
+        'calibrate',
         0.5,
         0.6,
         'rad',
@@ -529,7 +529,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'peck': _kind(
         'collision',
-        'test',
+        'train',
         0.025,
         0.05,
         'm',
@@ -537,7 +537,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'haul': _kind(
         'collision',
-        'test',
+        'train',
         0.04,
         0.12,
         'm',
@@ -663,7 +663,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'kick': _kind(
         'speed',
-        'test',
+        'train',
         0.06,
         0.3,
         'rad',
@@ -738,7 +738,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'cog': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.15,
         0.5,
         'rad',
