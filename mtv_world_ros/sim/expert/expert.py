@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -256,9 +256,11 @@ class Expert:
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = usual = self._stops(pick, move, now, goal, rng)
             crowds: dict[str, float] = {}
+            poached = 0.0
             if faults is not None and number == faults.move_of(len(task.moves)):
                 objects = [np.asarray(item.position) for item in now.values()]
                 stops, crowds = faults.applied(stops, pick.yaw, objects), faults.crowds
+                poached = faults.poached
                 usual = usual if faults.keeps_tempo else stops
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
             rows = self._follow(pick.arm, stops, pace)
@@ -268,8 +270,14 @@ class Expert:
             last_arm = pick.arm
             positions = self._lay(positions, rows, start, pick.arm)
             others = [arm for arm in self._tools if arm != pick.arm]
-            for phase, share in crowds.items() if others else ():
-                rows, before = self._crowd(pick.arm, others[0], stops, phase, share, pace)
+            comes = [
+                self._crowd(pick.arm, other, stops, phase, share, pace)
+                for other in others[:1]
+                for phase, share in crowds.items()
+            ]
+            if poached and others:
+                comes.append(self._poach(pick.arm, others[0], stops, poached, pace))
+            for rows, before in comes:
                 first = max(start + before, free.get(others[0], 1))
                 free[others[0]] = first + len(rows)
                 positions = self._lay(positions, rows, first, others[0])
@@ -409,20 +417,62 @@ class Expert:
         It goes a share of the way, or as much of it as it reaches, and is there just then.
         """
         met, home = [s.phase for s in stops].index(phase), self.workcell.home_tools[other]
+
+        def ways(share: float) -> list[WayPoint]:
+            near = WayPoint('above', home + share * (stops[met].position - home), 0.0, 1.0)
+            return [near, replace(near, seconds=_STAYS_S), WayPoint('home', home, 0.0, 1.0)]
+
+        rows, done = self._as_far_as_it_reaches(other, ways, share, pace)
+        arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
+        begins = (arrives - self._timed(done, home)[0]) * pace[0] / pace[1]
+        return rows, max(round(begins * self._config.rate_hz), 0)
+
+    def _poach(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that takes what this one put down, and how late they begin.
+
+        It lifts it, carries it towards where it rests itself, and lets it fall. Where it does not
+        reach so far, it closes nearer to there.
+        """
+        met, home = [s.phase for s in stops].index('open'), self.workcell.home_tools[other]
+        let_go, flat, rise = stops[met], np.array([1, 1, 0]), _rise(self._config.retreat)
+
+        def ways(share: float) -> list[WayPoint]:
+            short = (1 - share) * (home - let_go.position) * flat
+            down = replace(let_go, seconds=None).moved(short)
+            back = (home - down.position) * flat
+            pull = size * back / max(float(np.linalg.norm(back)), size)
+            over, shut = down.moved(rise), replace(down, opening=0.0, seconds=self._config.close_s)
+            lifted = replace(over, opening=0.0)
+            carried = lifted.moved(pull)
+            opened = replace(carried, opening=1.0, seconds=self._config.open_s)
+            return [over, down, shut, lifted, carried, opened, WayPoint('home', home, 0.0, 1.0)]
+
+        rows, _ = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        leaves = sum(self._timed(stops[: met + 2], self.workcell.home_tools[arm]))
+        return rows, round(leaves * pace[0] / pace[1] * self._config.rate_hz)
+
+    def _as_far_as_it_reaches(
+        self,
+        arm: str,
+        ways: Callable[[float], list[WayPoint]],
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, list[WayPoint]]:
+        """Rows and way points of an arm that goes a share of a way, or as much as it reaches."""
         while True:
-            there = home + share * (stops[met].position - home)
-            near = WayPoint('above', there, 0.0, 1.0)
-            ways = [near, replace(near, seconds=_STAYS_S), WayPoint('home', home, 0.0, 1.0)]
             try:
-                rows = self._follow(other, ways, pace)
+                return self._follow(arm, ways(share), pace), ways(share)
             except SimulatorError:
                 if not share:
                     raise
                 share = max(share - _LESS, 0.0)
-                continue
-            arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
-            begins = (arrives - self._timed(ways, home)[0]) * pace[0] / pace[1]
-            return rows, max(round(begins * self._config.rate_hz), 0)
 
     def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
         """Minimum-jerk blends between way points, at a pace."""

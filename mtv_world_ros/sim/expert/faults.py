@@ -122,6 +122,22 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'it passes its object on a way of up to this length, and the fingers close as it goes',
     ),
+    'flinch': _kind(
+        'timing',
+        'test',
+        0.5,
+        2.0,
+        's',
+        'once, as a gripper opens or closes, the arms go back this long on their way, and return',
+    ),
+    'blur': _kind(
+        'timing',
+        'test',
+        1.0,
+        3.0,
+        's',
+        'all commands are the mean of those of now and of a while ago, up to this long',
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -543,6 +559,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'shut fingers press on the object and drag it this far, and it is grasped there',
     ),
+    'crank': _kind(
+        'collision',
+        'test',
+        2.2,
+        2.5,
+        'rad',
+        'shut fingers press on the object, off its middle, and go round that by this angle',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -573,6 +597,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.12,
         'm',
         'once done, shut fingers push what it has put the object on or beside, this far',
+    ),
+    'poach': _kind(
+        'object',
+        'test',
+        0.08,
+        0.12,
+        'm',
+        'once it is done, the other arm takes what it put there, and lets it fall this far away',
     ),
     'place': _kind(
         'place',
@@ -744,6 +776,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'rad',
         'one joint skips by this, once, and is off from there on',
     ),
+    'bind': _kind(
+        'joint',
+        'test',
+        0.3,
+        1.0,
+        'rad',
+        'one joint sticks at one place until its command is this far on, and jumps there',
+    ),
     # regrasp
     'retry': _kind(
         'regrasp', 'train', 0.03, 0.08, 'm', 'a first grasp is this far off, the second is right'
@@ -819,6 +859,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'it tosses the object this far aside, and takes it from where it let go',
+    ),
+    'hop': _kind(
+        'regrasp',
+        'test',
+        0.018,
+        0.05,
+        'm',
+        'on its way it puts the object down twice, lets go, and takes it again this far off',
     ),
     'jumble': _kind(
         'any', 'calibrate', 2, 4, '', 'number of way points that change places with the next one'
@@ -1008,7 +1056,7 @@ _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
-_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival')
+_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival', 'poach')
 #: kinds of what a gripper does
 _OF_GRIPPERS = (
     'starve',
@@ -1044,7 +1092,14 @@ _OF_GRIPPERS = (
     'kick',
     'peck',
     'haul',
+    'flinch',
+    'crank',
+    'poach',
+    'hop',
 )
+#: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
+#: one command to the next, both as shares of its range; how much faster they go back
+_FLINCH_OPEN, _STANDS, _FLINCH_SPEED = 0.1, 1e-3, 2
 #: joints of a wrist, the last ones of an arm
 _NUM_WRIST = 3
 #: travel from which on an arm joint takes part in a plan [rad]
@@ -1193,6 +1248,12 @@ def _controller_faults(
     if variant.size('skip'):
         share = _own(rng).uniform(0.15, 0.65)
         positions = _skip(positions, float(share), round(variant.size('skip') / period), period)
+    if variant.size('flinch'):
+        own = _own(rng)
+        positions = _flinch(positions, robot, round(variant.size('flinch') / period), own)
+    if variant.size('blur'):
+        share = _own(rng).uniform()
+        positions = _blur(positions, round(share * variant.size('blur') / period))
     positions = _out_of_time(positions, variant, grippers, period, rng)
     positions = _choppy(positions, round(variant.size('choppy') / period), period)
     if variant.size('coarse'):
@@ -1255,7 +1316,7 @@ def _one_joint(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): one joint moves less than the others, not at all, or skips; or all lose way."""
+    """(T, J): one joint moves less than the others, not at all, sticks, or skips; or all lose."""
     if variant.size('weak'):
         own = _own(rng)
         positions = _weak(positions, grippers, variant.size('weak'), own)
@@ -1265,6 +1326,9 @@ def _one_joint(
     if variant.size('clamp'):
         own = _own(rng)
         positions = _clamp(positions, grippers, variant.size('clamp'), own)
+    if variant.size('bind'):
+        own = _own(rng)
+        positions = _bind(positions, grippers, variant.size('bind'), period, own)
     if variant.size('cog'):
         own = _own(rng)
         positions = _cog(positions, grippers, variant.size('cog'), period, own)
@@ -1545,6 +1609,37 @@ def _offbeat(
     return whole
 
 
+def _flinch(
+    positions: FloatArray, robot: RobotModel, num: int, rng: np.random.Generator
+) -> FloatArray:
+    """(T', J): once, as a gripper opens or closes, the arms go back by `num` samples, and return.
+
+    The gripper goes on, and stands still at the end of its way until they are there again.
+    """
+    ways = []
+    for opening in robot.gripper_openings(positions):
+        stands = np.append(np.abs(np.diff(opening)) < _STANDS, True)
+        for change in np.flatnonzero(np.diff(opening > _FLINCH_OPEN)):
+            begin = int(change - np.argmax(stands[change::-1]))
+            ways.append((begin, int(change + np.argmax(stands[change:]))))
+    if not ways:
+        return positions
+    begin, end = ways[int(rng.integers(len(ways)))]
+    back = np.arange(begin, max(begin - num, 0), -_FLINCH_SPEED)
+    rows = np.arange(len(positions))
+    arms = np.insert(rows, begin, [*back, *back[::-1]])
+    hands = np.insert(rows, end, np.full(2 * len(back), end))
+    whole, grippers = positions[arms], _grippers(robot)
+    whole[:, grippers] = positions[hands][:, grippers]
+    return whole
+
+
+def _blur(positions: FloatArray, num: int) -> FloatArray:
+    """(T + num, J): the mean of what is commanded now and `num` samples before."""
+    whole, delayed = _delayed(positions, num)
+    return (whole + delayed) / 2
+
+
 def _ring(positions: FloatArray, grippers: list[int], angle: float) -> FloatArray:
     """(T, J): the arms follow as masses on springs do, which swing by `angle` [rad] a sample."""
     damped = angle * np.sqrt(1 - _DAMPING**2)
@@ -1720,6 +1815,30 @@ def _cog(
     first = int(rng.uniform(*_BRAKES) * len(positions))
     since = np.maximum(np.arange(len(whole)) - first, 0) * period
     whole[:, joint] += rng.choice((-angle, angle)) * np.minimum(since / _JUMP_S, 1.0)
+    return whole
+
+
+def _bind(
+    positions: FloatArray,
+    grippers: list[int],
+    most: float,
+    period: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(T, J): one of the arm joints that move sticks at one place of its travel, drawn.
+
+    It jumps to where it should be once that is `most` on.
+    """
+    joint, whole = _moving(positions, grippers, rng), positions.copy()
+    own = positions[:, joint]
+    away = own - rng.uniform(own.min(), own.max())
+    side = away[0]
+    for row, far in enumerate(away):
+        if far * side < 0 and abs(far) < most:
+            whole[row, joint] -= far
+        elif far:
+            side = far
+    whole[:, joint] = _smooth(whole, [], round(_JUMP_S / period))[:, joint]
     return whole
 
 

@@ -72,6 +72,8 @@ _KEEP_TEMPO = frozenset(
         'nod',
         'peck',
         'haul',
+        'crank',
+        'hop',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -123,6 +125,11 @@ _SWIRL_M = 0.08
 _NUM_NODS, _NOD_S, _LEAST_NOD = 3, 0.2, 0.6
 #: shut fingers peck at an object from above: how often, how far off its middle [m]
 _NUM_PECKS, _PECK_BESIDE_M = 3, 0.015
+#: shut fingers press on an object and go round its middle: how far off it [m], way points
+_CRANK_M, _NUM_CRANK = 0.02, 5
+#: where on its way to the goal it puts the object down and takes it again, as shares of the way,
+#: and how far it rises there [m]
+_HOPS, _HOP_RISE_M = (0.2, 0.4), 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +189,11 @@ class WayPointFaults:
         """Phases in which another arm comes where this one is, by which share of its way."""
         sizes = {phase: self._variant.size(kind) for phase, kind in _CROWDED.items()}
         return {phase: size for phase, size in sizes.items() if size}
+
+    @property
+    def poached(self) -> float:
+        """How far another arm carries away what this one has let go [m]; 0 = it does not."""
+        return self._variant.size('poach')
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -1107,6 +1119,47 @@ def _haul(stops: Stops, size: float, side: _Side) -> Stops:
     return [*dragged, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(way))]
 
 
+def _crank(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers press on the object off its middle, go round that and turn as they go.
+
+    It is grasped where it was. From another side, drawn anew, where the arm does not reach so far.
+    """
+    begin, sense = side.play.uniform(0.0, 2 * np.pi), float(side.play.choice((-1.0, 1.0)))
+    turns = sense * size * np.linspace(-0.5, 0.5, _NUM_CRANK)
+
+    def round_it(stop: WayPoint) -> Stops:
+        angles = begin + turns
+        ways = _CRANK_M * np.array([np.cos(angles), np.sin(angles), 0 * angles])
+        pairs = zip(turns, ways.T, strict=True)
+        return [replace(stop, yaw=stop.yaw + turn).moved(way) for turn, way in pairs]
+
+    above = replace(stops[0], opening=0.0)
+    down = replace(stops[_first(stops, 'grasp')], phase='above', opening=0.0, seconds=_CIRCLE_S)
+    over, *_, left = round_it(above)
+    first, *ring = round_it(down)
+    return [over, replace(first, seconds=None), *ring, left, *stops]
+
+
+def _hop(stops: Stops, size: float, side: _Side) -> Stops:
+    """On its way it puts the object down, lets go, and takes it again where it is not; twice.
+
+    To other sides, drawn anew, where the arm does not reach so far.
+    """
+    lift, lower = _first(stops, 'lift'), _first(stops, 'lower')
+    closed, wide = stops[lift - 1], stops[lift - 2].opening
+    way, rise = (stops[lower].position - closed.position) * (1, 1, 0), _up(_HOP_RISE_M)
+    hops: Stops = []
+    for share in _HOPS:
+        down = replace(closed, phase='carry', seconds=None).moved(share * way)
+        opened = replace(down, opening=wide)
+        again = opened.moved(size * _drawn_way(side))
+        shut = replace(again, opening=0.0, seconds=closed.seconds)
+        hops += [down.moved(rise), down, replace(opened, seconds=closed.seconds)]
+        hops += [opened.moved(rise), again.moved(rise), again, shut]
+        hops.append(replace(shut, seconds=None).moved(rise))
+    return [*stops[: lift + 1], *hops, *stops[lift + 1 :]]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1209,4 +1262,6 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'nod': _nod,
     'peck': _peck,
     'haul': _haul,
+    'crank': _crank,
+    'hop': _hop,
 }

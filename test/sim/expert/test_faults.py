@@ -214,9 +214,10 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    for kind in ('mirror', 'swap', 'crowd', 'rival'):
+    for kind in ('mirror', 'swap', 'crowd', 'rival', 'poach'):
+        variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
-            with_faults(one, parse_variant(f'expert-{kind}-0.5'), franka, np.random.default_rng(0))
+            with_faults(one, variant, franka, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(
@@ -255,6 +256,10 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'kick',
         'peck',
         'haul',
+        'flinch',
+        'crank',
+        'poach',
+        'hop',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1100,6 +1105,99 @@ def test_a_joint_that_skips_is_off_from_there_on(expert):
     assert np.ptp(np.sign(error[first:, joint])) == 0
 
 
+def test_once_the_arms_go_back_and_return_while_a_gripper_goes_on(expert):
+    expert_plan, flinch = plan(expert, 'expert'), plan(expert, 'expert-flinch-0.4')
+    arms = arm_columns(expert)
+    # 20 commands back at twice their pace, and again
+    assert len(flinch) == len(expert_plan) + 20
+    begin = next(
+        row
+        for row in range(len(expert_plan))
+        if is_back_and_forth(flinch[row : row + 20, arms])
+        and np.array_equal(flinch[row + 20 :, arms], expert_plan[row:, arms])
+    )
+    np.testing.assert_array_equal(flinch[:begin, arms], expert_plan[:begin, arms])
+    openings = [expert.robot.gripper_openings(rows) for rows in (expert_plan, flinch)]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    # once, the gripper stands still for as long
+    own = openings[1][used]
+    assert any(
+        np.ptp(own[row : row + 21]) < 1e-12
+        and np.allclose(np.delete(own, range(row, row + 20)), openings[0][used])
+        for row in range(begin, len(own) - 20)
+    )
+
+
+def is_back_and_forth(way: np.ndarray) -> bool:
+    return np.ptp(way, axis=0).max() > 1e-3 and np.array_equal(way, way[::-1])
+
+
+def test_commands_are_the_mean_of_those_of_now_and_of_a_while_ago(expert):
+    expert_plan, blur = plan(expert, 'expert'), plan(expert, 'expert-blur-1')
+    num = len(blur) - len(expert_plan)
+    assert 0 < num <= 50
+    mean = (expert_plan[num:] + expert_plan[:-num]) / 2
+    np.testing.assert_allclose(blur[num : len(expert_plan)], mean, atol=1e-12)
+    np.testing.assert_array_equal(blur[-1], expert_plan[-1])
+
+
+def test_a_joint_sticks_at_one_place_until_its_command_is_further_on(expert):
+    expert_plan, bind = plan(expert, 'expert'), plan(expert, 'expert-bind-0.2')
+    error = bind - expert_plan
+    (joint,) = np.flatnonzero(np.abs(error).max(axis=0) > 0.05)
+    assert joint in arm_columns(expert) and np.abs(error).max() < 0.2
+    moves = np.abs(np.diff(expert_plan[:, joint])) > 1e-4
+    sticks = moves & (np.abs(np.diff(bind[:, joint])) < 1e-12)
+    assert sticks.any() and np.ptp(bind[1:, joint][sticks]) < 1e-9
+
+
+def test_shut_fingers_press_on_the_object_and_go_round_its_middle():
+    stops, changed = changed_stops('expert-crank-1.6')
+    assert changed[7:] == stops and len(changed) == 16
+    cranked = changed[:7]
+    assert all(stop.opening == 0 for stop in cranked)
+    ways = np.array([stop.position - stops[1].position for stop in cranked])
+    np.testing.assert_allclose(ways[:, 2], [0.1, *[0.0] * 5, 0.1], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(ways[:, :2], axis=1), 0.02)
+    angles = np.unwrap(np.arctan2(ways[:, 1], ways[:, 0]))[1:-1]
+    yaws = np.array([stop.yaw for stop in cranked])
+    np.testing.assert_allclose(np.abs(np.diff(angles)), 0.4)
+    np.testing.assert_allclose(np.diff(yaws[1:-1]), np.diff(angles))
+    np.testing.assert_allclose(yaws[[0, -1]], yaws[[1, -2]])
+    np.testing.assert_allclose(np.abs(yaws[[0, -1]]), 0.8)
+
+
+def test_on_its_way_it_puts_the_object_down_and_takes_it_again_off_its_place():
+    stops, changed = changed_stops('expert-hop-0.02')
+    assert changed[:4] == stops[:4] and changed[20:] == stops[4:]
+    for share, hop in ((0.2, changed[4:12]), (0.4, changed[12:20])):
+        there = stops[1].position + [-share * 0.2, 0, 0]
+        ways = np.array([stop.position - there for stop in hop])
+        np.testing.assert_allclose(ways[:, 2], [0.04, 0, 0, 0.04, 0.04, 0, 0, 0.04], atol=1e-12)
+        np.testing.assert_allclose(ways[:4, :2], 0.0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(ways[4:, :2], axis=1), 0.02)
+        np.testing.assert_allclose(ways[4:, :2], np.broadcast_to(ways[4, :2], (4, 2)))
+        assert [stop.opening for stop in hop] == [0, 0, 1, 1, 1, 1, 0, 0]
+
+
+def test_the_other_arm_takes_what_was_put_down_and_lets_it_fall(expert):
+    expert_plan, poach = plan(expert, 'expert'), plan(expert, 'expert-poach-0.08')
+    num, openings = len(expert_plan), expert.robot.gripper_openings(poach)
+    used = int(np.argmax(np.ptp(expert.robot.gripper_openings(expert_plan), axis=1)))
+    own, other = (half if used == 0 else 1 - half for half in (0, 1))
+    halves = [np.split(positions, 2, axis=1) for positions in (expert_plan, poach)]
+    np.testing.assert_array_equal(halves[1][own][:num], halves[0][own])
+    tools = [poses[:, :3, 3] for poses in expert.robot.tool_poses(poach)]
+    lets_go = int(np.flatnonzero(openings[own] < 1e-9)[-1])
+    shut = np.flatnonzero(openings[other] < 1e-9)
+    assert shut[0] > lets_go
+    np.testing.assert_allclose(tools[other][shut[0]], tools[own][lets_go], atol=2e-3)
+    way = tools[other][shut[-1]] - tools[other][shut[0]]
+    assert np.linalg.norm(way[:2]) == pytest.approx(0.08, abs=2e-3)
+    assert way[2] == pytest.approx(0.07, abs=2e-3)
+    assert way[:2] @ (tools[other][0] - tools[other][shut[0]])[:2] > 0
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [
@@ -1112,6 +1210,7 @@ def test_a_joint_that_skips_is_off_from_there_on(expert):
         ('swat', 0.03),
         ('nod', 0.2),
         ('peck', 0.02),
+        ('crank', 1.0),
     ],
 )
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
@@ -1320,6 +1419,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'haul',
         'kick',
         'cog',
+        'flinch',
+        'blur',
+        'crank',
+        'poach',
+        'bind',
+        'hop',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1426,9 +1531,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-haul-0.03' has haul"
+    said = r"split test are not for training: 'expert-high-0.1-hop-0.03' has hop"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-haul-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-hop-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
