@@ -118,7 +118,7 @@ def load_pipeline(
         task: the task to judge, by name or YAML file; default: the one the instruction matches.
         device: `cpu`, `cuda`, ...
         dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
-        num_threads: threads of the model on a CPU; 0 = all cores but one, at least one. As many
+        num_threads: threads of the model on a CPU; 0 = all cores but one, of two both. As many
             processes, or one a core, compute motions of rigid bodies.
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
         describer: YAML file of what names the objects of the first real frame; empty = the

@@ -17,9 +17,9 @@ _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
 
 def set_num_threads(num_threads: int) -> None:
-    """Limits torch on a CPU; 0 = all usable cores but one, which callbacks keep."""
+    """Limits torch on a CPU; 0 = all usable cores but one, which callbacks keep; of two both."""
     usable = len(os.sched_getaffinity(0))
-    torch.set_num_threads(num_threads or max(1, usable - 1))
+    torch.set_num_threads(num_threads or max(min(usable, 2), usable - 1))
 
 
 def check_device(name: str) -> None:
