@@ -22,7 +22,9 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     """Adds robot, device, threads, steps and seed."""
     parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
     parser.add_argument('--device', default='cpu')
-    parser.add_argument('--threads', type=int, default=0, help='CPU threads; 0 = all but one, of two both')
+    parser.add_argument(
+        '--threads', type=int, default=0, help='CPU threads; 0 = all but one, of two both'
+    )
     parser.add_argument(
         '--steps',
         type=_num_steps,

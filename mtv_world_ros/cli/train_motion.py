@@ -76,7 +76,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='of the products of matrices: float32, bfloat16, or auto (bfloat16 where the '
         'processor has it)',
     )
-    parser.add_argument('--threads', type=int, default=0, help='0 = all cores but one, of two both')
+    parser.add_argument(
+        '--threads', type=int, default=0, help='0 = all cores but one, of two both'
+    )
     add_overwrite(parser)
     parser.set_defaults(handler=_train)
 

@@ -80,7 +80,9 @@ class Settings(NodeSettings):
 
     device: str = at_start('cpu', 'Device of the model: cpu, cuda, cuda:1.')
     num_threads: int = at_start(
-        0, 'CPU threads of the model; 0 = all cores but one, of two both (motions: all).', (0, 1024)
+        0,
+        'CPU threads of the model; 0 = all cores but one, of two both (motions: all).',
+        (0, 1024),
     )
     serving: str = at_start(
         '', 'What makes the model faster or smaller, e.g. `compile=true`; see docs/serving.md.'

@@ -14,6 +14,9 @@ class ContactSettings(Schema):
     finger_damping: Positive = Field(description='of each finger [N s/m]')
     finger_mass_kg: Positive = Field(description='of its drive')
     fingers_swing: bool = Field(default=False, description='each for itself, as the hand moves')
+    pad_stiffness: Positive | None = Field(
+        default=None, description='with which finger tips give way [N/m]; None = they do not'
+    )
     grip_friction: Positive = Field(description='of fingers on what they touch')
     table_friction: Positive = Field(description='of all else')
     density: Positive = Field(description='of objects [kg/m^3]')

@@ -10,6 +10,7 @@ Shape letters: J joints, D degrees of freedom of the description, O solids, A to
 from __future__ import annotations
 
 from collections.abc import Sequence
+import copy
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -46,6 +47,10 @@ _SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
 _REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 _ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
 _LEAST_KG = 0.01
+#: time constant with which pads of fingers give way [s]
+_PAD_S = 0.02
+#: a pad gives way, or does not
+_FREE, _LOCKED = dart.dynamics.ActuatorType.FORCE, dart.dynamics.ActuatorType.LOCKED
 #: how exactly friction is solved while fingers touch something: repetitions, relative error
 _SWEEPS, _TOLERANCE = 50, 1e-5
 #: half the extents of the table [m]
@@ -127,7 +132,13 @@ class RigidBodies:
             self._of_fingers.addShapeFrame(node)
         for group, solid in zip(self._of_solids, self._solids, strict=True):
             group.addShapeFramesOf(solid)
-        for skeleton in (_table(settings), *self._solids):
+        table = _table(settings)
+        self._of_table = detector.createCollisionGroup()
+        self._of_table.addShapeFramesOf(table)
+        self._of_pads = [detector.createCollisionGroup() for _ in self.arms.pads]
+        for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
+            group.addShapeFramesOf(pad.getChildBodyNode())
+        for skeleton in (table, *self._solids):
             self._others.addShapeFramesOf(skeleton)
             self._world.addSkeleton(skeleton)
         self._world.addSkeleton(self.arms.skeleton)
@@ -152,7 +163,8 @@ class RigidBodies:
         """Gives what fingers touch by now the friction of grips, and the rest that of the table.
 
         So what is gripped holds to fingers and slides on others. While anything is touched,
-        friction is solved as a cone; else as a pyramid along x and y, which is quicker.
+        friction is solved as a cone; else as a pyramid along x and y, which is quicker. And pads
+        give way, so that both fingers press on what lies below them; but not on the table.
         """
         touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
         for number in np.flatnonzero(touched != self._touched):
@@ -164,6 +176,12 @@ class RigidBodies:
             solver = self._cone if touched.any() else self._pyramid
             self._world.getConstraintSolver().setBoxedLcpSolver(solver)
         self._touched = touched
+        for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
+            is_soft = bool(touched.any()) and not group.collide(self._of_table)
+            if not is_soft:
+                pad.setPosition(0, 0.0)
+                pad.setVelocity(0, 0.0)
+            pad.setActuatorType(_FREE if is_soft else _LOCKED)
 
     def step(self, forces: FloatArray) -> None:
         """Goes on by a step with forces (D,) on the arms."""
@@ -207,12 +225,20 @@ class Arms:
         settings: ContactSettings,
         pose: FloatArray,
     ) -> None:
-        self.skeleton, described = _skeleton(robot, swing=settings.fingers_swing)
-        self._ghost = self.skeleton.clone('expected')
         followers = {name: (name, 1.0, 0.0) for name in robot.joint_names}
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
-        names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         travels = finger_travels(robot)
+        grips = {name for name, (source, *_) in followers.items() if source in travels}
+        tree, pads = _with_pads(robot, grips if settings.pad_stiffness else set())
+        self.skeleton, described = _skeleton(robot, tree, swing=settings.fingers_swing)
+        self.pads = [self.skeleton.getJoint(name) for name in sorted(pads)]
+        for pad in self.pads:
+            pad.setLimitEnforcement(False)
+            pad.setSpringStiffness(0, settings.pad_stiffness)
+            pad.setDampingCoefficient(0, settings.pad_stiffness * _PAD_S)
+            pad.setActuatorType(_LOCKED)
+        self._ghost = self.skeleton.clone('expected')
+        names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         moves = [followers[name][0] if name in followers else '' for name in names]
         self.fingers = [row for row, source in enumerate(moves) if source in travels]
         self._follows = np.zeros((len(names), len(robot.joint_names)))
@@ -239,7 +265,7 @@ class Arms:
             self._armature[row] = armature
         self._means = np.asarray(np.linalg.pinv(self._follows), np.float64)
         self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
-        self._finger_joints = {names[row] for row in self.fingers}
+        self._finger_joints = {names[row] for row in self.fingers} | pads
         for skeleton in (self.skeleton, self._ghost):
             _settle(skeleton, described, self._finger_joints, settings)
         self.skeleton.setPositions(self.ways(pose[None])[0])
@@ -392,19 +418,61 @@ def _boxed(shape: Any) -> Any:
     return dart.dynamics.BoxShape(np.array([side, side, length]))
 
 
-def _skeleton(robot: RobotModel, *, swing: bool) -> tuple[Any, set[str]]:
-    """The robot's bodies, and the links that have an inertia in its description."""
+def _urdf(robot: RobotModel) -> Path:
     urdf = None
     if robot.file is not None:
         urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
     if robot.file is None or urdf is None:
         raise RobotError(f"robot '{robot.name}' has no URDF; contact needs one")
-    path = robot.file.parent / str(urdf)
+    return robot.file.parent / str(urdf)
+
+
+def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element, set[str]]:
+    """The robot's description whose fingers touch with pads, and the joints of these.
+
+    A pad is what a finger of a joint of `grips` touches with. It has half of its mass, and gives
+    way along the tool's z axis.
+    """
+    tree, pads = _described(_urdf(robot)), set[str]()
+    poses = robot.forward_kinematics((robot.lower + robot.upper)[None] / 2)
+    axes = np.stack([(poses[tool.link][0] @ tool.T_link_tool)[:3, 2] for tool in robot.tools])
+    tips = np.stack([(poses[tool.link][0] @ tool.T_link_tool)[:3, 3] for tool in robot.tools])
+    for joint in [one for one in tree.iterfind('joint') if one.attrib['name'] in grips]:
+        name = joint.find('child').attrib['link']  # type: ignore[union-attr]
+        link = next(one for one in tree.iterfind('link') if one.attrib['name'] == name)
+        shapes, mass = link.findall('collision'), link.find('inertial/mass')
+        if not shapes or mass is None:
+            continue
+        pad, pose = f'{name}_pad', poses[name][0]
+        nearest = int(np.linalg.norm(tips - pose[:3, 3], axis=-1).argmin())
+        mass.set('value', str(float(mass.attrib['value']) / 2))
+        body = ElementTree.SubElement(tree, 'link', name=pad)
+        body.append(copy.deepcopy(link.find('inertial')))  # type: ignore[arg-type]
+        for shape in shapes:
+            link.remove(shape)
+            body.append(shape)
+        slide = ElementTree.SubElement(tree, 'joint', name=pad, type='prismatic')
+        axis = ' '.join(map(str, pose[:3, :3].T @ axes[nearest]))
+        for tag, given in (
+            ('parent', {'link': name}),
+            ('child', {'link': pad}),
+            ('axis', {'xyz': axis}),
+            ('limit', {'lower': '-1', 'upper': '1', 'effort': '1e9', 'velocity': '1e9'}),
+        ):
+            ElementTree.SubElement(slide, tag, given)
+        pads.add(pad)
+    return tree, pads
+
+
+def _skeleton(
+    robot: RobotModel, tree: ElementTree.Element, *, swing: bool
+) -> tuple[Any, set[str]]:
+    """The robot's bodies, and the links that have an inertia in its description."""
+    path = _urdf(robot)
     loader = dart.utils.DartLoader()
     options = loader.getOptions()
     options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED
     loader.setOptions(options)
-    tree = _described(path)
     if swing:
         for joint in tree.iterfind('joint/mimic/..'):
             joint.remove(joint.find('mimic'))  # type: ignore[arg-type]

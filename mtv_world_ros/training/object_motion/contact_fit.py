@@ -41,6 +41,7 @@ from mtv_world_ros.training.object_motion.tracks import (
 _FITTED = (
     'finger_stiffness',
     'finger_damping',
+    'pad_stiffness',
     'grip_friction',
     'table_friction',
     'density',
@@ -138,6 +139,7 @@ def first_settings(robot: RobotModel, response: ArmResponse) -> ContactSettings:
         finger_stiffness=float(stiffness),
         finger_damping=float(damping),
         finger_mass_kg=float(mass),
+        pad_stiffness=1e4,
         grip_friction=1.0,
         table_friction=0.5,
         density=300.0,
