@@ -229,13 +229,14 @@ class Arms:
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
         travels = finger_travels(robot)
         grips = {name for name, (source, *_) in followers.items() if source in travels}
-        tree, pads = _with_pads(robot, grips if settings.pad_stiffness else set())
+        stiffness = settings.pad_stiffness or 0.0
+        tree, pads = _with_pads(robot, grips if stiffness else set())
         self.skeleton, described = _skeleton(robot, tree, swing=settings.fingers_swing)
         self.pads = [self.skeleton.getJoint(name) for name in sorted(pads)]
         for pad in self.pads:
             pad.setLimitEnforcement(False)
-            pad.setSpringStiffness(0, settings.pad_stiffness)
-            pad.setDampingCoefficient(0, settings.pad_stiffness * _PAD_S)
+            pad.setSpringStiffness(0, stiffness)
+            pad.setDampingCoefficient(0, stiffness * _PAD_S)
             pad.setActuatorType(_LOCKED)
         self._ghost = self.skeleton.clone('expected')
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]

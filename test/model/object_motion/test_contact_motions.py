@@ -28,7 +28,7 @@ from mtv_world_ros.model.object_motion.predictor import (
     load_predictor,
     save_contact,
 )
-from mtv_world_ros.model.object_motion.rigid_bodies import RigidBodies
+from mtv_world_ros.model.object_motion.rigid_bodies import _FREE, RigidBodies
 from mtv_world_ros.training.object_motion.contact_fit import read_contact
 
 #: of commands between two rows that come back
@@ -180,6 +180,46 @@ def test_arms_hit_each_other(robot, response, recording):
         arms = RigidBodies(robot, response, (), SETTINGS, STEP_S, rest).arms
         reached.append(np.abs(then.states[0].positions[-1] - arms.ways(positions[-1:])[0]).max())
     assert reached[0] > 0.05 > 0.01 > reached[1]
+
+
+def test_both_shut_fingers_bear_on_what_they_press(robot, response, recording):
+    """Where tips do not give way one bears it all, and slides away from the other."""
+    lowest = robot.tool_poses(recording.positions)[..., 2, 3]
+    arm, row = np.unravel_index(lowest.argmin(), lowest.shape)
+    tool, joints = robot.tools[arm], recording.positions[row].copy()
+    joints[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
+    pose = robot.tool_poses(joints[None])[arm, 0]
+    block = Solid(centre=np.array([*pose[:2, 3], 0.025]), size=np.full(3, 0.05))
+    solver, ends = ArmSolver(robot, tool), []
+    for height in (0.11, 0.03):  # 2 cm too deep, 1 cm beside the middle
+        place = pose.copy()
+        place[:3, 3] = pose[0, 3] + 0.01, pose[1, 3], height
+        ends.append(joints.copy())
+        ends[-1][solver.indices] = solver.solve(place, joints[solver.indices])
+    share = np.clip(np.linspace(-0.5, 2, 50), 0, 1)[:, None]
+    positions = ends[0] + share * (ends[1] - ends[0])
+    for pads, least, most in ((None, 0.03, 1.0), (1e4, 0.0, 0.01)):
+        motions = motions_of(
+            response, block, fingers_swing=True, grip_friction=1.6, pad_stiffness=pads
+        )
+        moved, _ = motions.advance(robot, positions, ROWS)
+        assert least <= robot.gripper_openings(moved.joints[0])[arm].max() <= most
+        assert np.linalg.norm(moved.points[0, -1] - moved.points[0, 0]) < 0.005
+
+
+def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
+    rest = still(robot, 0.0)[0]
+    for tool in robot.tools:
+        rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
+    tip = robot.tool_poses(rest[None])[0, 0, :3, 3]
+    for table, given in ((tip[2] - 0.2, True), (tip[2], False)):
+        settings = SETTINGS.model_copy(update={'pad_stiffness': 1e4, 'table_m': table})
+        between = replace(AWAY, centre=tip)
+        bodies = RigidBodies(robot, response, (between,), settings, STEP_S, rest)
+        assert len(bodies.arms.pads) == 2 * len(robot.tools)
+        bodies.notice_touch()
+        kinds = {pad.getActuatorType() for pad in bodies.arms.pads}
+        assert (_FREE in kinds) == given
 
 
 @pytest.mark.parametrize(('is_open', 'height'), [(True, 0.02), (False, 0.07)])
