@@ -145,8 +145,17 @@ class Clip:
     origin: Origin | None = None
     masks_by: str = ''
 
+    @property
+    def begun(self) -> Clip:
+        """The same with its own first frame as its origin."""
+        if self.object_poses is None:
+            return self
+        return replace(
+            self, origin=Origin(self.frames[:, 0], self.positions[0], self.object_poses[0])
+        )
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
+@dataclass(frozen=True, slots=True)
 class Origin:
     """The frame in which the objects of a clip were found.
 
@@ -383,11 +392,7 @@ def cut_clip(
 def _origin(recording: Recording) -> Origin | None:
     if recording.object_poses is None:
         return None
-    return Origin(
-        frames=recording.frames[:, 0],
-        positions=recording.positions[0],
-        object_poses=recording.object_poses[0],
-    )
+    return Origin(recording.frames[:, 0], recording.positions[0], recording.object_poses[0])
 
 
 def chunk_of(clip: Clip, chunk: int, num_frames: int) -> Clip:

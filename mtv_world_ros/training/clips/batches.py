@@ -197,6 +197,9 @@ class BatchSource:
             clip = cut_clip(recording, start, self._spec)
         else:
             clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        begun = self._augment.begun_share
+        if lead is None and begun and rng.random() < begun:
+            clip = clip.begun
         past = self._past(recording, start, lead, rng)
         names = recording.names
         if rng.random() < self._augment.name_dropout:
