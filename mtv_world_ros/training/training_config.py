@@ -105,8 +105,8 @@ class AugmentConfig(Schema):
     begun_share: Share = Field(
         default=0.0,
         description='probability of a clip whose objects are cut out of its own first frame, '
-        'where a gripper may hide half of them, as where a rollout begins in mid-episode; else out of '
-        "the recording's first frame",
+        'where a gripper may hide half of them, as where a rollout begins in mid-episode; else '
+        "out of the recording's first frame",
     )
     action_dropout: Share = Field(
         default=0.05,
