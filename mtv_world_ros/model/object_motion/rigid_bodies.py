@@ -229,15 +229,9 @@ class Arms:
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
         travels = finger_travels(robot)
         grips = {name for name, (source, *_) in followers.items() if source in travels}
-        stiffness = settings.pad_stiffness or 0.0
-        tree, pads = _with_pads(robot, grips if stiffness else set())
+        tree, pads = _with_pads(robot, grips if settings.pad_stiffness else set())
         self.skeleton, described = _skeleton(robot, tree, swing=settings.fingers_swing)
-        self.pads = [self.skeleton.getJoint(name) for name in sorted(pads)]
-        for pad in self.pads:
-            pad.setLimitEnforcement(False)
-            pad.setSpringStiffness(0, stiffness)
-            pad.setDampingCoefficient(0, stiffness * _PAD_S)
-            pad.setActuatorType(_LOCKED)
+        self.pads = [_pad(self.skeleton, name, settings) for name in sorted(pads)]
         self._ghost = self.skeleton.clone('expected')
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         moves = [followers[name][0] if name in followers else '' for name in names]
@@ -435,9 +429,8 @@ def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element,
     way along the tool's z axis.
     """
     tree, pads = _described(_urdf(robot)), set[str]()
-    poses = robot.forward_kinematics((robot.lower + robot.upper)[None] / 2)
-    axes = np.stack([(poses[tool.link][0] @ tool.T_link_tool)[:3, 2] for tool in robot.tools])
-    tips = np.stack([(poses[tool.link][0] @ tool.T_link_tool)[:3, 3] for tool in robot.tools])
+    poses = robot.forward_kinematics(np.clip(0.0, robot.lower, robot.upper)[None])
+    tools = np.stack([poses[tool.link][0] @ tool.T_link_tool for tool in robot.tools])
     for joint in [one for one in tree.iterfind('joint') if one.attrib['name'] in grips]:
         name = joint.find('child').attrib['link']  # type: ignore[union-attr]
         link = next(one for one in tree.iterfind('link') if one.attrib['name'] == name)
@@ -445,7 +438,7 @@ def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element,
         if not shapes or mass is None:
             continue
         pad, pose = f'{name}_pad', poses[name][0]
-        nearest = int(np.linalg.norm(tips - pose[:3, 3], axis=-1).argmin())
+        tool = tools[np.linalg.norm(tools[:, :3, 3] - pose[:3, 3], axis=-1).argmin()]
         mass.set('value', str(float(mass.attrib['value']) / 2))
         body = ElementTree.SubElement(tree, 'link', name=pad)
         body.append(copy.deepcopy(link.find('inertial')))  # type: ignore[arg-type]
@@ -453,7 +446,7 @@ def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element,
             link.remove(shape)
             body.append(shape)
         slide = ElementTree.SubElement(tree, 'joint', name=pad, type='prismatic')
-        axis = ' '.join(map(str, pose[:3, :3].T @ axes[nearest]))
+        axis = ' '.join(map(str, pose[:3, :3].T @ tool[:3, 2]))
         for tag, given in (
             ('parent', {'link': name}),
             ('child', {'link': pad}),
@@ -463,6 +456,16 @@ def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element,
             ElementTree.SubElement(slide, tag, given)
         pads.add(pad)
     return tree, pads
+
+
+def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
+    """The joint of a pad, which does not give way yet."""
+    joint, stiffness = arms.getJoint(name), settings.pad_stiffness or 0.0
+    joint.setLimitEnforcement(False)
+    joint.setSpringStiffness(0, stiffness)
+    joint.setDampingCoefficient(0, stiffness * _PAD_S)
+    joint.setActuatorType(_LOCKED)
+    return joint
 
 
 def _skeleton(
