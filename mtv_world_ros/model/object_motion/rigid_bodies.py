@@ -229,8 +229,10 @@ class Arms:
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
         travels = finger_travels(robot)
         grips = {name for name, (source, *_) in followers.items() if source in travels}
-        tree, pads = _with_pads(robot, grips if settings.pad_stiffness else set())
-        self.skeleton, described = _skeleton(robot, tree, swing=settings.fingers_swing)
+        path = _urdf(robot)
+        tree = _described(path)
+        pads = _add_pads(tree, robot, grips) if settings.pad_stiffness else set[str]()
+        self.skeleton, described = _skeleton(robot, path, tree, swing=settings.fingers_swing)
         self.pads = [_pad(self.skeleton, name, settings) for name in sorted(pads)]
         self._ghost = self.skeleton.clone('expected')
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
@@ -414,6 +416,7 @@ def _boxed(shape: Any) -> Any:
 
 
 def _urdf(robot: RobotModel) -> Path:
+    """Where the robot is described."""
     urdf = None
     if robot.file is not None:
         urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
@@ -422,13 +425,13 @@ def _urdf(robot: RobotModel) -> Path:
     return robot.file.parent / str(urdf)
 
 
-def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element, set[str]]:
-    """The robot's description whose fingers touch with pads, and the joints of these.
+def _add_pads(tree: ElementTree.Element, robot: RobotModel, grips: set[str]) -> set[str]:
+    """Gives fingers pads to touch with, in a robot's description; returns the pads' joints.
 
     A pad is what a finger of a joint of `grips` touches with. It has half of its mass, and gives
     way along the tool's z axis.
     """
-    tree, pads = _described(_urdf(robot)), set[str]()
+    pads = set[str]()
     poses = robot.forward_kinematics(np.clip(0.0, robot.lower, robot.upper)[None])
     tools = np.stack([poses[tool.link][0] @ tool.T_link_tool for tool in robot.tools])
     for joint in [one for one in tree.iterfind('joint') if one.attrib['name'] in grips]:
@@ -455,7 +458,7 @@ def _with_pads(robot: RobotModel, grips: set[str]) -> tuple[ElementTree.Element,
         ):
             ElementTree.SubElement(slide, tag, given)
         pads.add(pad)
-    return tree, pads
+    return pads
 
 
 def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
@@ -469,10 +472,9 @@ def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
 
 
 def _skeleton(
-    robot: RobotModel, tree: ElementTree.Element, *, swing: bool
+    robot: RobotModel, path: Path, tree: ElementTree.Element, *, swing: bool
 ) -> tuple[Any, set[str]]:
-    """The robot's bodies, and the links that have an inertia in its description."""
-    path = _urdf(robot)
+    """The robot's bodies, and the links that have an inertia in its description, of a file."""
     loader = dart.utils.DartLoader()
     options = loader.getOptions()
     options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED

@@ -467,8 +467,9 @@ class Expert:
     ) -> tuple[FloatArray, list[WayPoint]]:
         """Rows and way points of an arm that goes a share of a way, or as much as it reaches."""
         while True:
+            way = ways(share)
             try:
-                return self._follow(arm, ways(share), pace), ways(share)
+                return self._follow(arm, way, pace), way
             except SimulatorError:
                 if not share:
                     raise
