@@ -138,6 +138,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-haul-0.04',
         'expert-kick-0.05',
         'expert-kick-0.08',
+        'expert-crank-2',
+        'expert-crank-2.2',
+        'expert-poach-0.06',
+        'expert-poach-0.1',
+        'expert-hop-0.015',
+        'expert-hop-0.018',
     ),
     'calibrate': (
         'expert',
@@ -242,22 +248,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-nod-0.5',
         'expert-cog-0.15',
         'expert-cog-0.2',
-    ),
-    'test': (
-        'expert',
         'expert-flinch-0.3',
         'expert-flinch-0.5',
         'expert-blur-0.9',
         'expert-blur-1.2',
-        'expert-crank-2',
-        'expert-crank-2.2',
-        'expert-poach-0.06',
-        'expert-poach-0.1',
         'expert-bind-0.25',
         'expert-bind-0.4',
-        'expert-hop-0.015',
-        'expert-hop-0.018',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

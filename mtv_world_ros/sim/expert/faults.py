@@ -124,7 +124,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'flinch': _kind(
         'timing',
-        'test',
+        'calibrate',
         0.5,
         2.0,
         's',
@@ -132,7 +132,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'blur': _kind(
         'timing',
-        'test',
+        'calibrate',
         1.0,
         3.0,
         's',
@@ -561,7 +561,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'crank': _kind(
         'collision',
-        'test',
+        'train',
         2.2,
         2.5,
         'rad',
@@ -600,7 +600,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'poach': _kind(
         'object',
-        'test',
+        'train',
         0.08,
         0.12,
         'm',
@@ -778,7 +778,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'bind': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.3,
         1.0,
         'rad',
@@ -862,7 +862,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'hop': _kind(
         'regrasp',
-        'test',
+        'train',
         0.018,
         0.05,
         'm',
