@@ -219,6 +219,22 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of its height over the grasp by which a place is off, to one side',
     ),
+    'stretch': _kind(
+        'lateral',
+        'test',
+        0.15,
+        0.3,
+        '',
+        'share by which all places are farther from where the arm rests, or nearer to there',
+    ),
+    'hunt': _kind(
+        'lateral',
+        'test',
+        0.04,
+        0.1,
+        'm',
+        'on its way down, it swings from side to side with open fingers, this far',
+    ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
     'lean': _kind('wrist', 'train', 0.4, 0.9, 'rad', 'the wrist leans in a grasp'),
@@ -240,6 +256,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.6,
         'rad',
         'down at the object, it leans to and fro, up to this far, before the fingers close',
+    ),
+    'rock': _kind(
+        'wrist',
+        'test',
+        0.45,
+        0.6,
+        'rad',
+        'what it holds leans to and fro on its goal, up to this far, before it is let go',
     ),
     # opening
     'loose': _kind(
@@ -324,6 +348,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'the gripper gives way as its arm reaches out, by up to this share of its range',
+    ),
+    'yawn': _kind(
+        'opening',
+        'test',
+        0.45,
+        1.0,
+        '',
+        'share of its way down that it comes shut; the fingers open over the rest',
     ),
     # release
     'drops': _kind(
@@ -606,6 +638,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'once it is done, the other arm takes what it put there, and lets it fall this far away',
     ),
+    'waver': _kind(
+        'object',
+        'test',
+        0.9,
+        1.0,
+        '',
+        'share of the way to the next object that it goes, down at its own, and comes back',
+    ),
     'place': _kind(
         'place',
         'train',
@@ -783,6 +823,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         'rad',
         'one joint sticks at one place until its command is this far on, and jumps there',
+    ),
+    'drift': _kind(
+        'joint',
+        'test',
+        0.014,
+        0.2,
+        'rad/s',
+        'standard deviation of how fast every arm joint drifts off',
     ),
     # regrasp
     'retry': _kind(
@@ -1096,6 +1144,10 @@ _OF_GRIPPERS = (
     'crank',
     'poach',
     'hop',
+    'hunt',
+    'rock',
+    'yawn',
+    'waver',
 )
 #: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
 #: one command to the next, both as shares of its range; how much faster they go back
@@ -1377,6 +1429,9 @@ def _errors(
     rows, joints = error.shape
     if variant.size('zero'):
         error += _offset(rows, joints, variant.size('zero'), period, rng)
+    if variant.size('drift'):
+        speeds = _own(rng).normal(0.0, variant.size('drift'), joints)
+        error += period * np.arange(rows)[:, None] * speeds
     if variant.size('mirror'):
         error += variant.size('mirror') * _mirrored(positions, len(robot.tools), period)
     if variant.size('tremble'):

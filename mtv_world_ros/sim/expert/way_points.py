@@ -74,6 +74,9 @@ _KEEP_TEMPO = frozenset(
         'haul',
         'crank',
         'hop',
+        'hunt',
+        'yawn',
+        'waver',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -120,8 +123,8 @@ _THUMP_M, _NUM_THUMPS, _THUMP_S = 0.05, 3, 0.12
 _SWAT_S = 0.3
 #: shut fingers go round an object: how far off its middle they come down [m]
 _SWIRL_M = 0.08
-#: down at the object, it leans to and fro: how often, time from one side to the other [s], and how
-#: far at least, as a share
+#: down at the object, or with it at its goal, it leans to and fro: how often, time from one side
+#: to the other [s], and how far at least, as a share
 _NUM_NODS, _NOD_S, _LEAST_NOD = 3, 0.2, 0.6
 #: shut fingers peck at an object from above: how often, how far off its middle [m]
 _NUM_PECKS, _PECK_BESIDE_M = 3, 0.015
@@ -130,6 +133,8 @@ _CRANK_M, _NUM_CRANK = 0.02, 5
 #: where on its way to the goal it puts the object down and takes it again, as shares of the way,
 #: and how far it rises there [m]
 _HOPS, _HOP_RISE_M = (0.2, 0.4), 0.04
+#: on its way down it swings from side to side: how often, and time of a stroke [s]
+_NUM_HUNTS, _HUNT_S = 5, 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,11 +290,16 @@ def _slide(stops: Stops, size: float, side: _Side) -> Stops:
 
 def _torn(stops: Stops, size: float, side: _Side) -> Stops:
     """It grasps between its object and the nearest other one."""
+    way = size * _way_to_other(stops, side)
+    return _changed(stops, _GRASP, lambda stop: stop.moved(way))
+
+
+def _way_to_other(stops: Stops, side: _Side) -> FloatArray:
+    """(3,) in the plane from its grasp to the nearest other object; none where there is none."""
     grasp = stops[_first(stops, 'close')].position
     ways = [(place - grasp) * (1, 1, 0) for place in side.objects]
     others = [way for way in ways if np.linalg.norm(way) > _VISIT_TO_M[1]]
-    way = size * min(others, key=np.linalg.norm, default=np.zeros(3))
-    return _changed(stops, _GRASP, lambda stop: stop.moved(way))
+    return min(others, key=np.linalg.norm, default=np.zeros(3))
 
 
 def _turn(stops: Stops, size: float, side: _Side) -> Stops:
@@ -1090,10 +1100,15 @@ def _nod(stops: Stops, size: float, side: _Side) -> Stops:
     To either side by an angle up to this, drawn anew where the wrist does not lean so far.
     """
     first = _first(stops, 'close')
-    grasp = replace(stops[first - 1], phase='above', seconds=_NOD_S)
+    grasp = replace(stops[first - 1], phase='above')
+    return [*stops[:first], *_nods(grasp, size, side), *stops[first:]]
+
+
+def _nods(stop: WayPoint, size: float, side: _Side) -> Stops:
+    """Leaning to either side of a way point, by angles up to this, drawn, and back to it."""
     left, right = size * side.play.uniform(_LEAST_NOD, 1.0, 2)
-    leans = (grasp.lean + lean for lean in (*(left, -right) * _NUM_NODS, 0.0))
-    return [*stops[:first], *(replace(grasp, lean=lean) for lean in leans), *stops[first:]]
+    leans = (stop.lean + lean for lean in (*(left, -right) * _NUM_NODS, 0.0))
+    return [replace(stop, lean=lean, seconds=_NOD_S) for lean in leans]
 
 
 def _peck(stops: Stops, size: float, side: _Side) -> Stops:
@@ -1158,6 +1173,55 @@ def _hop(stops: Stops, size: float, side: _Side) -> Stops:
         hops += [opened.moved(rise), again.moved(rise), again, shut]
         hops.append(replace(shut, seconds=None).moved(rise))
     return [*stops[: lift + 1], *hops, *stops[lift + 1 :]]
+
+
+def _hunt(stops: Stops, size: float, side: _Side) -> Stops:
+    """On its way down, it swings from side to side, as if it kept correcting its aim.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    first, way = _first(stops, 'grasp'), size * _drawn_way(side)
+    above, grasp = stops[first - 1 : first + 1]
+    down, swing = grasp.position - above.position, replace(above, seconds=_HUNT_S)
+    swings = [
+        swing.moved(number / _NUM_HUNTS * down + (-1) ** number * way)
+        for number in range(1, _NUM_HUNTS + 1)
+    ]
+    return [*stops[:first], *swings, *stops[first:]]
+
+
+def _stretch(stops: Stops, size: float, side: _Side) -> Stops:
+    """All places are farther from where the arm rests, or nearer to there, by a share.
+
+    Drawn anew where the arm does not reach so far.
+    """
+    home, share = stops[-1].position, size * float(side.play.choice((-1.0, 1.0)))
+    return [stop.moved(share * (stop.position - home) * (1, 1, 0)) for stop in stops]
+
+
+def _rock(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds leans to and fro on its goal before it is let go.
+
+    To either side by an angle up to this, drawn anew where the wrist does not lean so far.
+    """
+    opened = _first(stops, 'open')
+    return [*stops[:opened], *_nods(stops[opened - 1], size, side), *stops[opened:]]
+
+
+def _yawn(stops: Stops, size: float, side: _Side) -> Stops:
+    """It comes down shut, and the fingers open only over the rest of the way, onto the object."""
+    first = _first(stops, 'grasp')
+    above = replace(stops[first - 1], opening=0.0)
+    shut = above.moved(size * (stops[first].position - above.position))
+    return [*stops[: first - 1], above, shut, *stops[first:]]
+
+
+def _waver(stops: Stops, size: float, side: _Side) -> Stops:
+    """Down at the object, it goes towards the nearest other one with open fingers, and back."""
+    first = _first(stops, 'close')
+    grasp = replace(stops[first - 1], phase='above')
+    away = grasp.moved(size * _way_to_other(stops, side))
+    return [*stops[:first], away, grasp, *stops[first:]]
 
 
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
@@ -1264,4 +1328,9 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'haul': _haul,
     'crank': _crank,
     'hop': _hop,
+    'hunt': _hunt,
+    'stretch': _stretch,
+    'rock': _rock,
+    'yawn': _yawn,
+    'waver': _waver,
 }

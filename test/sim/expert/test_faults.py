@@ -260,6 +260,10 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'crank',
         'poach',
         'hop',
+        'hunt',
+        'rock',
+        'yawn',
+        'waver',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1198,6 +1202,68 @@ def test_the_other_arm_takes_what_was_put_down_and_lets_it_fall(expert):
     assert way[:2] @ (tools[other][0] - tools[other][shut[0]])[:2] > 0
 
 
+def test_joints_drift_ever_farther_off(expert):
+    error = plan(expert, 'expert-drift-0.01') - plan(expert, 'expert')
+    arms = arm_columns(expert)
+    assert np.abs(np.delete(error, arms, axis=1)).max() == 0 and np.abs(error[0]).max() == 0
+    steps = np.diff(error[:, arms], axis=0)
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-12)
+    assert (np.abs(steps) > 1e-6).all() and 0.003 < np.std(steps * 50) < 0.03
+
+
+def test_all_places_are_farther_or_nearer_by_a_share():
+    stops, changed = changed_stops('expert-stretch-0.1')
+    home = stops[-1].position
+    ways = [np.array([stop.position - home for stop in some]) for some in (stops, changed)]
+    factor = ways[1][1, 0] / ways[0][1, 0]
+    assert abs(factor - 1) == pytest.approx(0.1)
+    np.testing.assert_allclose(ways[1], ways[0] * (factor, factor, 1), atol=1e-12)
+
+
+def test_on_its_way_down_it_swings_from_side_to_side():
+    stops, changed = changed_stops('expert-hunt-0.03')
+    assert changed[:1] == stops[:1] and changed[6:] == stops[1:]
+    swings = changed[1:6]
+    ways = np.array([stop.position - stops[1].position for stop in swings])
+    np.testing.assert_allclose(ways[:, 2], [0.08, 0.06, 0.04, 0.02, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(ways[:, :2], axis=1), 0.03)
+    np.testing.assert_allclose(ways[1:, :2], -ways[:-1, :2], atol=1e-12)
+    assert all(stop.opening == 1 for stop in swings)
+
+
+def test_what_it_holds_leans_to_and_fro_on_its_goal():
+    stops, changed = changed_stops('expert-rock-0.4')
+    assert changed[:6] == stops[:6] and changed[13:] == stops[6:]
+    rocks = changed[6:13]
+    leans = np.array([stop.lean for stop in rocks])
+    assert leans[-1] == 0 and (leans[0:6:2] > 0).all() and (leans[1:6:2] < 0).all()
+    assert (np.abs(leans[:6]) >= 0.24).all() and np.abs(leans).max() <= 0.4
+    for stop in rocks:
+        np.testing.assert_array_equal(stop.position, stops[5].position)
+        assert stop.opening == 0 and stop.seconds == 0.2
+
+
+def test_it_comes_down_shut_and_opens_over_the_rest_of_the_way():
+    stops, changed = changed_stops('expert-yawn-0.6')
+    assert changed[2:] == stops[1:]
+    assert [stop.opening for stop in changed[:4]] == [0, 0, 1, 0]
+    np.testing.assert_array_equal(changed[0].position, stops[0].position)
+    np.testing.assert_allclose(changed[1].position - stops[0].position, [0, 0, -0.06])
+
+
+def test_down_at_the_object_it_goes_towards_another_one_and_comes_back():
+    stops, alone = changed_stops('expert-waver-0.5')
+    own, rng = stops[1].position, np.random.default_rng(0)
+    faults = WayPointFaults(parse_variant('expert-waver-0.5'), rng)
+    changed = faults.applied(stops, 0.0, [own, own + [0, 0.1, 0.02], own + [0.3, 0, 0]])
+    assert changed[:2] == stops[:2] and changed[4:] == stops[2:]
+    np.testing.assert_allclose(changed[2].position - own, [0, 0.05, 0])
+    np.testing.assert_array_equal(changed[3].position, own)
+    assert changed[2].opening == changed[3].opening == 1
+    # where there is no other object, it stays
+    np.testing.assert_array_equal(alone[2].position, own)
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [
@@ -1211,6 +1277,7 @@ def test_the_other_arm_takes_what_was_put_down_and_lets_it_fall(expert):
         ('nod', 0.2),
         ('peck', 0.02),
         ('crank', 1.0),
+        ('hunt', 0.03),
     ],
 )
 def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
@@ -1425,6 +1492,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'poach',
         'bind',
         'hop',
+        'stretch',
+        'hunt',
+        'rock',
+        'yawn',
+        'waver',
+        'drift',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1531,9 +1604,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-hop-0.03' has hop"
+    said = r"split test are not for training: 'expert-high-0.1-hunt-0.03' has hunt"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-hop-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-hunt-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
