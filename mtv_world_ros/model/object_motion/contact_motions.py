@@ -160,7 +160,10 @@ class ContactMotions:
         )
 
     def _disturbed(self, number: int) -> tuple[ContactSettings, list[Solid]]:
-        """Settings and solids of a motion; those of the first are as they are."""
+        """Settings and solids of a motion; those of the first are as they are.
+
+        Finger tips are hard in every other one: neither hard nor soft ones are right alone.
+        """
         rng, share = np.random.default_rng((2, number)), float(number > 0)
         settings = self.settings
 
@@ -174,6 +177,7 @@ class ContactMotions:
                 'finger_stiffness': settings.finger_stiffness * scaled(_STIFFNESS),
                 'density': settings.density * scaled(_WEIGHT),
                 'tray_kg': settings.tray_kg * scaled(_WEIGHT),
+                'pad_stiffness': settings.pad_stiffness if number % 2 == 0 else None,
             }
         )
         return changed, [

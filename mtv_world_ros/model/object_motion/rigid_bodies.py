@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from mtv_world_ros.bounded_input import parse_yaml, read_text
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import find_mesh
@@ -51,6 +51,8 @@ _LEAST_KG = 0.01
 _PAD_S = 0.02
 #: a pad gives way, or does not
 _FREE, _LOCKED = dart.dynamics.ActuatorType.FORCE, dart.dynamics.ActuatorType.LOCKED
+#: fingers that are further from their middle and touch the same, hold it between them [m]
+_GRIP_M = 0.002
 #: how exactly friction is solved while fingers touch something: repetitions, relative error
 _SWEEPS, _TOLERANCE = 50, 1e-5
 #: half the extents of the table [m]
@@ -124,12 +126,14 @@ class RigidBodies:
             self._option.collisionFilter.addBodyNodePairToBlackList(*pair)
         self._touched = np.zeros(len(solids), np.bool_)
         self._pyramid, self._cone = solver.getBoxedLcpSolver(), _cone()
-        groups = [detector.createCollisionGroup() for _ in range(3 + len(solids))]
-        self._of_arms, self._of_fingers, self._others, *self._of_solids = groups
+        groups = [detector.createCollisionGroup() for _ in range(2 + len(solids))]
+        self._of_arms, self._others, *self._of_solids = groups
+        self._of_fingers = [detector.createCollisionGroup() for _ in self.arms.finger_nodes]
         for node in _moving_nodes(self.arms.skeleton):
             self._of_arms.addShapeFrame(node)
-        for node in self.arms.finger_nodes:
-            self._of_fingers.addShapeFrame(node)
+        for group, nodes in zip(self._of_fingers, self.arms.finger_nodes, strict=True):
+            for node in nodes:
+                group.addShapeFrame(node)
         for group, solid in zip(self._of_solids, self._solids, strict=True):
             group.addShapeFramesOf(solid)
         table = _table(settings)
@@ -162,19 +166,23 @@ class RigidBodies:
     def notice_touch(self) -> None:
         """Gives what fingers touch by now the friction of grips, and the rest that of the table.
 
-        So what is gripped holds to fingers and slides on others. While anything is touched,
-        friction is solved as a cone; else as a pyramid along x and y, which is quicker. And pads
-        give way, so that both fingers press on what lies below them; but not on the table.
+        So what is gripped holds to fingers and slides on others. Friction of what is held is
+        solved as a cone, and of all that pads touch; else as a pyramid along x and y, which is
+        quicker, and exact where hard fingers press on what is light. And pads give way, so that
+        both fingers press on what lies below them; but not on the table.
         """
-        touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
+        touches = np.zeros((len(self._of_fingers), len(self._of_solids)), np.bool_)
+        for finger, solid in np.ndindex(touches.shape):
+            touches[finger, solid] = self._of_fingers[finger].collide(self._of_solids[solid])
+        touched = touches.any(0)
         for number in np.flatnonzero(touched != self._touched):
             grip, table = self._settings.grip_friction, self._settings.table_friction
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        if touched.any() != self._touched.any():
-            solver = self._cone if touched.any() else self._pyramid
-            self._world.getConstraintSolver().setBoxedLcpSolver(solver)
+        is_round = touched.any() if self.arms.pads else self._holds(touches)
+        solver = self._cone if is_round else self._pyramid
+        self._world.getConstraintSolver().setBoxedLcpSolver(solver)
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
             is_soft = bool(touched.any()) and not group.collide(self._of_table)
@@ -182,6 +190,11 @@ class RigidBodies:
                 pad.setPosition(0, 0.0)
                 pad.setVelocity(0, 0.0)
             pad.setActuatorType(_FREE if is_soft else _LOCKED)
+
+    def _holds(self, touches: BoolArray) -> bool:
+        """Whether fingers (F,) that touch solids (F, O) hold one between them."""
+        held = (self.arms.is_of_tool @ touches > 1).any(-1)
+        return bool(held.any() and (held & (self.arms.finger_gaps > _GRIP_M)).any())
 
     def step(self, forces: FloatArray) -> None:
         """Goes on by a step with forces (D,) on the arms."""
@@ -238,6 +251,12 @@ class Arms:
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         moves = [followers[name][0] if name in followers else '' for name in names]
         self.fingers = [row for row, source in enumerate(moves) if source in travels]
+        grips = [
+            [moves[row] == tool.gripper_joint for row in self.fingers] for tool in robot.tools
+        ]
+        #: (A, F) 1 where a finger is of a tool
+        self.is_of_tool = np.array(grips, np.float64)
+        self._robot = robot
         self._follows = np.zeros((len(names), len(robot.joint_names)))
         self._offsets = np.zeros(len(names))
         self._stiffness, self._damping = np.zeros(len(names)), np.zeros(len(names))
@@ -273,13 +292,21 @@ class Arms:
                 _add_drive(joint, float(rotors[row]), is_finger=names[row] in self._finger_joints)
 
     @property
-    def finger_nodes(self) -> list[Any]:
-        """Shapes of the fingers."""
-        return [
-            node
-            for node in _moving_nodes(self.skeleton)
-            if node.getBodyNodePtr().getParentJoint().getName() in self._finger_joints
-        ]
+    def finger_nodes(self) -> list[list[Any]]:
+        """Shapes of each of F fingers, those of its pad among them."""
+        moving = _moving_nodes(self.skeleton)
+        own = [{self.skeleton.getDof(row).getName()} for row in self.fingers]
+        for names in own:
+            body = self.skeleton.getJoint(min(names)).getChildBodyNode()
+            names |= {pad.getName() for pad in self.pads if pad.getParentBodyNode() == body}
+        joints = [node.getBodyNodePtr().getParentJoint().getName() for node in moving]
+        pairs = list(zip(joints, moving, strict=True))
+        return [[node for joint, node in pairs if joint in names] for names in own]
+
+    @property
+    def finger_gaps(self) -> FloatArray:
+        """(A,) how far the fingers of each tool are from its middle [m]."""
+        return self._robot.finger_gaps(self.joints[None])[0]
 
     @property
     def finger_drives(self) -> FingerDrives:
