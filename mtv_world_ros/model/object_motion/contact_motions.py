@@ -63,7 +63,7 @@ class ContactMotions:
         solids: O, as found; None = not seen by two views.
         states: K, of all bodies; empty = nothing has moved yet.
         arms: where the arms would be by now if nothing were touched.
-        speeds: (D,) of these arms, in the engine's order.
+        speeds: K of (D,), of these arms, in the engine's order.
         swings: (2, K, F) how far fingers swing off their ways then, and how fast; see
             `FingerDrives`.
         pose: (J,) near which the arms work, that of the first command.
@@ -74,7 +74,7 @@ class ContactMotions:
     solids: tuple[Solid | None, ...]
     states: tuple[BodyState, ...] = ()
     arms: ArmState | None = None
-    speeds: FloatArray | None = None
+    speeds: tuple[FloatArray, ...] = ()
     swings: FloatArray | None = None
     pose: FloatArray | None = None
 
@@ -106,7 +106,7 @@ class ContactMotions:
             begun,
             states=tuple(one.state for one in moved),
             arms=arms,
-            speeds=moved[0].speeds,
+            speeds=tuple(one.speeds for one in moved),
             swings=np.stack([one.swings for one in moved], axis=1),
         )
         motions = BodyMotions(
@@ -143,7 +143,8 @@ class ContactMotions:
         settings, solids = self._disturbed(number)
         bodies = RigidBodies(robot, self.response, solids, settings, _STEP_S, self.pose)
         begin = None if self.swings is None else self.swings[:, number]
-        course, speeds, swings = course_of(bodies.arms, where, self.speeds, begin)
+        first = self.speeds[number] if self.speeds else None
+        course, speeds, swings = course_of(bodies.arms, where, first, begin)
         found = bodies.poses()[:, :3, :3]
         if self.states:
             bodies.state = self.states[number]
