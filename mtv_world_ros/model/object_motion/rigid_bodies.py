@@ -171,9 +171,8 @@ class RigidBodies:
         quicker, and exact where hard fingers press on what is light. And pads give way, so that
         both fingers press on what lies below them; but not on the table.
         """
-        touches = np.zeros((len(self._of_fingers), len(self._of_solids)), np.bool_)
-        for finger, solid in np.ndindex(touches.shape):
-            touches[finger, solid] = self._of_fingers[finger].collide(self._of_solids[solid])
+        found = [[bool(one.collide(other)) for other in self._of_solids] for one in self._of_fingers]
+        touches = np.array(found, np.bool_).reshape(len(self._of_fingers), len(self._of_solids))
         touched = touches.any(0)
         for number in np.flatnonzero(touched != self._touched):
             grip, table = self._settings.grip_friction, self._settings.table_friction
