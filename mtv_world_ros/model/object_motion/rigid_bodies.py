@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import copy
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -171,9 +171,10 @@ class RigidBodies:
         quicker, and exact where hard fingers press on what is light. And pads give way, so that
         both fingers press on what lies below them; but not on the table.
         """
-        found = [[bool(one.collide(other)) for other in self._of_solids] for one in self._of_fingers]
+        pairs = product(self._of_fingers, self._of_solids)
+        found = [bool(finger.collide(solid)) for finger, solid in pairs]
         touches = np.array(found, np.bool_).reshape(len(self._of_fingers), len(self._of_solids))
-        touched = touches.any(0)
+        touched = np.asarray(touches.any(0))
         for number in np.flatnonzero(touched != self._touched):
             grip, table = self._settings.grip_friction, self._settings.table_friction
             body = self._solids[number].getBodyNode(0)
