@@ -9,10 +9,10 @@ Shape letters: J joints, D degrees of freedom of the description, O solids, A to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import copy
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -126,14 +126,12 @@ class RigidBodies:
             self._option.collisionFilter.addBodyNodePairToBlackList(*pair)
         self._touched = np.zeros(len(solids), np.bool_)
         self._pyramid, self._cone = solver.getBoxedLcpSolver(), _cone()
-        groups = [detector.createCollisionGroup() for _ in range(2 + len(solids))]
-        self._of_arms, self._others, *self._of_solids = groups
-        self._of_fingers = [detector.createCollisionGroup() for _ in self.arms.finger_nodes]
-        for node in _moving_nodes(self.arms.skeleton):
-            self._of_arms.addShapeFrame(node)
-        for group, nodes in zip(self._of_fingers, self.arms.finger_nodes, strict=True):
-            for node in nodes:
-                group.addShapeFrame(node)
+        groups = [detector.createCollisionGroup() for _ in range(1 + len(solids))]
+        self._others, *self._of_solids = groups
+        tools = self.arms.finger_nodes
+        self._of_arms = _group(detector, _moving_nodes(self.arms.skeleton))
+        self._of_fingers = _group(detector, chain.from_iterable(chain.from_iterable(tools)))
+        self._of_tools = [[_group(detector, nodes) for nodes in fingers] for fingers in tools]
         for group, solid in zip(self._of_solids, self._solids, strict=True):
             group.addShapeFramesOf(solid)
         table = _table(settings)
@@ -171,16 +169,13 @@ class RigidBodies:
         quicker, and exact where hard fingers press on what is light. And pads give way, so that
         both fingers press on what lies below them; but not on the table.
         """
-        pairs = product(self._of_fingers, self._of_solids)
-        found = [bool(finger.collide(solid)) for finger, solid in pairs]
-        touches = np.array(found, np.bool_).reshape(len(self._of_fingers), len(self._of_solids))
-        touched = np.asarray(touches.any(0))
+        touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
         for number in np.flatnonzero(touched != self._touched):
             grip, table = self._settings.grip_friction, self._settings.table_friction
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        is_round = touched.any() if self.arms.pads else self._holds(touches)
+        is_round = touched.any() and (bool(self.arms.pads) or self._holds(touched))
         solver = self._cone if is_round else self._pyramid
         self._world.getConstraintSolver().setBoxedLcpSolver(solver)
         self._touched = touched
@@ -191,10 +186,14 @@ class RigidBodies:
                 pad.setVelocity(0, 0.0)
             pad.setActuatorType(_FREE if is_soft else _LOCKED)
 
-    def _holds(self, touches: BoolArray) -> bool:
-        """Whether fingers (F,) that touch solids (F, O) hold one between them."""
-        held = (self.arms.is_of_tool @ touches > 1).any(-1)
-        return bool(held.any() and (held & (self.arms.finger_gaps > _GRIP_M)).any())
+    def _holds(self, touched: BoolArray) -> bool:
+        """Whether a tool has one of the touched solids (O,) between its fingers."""
+        tools = zip(self._of_tools, self.arms.finger_gaps, strict=True)
+        wide = [fingers for fingers, gap in tools if gap > _GRIP_M]
+        solids = [self._of_solids[number] for number in np.flatnonzero(touched)]
+        return any(
+            sum(map(solid.collide, fingers)) > 1 for fingers, solid in product(wide, solids)
+        )
 
     def step(self, forces: FloatArray) -> None:
         """Goes on by a step with forces (D,) on the arms."""
@@ -251,11 +250,10 @@ class Arms:
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
         moves = [followers[name][0] if name in followers else '' for name in names]
         self.fingers = [row for row, source in enumerate(moves) if source in travels]
-        grips = [
-            [moves[row] == tool.gripper_joint for row in self.fingers] for tool in robot.tools
+        self._of_tools = [
+            [names[row] for row in self.fingers if moves[row] == tool.gripper_joint]
+            for tool in robot.tools
         ]
-        #: (A, F) 1 where a finger is of a tool
-        self.is_of_tool = np.array(grips, np.float64)
         self._robot = robot
         self._follows = np.zeros((len(names), len(robot.joint_names)))
         self._offsets = np.zeros(len(names))
@@ -292,16 +290,16 @@ class Arms:
                 _add_drive(joint, float(rotors[row]), is_finger=names[row] in self._finger_joints)
 
     @property
-    def finger_nodes(self) -> list[list[Any]]:
-        """Shapes of each of F fingers, those of its pad among them."""
-        moving = _moving_nodes(self.skeleton)
-        own = [{self.skeleton.getDof(row).getName()} for row in self.fingers]
-        for names in own:
-            body = self.skeleton.getJoint(min(names)).getChildBodyNode()
-            names |= {pad.getName() for pad in self.pads if pad.getParentBodyNode() == body}
-        joints = [node.getBodyNodePtr().getParentJoint().getName() for node in moving]
-        pairs = list(zip(joints, moving, strict=True))
-        return [[node for joint, node in pairs if joint in names] for names in own]
+    def finger_nodes(self) -> list[list[list[Any]]]:
+        """Shapes of each finger of each of A tools, those of its pad among them."""
+        pads = {pad.getName() for pad in self.pads}
+        found: dict[str, list[Any]] = {}
+        for node in _moving_nodes(self.skeleton):
+            joint = node.getBodyNodePtr().getParentJoint()
+            if joint.getName() in pads:
+                joint = joint.getParentBodyNode().getParentJoint()
+            found.setdefault(joint.getName(), []).append(node)
+        return [[found.get(name, []) for name in fingers] for fingers in self._of_tools]
 
     @property
     def finger_gaps(self) -> FloatArray:
@@ -400,6 +398,14 @@ def _moving_nodes(arms: Any) -> list[Any]:
     bodies = map(arms.getBodyNode, range(arms.getNumBodyNodes()))
     moving = [body for body in bodies if body.getNumDependentGenCoords()]
     return [body.getShapeNode(k) for body in moving for k in range(body.getNumShapeNodes())]
+
+
+def _group(detector: Any, nodes: Iterable[Any]) -> Any:
+    """Shapes that are asked together what they touch."""
+    group = detector.createCollisionGroup()
+    for node in nodes:
+        group.addShapeFrame(node)
+    return group
 
 
 def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
