@@ -144,6 +144,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-poach-0.1',
         'expert-hop-0.015',
         'expert-hop-0.018',
+        'expert-hunt-0.035',
+        'expert-hunt-0.045',
+        'expert-rock-0.42',
+        'expert-rock-0.48',
+        'expert-waver-0.75',
+        'expert-waver-1',
     ),
     'calibrate': (
         'expert',
@@ -254,22 +260,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-blur-1.2',
         'expert-bind-0.25',
         'expert-bind-0.4',
-    ),
-    'test': (
-        'expert',
         'expert-stretch-0.13',
         'expert-stretch-0.16',
-        'expert-hunt-0.035',
-        'expert-hunt-0.045',
-        'expert-rock-0.42',
-        'expert-rock-0.48',
         'expert-yawn-0.4',
         'expert-yawn-0.55',
-        'expert-waver-0.75',
-        'expert-waver-1',
         'expert-drift-0.01',
         'expert-drift-0.014',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -221,7 +221,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'stretch': _kind(
         'lateral',
-        'test',
+        'calibrate',
         0.15,
         0.3,
         '',
@@ -229,7 +229,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'hunt': _kind(
         'lateral',
-        'test',
+        'train',
         0.04,
         0.1,
         'm',
@@ -259,7 +259,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'rock': _kind(
         'wrist',
-        'test',
+        'train',
         0.45,
         0.6,
         'rad',
@@ -351,7 +351,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'yawn': _kind(
         'opening',
-        'test',
+        'calibrate',
         0.45,
         1.0,
         '',
@@ -640,7 +640,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'waver': _kind(
         'object',
-        'test',
+        'train',
         0.9,
         1.0,
         '',
@@ -826,7 +826,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'drift': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.014,
         0.2,
         'rad/s',
