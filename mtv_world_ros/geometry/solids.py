@@ -28,6 +28,8 @@ _TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
 #: a box must fit by so much better than a cylinder, which has two numbers less
 _BETTER = 0.9
 _MAX_EVALUATIONS = 60
+#: relative step of finite differences
+_DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
 #: words for what is hollow and open at the top
 _VESSEL = re.compile(r'\b(basket|bin|bowl|bucket|cup|dish|glass|jar|mug|plate|pot|tray|vase)s?\b')
 
@@ -91,9 +93,14 @@ def fit_solid(
     def misses(numbers: FloatArray, outline: FloatArray) -> FloatArray:
         corners = _in_space(numbers, outline)
         found = [_reach(project(cameras[view], poses[view], corners)[0]) for view in seen]
-        stands = (numbers[-1] - floor) / _STANDS_M
-        away = np.nan_to_num(np.concatenate(found) - np.concatenate(wanted), nan=1e3)
-        return np.append(away, stands)
+        stands = (numbers[..., -1:] - floor) / _STANDS_M
+        away = np.nan_to_num(np.concatenate(found, -1) - np.concatenate(wanted), nan=1e3)
+        return np.concatenate([away, stands], -1)
+
+    def slopes(numbers: FloatArray, outline: FloatArray) -> FloatArray:
+        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
+        rows = misses(np.concatenate([numbers[None], numbers + np.diag(steps)]), outline)
+        return ((rows[1:] - rows[0]) / steps[:, None]).T
 
     height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
     best = None
@@ -107,6 +114,7 @@ def fit_solid(
             found = least_squares(
                 misses,
                 given,
+                jac=slopes,  # all differences at once: ten times as fast as one by one
                 bounds=(least, np.inf),
                 x_scale=np.where(np.isfinite(least), 0.01, 0.1),
                 loss='soft_l1',
@@ -134,14 +142,14 @@ def _solid(numbers: FloatArray, is_round: bool, error_px: float) -> Solid:
 
 
 def _in_space(numbers: FloatArray, outline: FloatArray) -> FloatArray:
-    """(2 N, 3) the outline (N, 2) at the bottom and the top."""
-    solid = _solid(numbers, len(numbers) == 5, 0.0)
-    cos, sin = np.cos(solid.yaw), np.sin(solid.yaw)
-    flat = (outline * solid.size[:2]) @ np.array([[cos, sin], [-sin, cos]]) + solid.centre[:2]
-    half = solid.size[2] / 2
-    return np.concatenate(
-        [np.c_[flat, np.full(len(flat), solid.centre[2] + z)] for z in (-half, half)]
-    )
+    """(..., 2 N, 3) the outline (N, 2) at the bottom and the top, of numbers (..., 5 or 7)."""
+    x, y, *turn, height, bottom = np.moveaxis(numbers, -1, 0)[..., None]
+    yaw, wide, long = (np.zeros_like(x), *turn * 2) if len(turn) == 1 else turn
+    along, across = wide * outline[:, 0], long * outline[:, 1]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    flat = (x + cos * along - sin * across, y + sin * along + cos * across)
+    ends = [(*flat, np.broadcast_to(z, flat[0].shape)) for z in (bottom, bottom + height)]
+    return np.concatenate([np.stack(end, -1) for end in ends], -2)
 
 
 def _corners(mask: BoolArray) -> FloatArray:
@@ -150,5 +158,5 @@ def _corners(mask: BoolArray) -> FloatArray:
 
 
 def _reach(points: FloatArray) -> FloatArray:
-    """How far points (N, 2) reach along each direction [px]."""
-    return (points @ _DIRECTIONS.T).max(0)
+    """How far points (..., N, 2) reach along each direction [px]."""
+    return (points @ _DIRECTIONS.T).max(-2)
