@@ -145,6 +145,9 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
+    motion = None  # its helpers start while the world model is loaded
+    if loaded.object_motion is not None:
+        motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
@@ -162,9 +165,7 @@ def load_pipeline(
         describer=asked_describer(describer),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
-        object_motion=None
-        if loaded.object_motion is None
-        else load_predictor(loaded.object_motion, model, num_threads or threads_each(1)),
+        object_motion=motion,
     )
 
 

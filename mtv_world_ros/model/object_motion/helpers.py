@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 class Helpers:
-    """Started at the first call; each helps from when it is ready on.
+    """Started by `start` or the first call; each helps from when it is ready on.
 
     Args:
         count: processes beside this one.
@@ -37,6 +37,10 @@ class Helpers:
         self._count, self._lock = count, Lock()
         self._starting: list[_Helper] | None = None
         self._ready: list[_Helper] = []
+
+    def start(self, function: Callable[[Any], Any]) -> None:
+        """Lets the helpers import what a function needs, so that they are ready when jobs come."""
+        self.map(function, ())
 
     def map(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
         """Returns what a function gives for each job, in their order.

@@ -444,9 +444,19 @@ def load_predictor(folder: Path, robot: RobotModel, processes: int = 1) -> Objec
         members.append(Member(network=load_network(each), response=response))
     helpers = None
     if contact is not None:
-        _check_contact(contact, robot, members[0].response, folder)
+        from mtv_world_ros.model.object_motion.contact_motions import check_robot
+
         count = min(processes, contact.num_motions) - 1
-        helpers = Helpers(count) if count > 0 else None
+        if count > 0:
+            helpers = Helpers(count)
+            helpers.start(check_robot)
+        response = members[0].response
+        if response is None:
+            raise CheckpointError(
+                f"'{folder / CONTACT_FILE}' asks for rigid bodies, but '{_RESPONSE}' beside it is "
+                "missing; run 'mtv-world train-motion'"
+            )
+        check_robot(contact, robot, response)
     return ObjectMotionPredictor(members, robot, contact, helpers=helpers)
 
 
@@ -470,19 +480,6 @@ def load_contact(folder: Path) -> ContactSettings | None:
     except (OSError, ValueError) as error:
         raise CheckpointError(f"'{file}' cannot be used: {error}; fit it anew") from error
     return validated(ContactSettings, values, f"'{file}'", error=CheckpointError)
-
-
-def _check_contact(
-    contact: ContactSettings, robot: RobotModel, response: ArmResponse | None, folder: Path
-) -> None:
-    from mtv_world_ros.model.object_motion.contact_motions import check_robot
-
-    if response is None:
-        raise CheckpointError(
-            f"'{folder / CONTACT_FILE}' asks for rigid bodies, but '{_RESPONSE}' beside it is "
-            "missing; run 'mtv-world train-motion'"
-        )
-    check_robot(contact, robot, response)
 
 
 def num_features(num_views: int) -> int:
