@@ -74,6 +74,8 @@ class Calibration(Weights):
     Attributes:
         observed: for frames that were seen, not imagined, of the same episodes; None = as for
             those that are imagined.
+        unforeseen: for imagined frames where no motion is foreseen, as of a rollout that begins
+            in mid-episode; None = as where some are.
         segmenter: that found the masks.
         tasks: that it was fitted on.
         num_episodes: that it was fitted on.
@@ -84,6 +86,7 @@ class Calibration(Weights):
     """
 
     observed: Weights | None = None
+    unforeseen: Weights | None = None
     segmenter: str
     tasks: ListOf[str]
     num_episodes: int
@@ -92,9 +95,10 @@ class Calibration(Weights):
     scores: Mapping[str, Mapping[str, Any]] = {}
     made: Mapping[str, str] = {}
 
-    def given(self, is_real: bool) -> Weights:
-        """Returns the weights for frames that are real, or imagined."""
-        return (self.observed or self) if is_real else self
+    def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
+        """Returns the weights for frames that are real, or imagined with motions foreseen."""
+        special = self.observed if is_real else None if is_foreseen else self.unforeseen
+        return special or self
 
     def objection(self, task: str, segmenter: str) -> str:
         """Returns why it does not apply to a task and a segmenter; empty = it applies."""

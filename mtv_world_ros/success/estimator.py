@@ -169,7 +169,9 @@ class SuccessEstimator:
         features['foreseen'] = foreseen_feature(ends)
         features['released'] = _released(task, views.footage.openings)
         basis = self._objection(task)
-        weights = None if basis or self.calibration is None else self.calibration.given(is_real)
+        weights = None
+        if self.calibration is not None and not basis:
+            weights = self.calibration.given(is_real, ends is not None)
         probability = weights.probability if weights else stated_probability
         margins = [features['margin'] + shift for shift in (-spread, 0.0, spread)]
         if evidence.worst is None:  # between the worst and the best that pictures could show

@@ -227,6 +227,18 @@ def test_frames_that_were_seen_have_weights_of_their_own():
         assert estimator.estimate(shown, LEFT).estimate.probability == 0.5
 
 
+def test_where_nothing_is_foreseen_weights_are_others():
+    alone = Weights(features=('margin',), means=(1.0,), scales=(2.0,), weights=(0.0,), bias=2.0)
+    calibration = CALIBRATION.replace(unforeseen=alone)
+    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
+    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    tasks = load_tasks(share_path('config', 'tasks'))
+    estimator = SuccessEstimator(tasks, calibration=calibration, segmenter=Named('colour'))
+    found = estimator.estimate(shown, LEFT).estimate
+    assert found.probability == pytest.approx(1 / (1 + np.exp(-2)))
+    assert estimator.estimate(shown, LEFT, is_real=True).estimate.probability == 0.5
+
+
 @pytest.mark.parametrize(
     ('views', 'word'), [(('low',), 'not used by the task'), (('top',), 'top')]
 )

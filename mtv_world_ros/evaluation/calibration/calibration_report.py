@@ -16,6 +16,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
     FITTED,
     OBSERVED,
     Sample,
+    UNFORESEEN,
 )
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.evaluation.report.charts import reliability_chart
@@ -38,6 +39,7 @@ _ROWS = {
     AFTER: 'after: each task left out of the fit',
     AFTER_KINDS: 'after: each fault kind left out of the fit',
     OBSERVED: 'the recorded frames, each kind or task left out of a fit to them',
+    UNFORESEEN: 'imagined frames alone, each kind or task left out of a fit to them',
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }
@@ -63,17 +65,18 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
         for name, words in _ROWS.items()
         if name in calibration.scores
     ]
-    observed = calibration.observed
+    weights = {
+        'Weights': calibration,
+        'Weights for frames that were seen': calibration.observed,
+        'Weights where no motion is foreseen': calibration.unforeseen,
+    }
     return render(
         'calibration.md.j2',
         summary=_summary(found),
         scores=Table(head=['', *_COLUMNS.values()], rows=scores),
         tasks=_groups(found, AFTER, 'task', lambda sample: (sample.task,)),
         kinds=_kinds(found),
-        weights=_weights(calibration),
-        bias=calibration.bias,
-        observed=observed and _weights(observed),
-        observed_bias=observed and observed.bias,
+        weights={title: (_weights(w), w.bias) for title, w in weights.items() if w},
         horizon='' if horizon is None else _horizon_text(horizon),
         made=calibration.made,
     )

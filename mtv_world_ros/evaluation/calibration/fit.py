@@ -25,7 +25,7 @@ MIN_EPISODES = 8
 MAX_BIAS = 30.0
 #: what the scores are called, in the order of the tables
 BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
-OBSERVED = 'observed'
+OBSERVED, UNFORESEEN = 'observed', 'unforeseen'
 ALWAYS = 'always success'
 
 
@@ -59,6 +59,15 @@ class Sample:
         """The same with the recorded frames in place of the imagined ones."""
         return replace(self, features=(self.observed,))
 
+    @property
+    def as_unforeseen(self) -> Sample:
+        """The same with nothing foreseen; empty where pictures do not tell."""
+        told = [isfinite(features.get('margin', nan)) for features in self.features]
+        pairs = zip(self.features, told, strict=True)
+        return replace(
+            self, features=tuple({**f, 'foreseen': nan} if tells else {} for f, tells in pairs)
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibrated:
@@ -70,7 +79,8 @@ class Calibrated:
         judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
             `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
             only where there are faults), `OBSERVED` (the same of the recorded frames, by a fit to
-            them), `FITTED` (on what it was fitted on: too good) -> one per sample.
+            them), `UNFORESEEN` (of imagined ones alone, by a fit to them), `FITTED` (on what it
+            was fitted on: too good) -> one per sample.
     """
 
     calibration: Calibration
@@ -138,12 +148,16 @@ def calibrate(
     if any(sample.kinds for sample in samples):
         groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
         judgements[AFTER_KINDS] = _left_out(samples, groups, segmenter, l2)
-    seen, observed = [sample.as_observed for sample in samples], None
-    if _tells(seen):
-        observed = Weights(**_weights(seen, l2))
-        judgements[OBSERVED] = _left_out(seen, groups, segmenter, l2)
+    special: dict[str, Weights] = {}
+    for name, others in (
+        (OBSERVED, [sample.as_observed for sample in samples]),
+        (UNFORESEEN, [sample.as_unforeseen for sample in samples]),
+    ):
+        if _tells(others):
+            special[name] = Weights(**_weights(others, l2))
+            judgements[name] = _left_out(others, groups, segmenter, l2)
     scores = {name: agreement(found) for name, found in judgements.items()}
-    calibration = Calibration(**fitted, observed=observed, scores=scores, made=dict(made or {}))
+    calibration = Calibration(**fitted, **special, scores=scores, made=dict(made or {}))
     return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 import json
-from math import nan
+from math import isnan, nan
 import re
 
 import numpy as np
@@ -24,6 +24,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
     FITTED,
     OBSERVED,
     Sample,
+    UNFORESEEN,
 )
 from mtv_world_ros.evaluation.metrics.success_agreement import (
     agreement,
@@ -284,6 +285,25 @@ def test_recorded_frames_are_fitted_by_themselves():
     text = markdown(found, None)
     assert '| the recorded frames, each kind or task left out of a fit to them |' in text
     assert '## Weights for frames that were seen' in text
+
+
+def test_where_nothing_is_foreseen_pictures_are_fitted_alone():
+    rng, foreseen, samples = np.random.default_rng(3), [], made_samples()
+    for sample in samples:
+        said = (1.0 if sample.success else -1.0) * (rng.random() < 0.95)
+        features = tuple({**f, 'foreseen': said} if f else f for f in sample.features)
+        foreseen.append(replace(sample, features=features))
+    # where pictures do not tell, motions alone say nothing about pictures
+    foreseen[0] = replace(foreseen[0], features=({'margin': nan, 'foreseen': 1.0},))
+    found = calibrate(foreseen, segmenter='colour')
+    alone = calibrate(samples[1:], segmenter='colour').calibration
+    assert found.calibration.given(False, False).weights == pytest.approx(alone.weights)
+    assert found.calibration.given(False, True).weights != pytest.approx(alone.weights)
+    assert isnan(found.judgements[UNFORESEEN][0].probability)
+    assert found.calibration.given(True, False) == found.calibration.given(True)
+    scores = found.calibration.scores
+    assert scores[UNFORESEEN]['num_abstained'] == scores[FITTED]['num_abstained'] + 1
+    assert '## Weights where no motion is foreseen' in markdown(found, None)
 
 
 def test_task_that_is_all_there_is_cannot_be_left_out():
