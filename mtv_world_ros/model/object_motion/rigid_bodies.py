@@ -165,9 +165,9 @@ class RigidBodies:
         """Gives what fingers touch by now the friction of grips, and the rest that of the table.
 
         So what is gripped holds to fingers and slides on others. Friction of what is held is
-        solved as a cone, and of all that pads touch; else as a pyramid along x and y, which is
-        quicker, and exact where hard fingers press on what is light. And pads give way, so that
-        both fingers press on what lies below them; but not on the table.
+        solved as a cone; else as a pyramid along x and y, which is quicker, and exact where
+        fingers press on what is light. And pads give way, so that both fingers press on what lies
+        below them; but not on the table.
         """
         touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
         for number in np.flatnonzero(touched != self._touched):
@@ -175,8 +175,7 @@ class RigidBodies:
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        is_round = touched.any() and (bool(self.arms.pads) or self._holds(touched))
-        solver = self._cone if is_round else self._pyramid
+        solver = self._cone if self._holds(touched) else self._pyramid
         self._world.getConstraintSolver().setBoxedLcpSolver(solver)
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
