@@ -12,7 +12,7 @@ from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
-from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
+from mtv_world_ros.sim.expert.way_points import Pull, WayPoint, WayPointFaults
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.sim.world.placement import side_of
@@ -256,11 +256,11 @@ class Expert:
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = usual = self._stops(pick, move, now, goal, rng)
             crowds: dict[str, float] = {}
-            poached = 0.0
+            poached, pulls = 0.0, list[Pull]()
             if faults is not None and number == faults.move_of(len(task.moves)):
                 objects = [np.asarray(item.position) for item in now.values()]
                 stops, crowds = faults.applied(stops, pick.yaw, objects), faults.crowds
-                poached = faults.poached
+                poached, pulls = faults.poached, faults.pulls(stops, objects)
                 usual = usual if faults.keeps_tempo else stops
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
             rows = self._follow(pick.arm, stops, pace)
@@ -277,6 +277,11 @@ class Expert:
             ]
             if poached and others:
                 comes.append(self._poach(pick.arm, others[0], stops, poached, pace))
+            comes += [
+                self._pull(pick.arm, other, stops, pull, pace)
+                for other in others[:1]
+                for pull in pulls
+            ]
             for rows, before in comes:
                 first = max(start + before, free.get(others[0], 1))
                 free[others[0]] = first + len(rows)
@@ -457,6 +462,38 @@ class Expert:
         rows, _ = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         leaves = sum(self._timed(stops[: met + 2], self.workcell.home_tools[arm]))
         return rows, round(leaves * pace[0] / pace[1] * self._config.rate_hz)
+
+    def _pull(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        pull: Pull,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that closes on something and pulls, and how late they begin.
+
+        Where it does not reach so far, it closes nearer to where it rests.
+        """
+        home, flat = self.workcell.home_tools[other], np.array([1, 1, 0])
+        rise, config = _rise(pull.rise), self._config
+
+        def ways(share: float) -> list[WayPoint]:
+            short = (1 - share) * (home - pull.position) * flat
+            down = WayPoint('above', pull.position + short, 0.0, 1.0)
+            back = (home - down.position) * flat
+            way = pull.size * back / max(float(np.linalg.norm(back)), pull.size)
+            shut = replace(down, opening=0.0, seconds=config.close_s)
+            pulled = replace(shut, seconds=None).moved(way)
+            opened = replace(pulled, opening=1.0, seconds=config.open_s)
+            left = replace(opened, seconds=None).moved(rise)
+            rest = WayPoint('home', home, 0.0, 1.0)
+            return [down.moved(rise), down, shut, pulled, opened, left, rest]
+
+        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
+        begins = (arrives - sum(self._timed(done[:3], home))) * pace[0] / pace[1]
+        return rows, max(round(begins * config.rate_hz), 0)
 
     def _as_far_as_it_reaches(
         self,

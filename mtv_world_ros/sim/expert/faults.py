@@ -138,6 +138,22 @@ FAULTS: Mapping[str, FaultKind] = {
         's',
         'all commands are the mean of those of now and of a while ago, up to this long',
     ),
+    'lapse': _kind(
+        'timing',
+        'test',
+        0.35,
+        2.0,
+        's',
+        'steps of the arms over this time are lost, once, and never made up for',
+    ),
+    'restart': _kind(
+        'timing',
+        'test',
+        0.9,
+        1.0,
+        '',
+        'share of the plan up to which it starts all over, once',
+    ),
     # height
     'high': _kind('height', 'train', 0.02, 0.1, 'm', 'a grasp closes this much too high'),
     'dive': _kind(
@@ -175,6 +191,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.5,
         '',
         'share of how far it reaches out by which the arm hangs too low',
+    ),
+    'droop': _kind(
+        'height',
+        'test',
+        0.45,
+        1.0,
+        '',
+        'share of how far it has carried the object by which the arm hangs too low',
     ),
     # lateral
     'shift': _kind(
@@ -599,6 +623,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'rad',
         'shut fingers press on the object, off its middle, and go round that by this angle',
     ),
+    'tug': _kind(
+        'collision',
+        'test',
+        0.04,
+        0.12,
+        'm',
+        'over the goal, the other arm closes on what this one holds, and pulls it this far',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -645,6 +677,14 @@ FAULTS: Mapping[str, FaultKind] = {
         1.0,
         '',
         'share of the way to the next object that it goes, down at its own, and comes back',
+    ),
+    'budge': _kind(
+        'object',
+        'test',
+        0.015,
+        0.12,
+        'm',
+        'meanwhile the other arm takes what is next to the goal and moves it this far',
     ),
     'place': _kind(
         'place',
@@ -831,6 +871,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.2,
         'rad/s',
         'standard deviation of how fast every arm joint drifts off',
+    ),
+    'warp': _kind(
+        'joint',
+        'test',
+        0.05,
+        0.5,
+        'rad',
+        'every arm joint is off by a wave over its angle, with this amplitude',
     ),
     # regrasp
     'retry': _kind(
@@ -1078,6 +1126,10 @@ def _near(name: str) -> str:
 _NOISE_KNOT_S = 0.5
 #: time in which an arm goes back to where it repeats its commands from [s]
 _BACK_S = 0.4
+#: time in which the robot goes back to where it rests, and starts all over [s]
+_RESTART_S = 0.8
+#: periods of a wavy error over one turn of a joint
+_NUM_WAVES = 4
 #: time in which a constant error sets in [s]
 _SET_IN_S = 1.0
 #: how often commands are lost
@@ -1104,7 +1156,7 @@ _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
-_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival', 'poach')
+_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival', 'poach', 'budge', 'tug')
 #: kinds of what a gripper does
 _OF_GRIPPERS = (
     'starve',
@@ -1148,6 +1200,9 @@ _OF_GRIPPERS = (
     'rock',
     'yawn',
     'waver',
+    'droop',
+    'budge',
+    'tug',
 )
 #: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
 #: one command to the next, both as shares of its range; how much faster they go back
@@ -1344,7 +1399,10 @@ def _out_of_time(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T', J): chunks in the wrong order; chunks, joints or grippers off their time."""
+    """(T', J): all starts over; chunks in the wrong order; chunks, joints or grippers off time."""
+    if variant.size('restart'):
+        share = variant.size('restart') * _own(rng).uniform()
+        positions = _restart(positions, float(share), round(_RESTART_S / period))
     if variant.size('shuffle'):
         share, num = _own(rng).uniform(), round(variant.size('shuffle') / period)
         positions = _shuffle(positions, float(share), num, period)
@@ -1404,7 +1462,16 @@ def _off_course(
     period: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(T, J): away from the commands for a while, within the joints' limits."""
+    """(T, J): away from the commands for a while or for good, within the joints' limits."""
+    if variant.size('lapse'):
+        share = _own(rng).uniform(*_BRAKES)
+        positions = _lapse(
+            positions, grippers, float(share), round(variant.size('lapse') / period)
+        )
+        positions = np.clip(positions, robot.lower, robot.upper)
+    if variant.size('warp'):
+        positions = _warp(positions, grippers, variant.size('warp'), _own(rng))
+        positions = np.clip(positions, robot.lower, robot.upper)
     if variant.size('swap'):
         share = _own(rng).uniform(0.1, 0.9)
         weights = variant.size('swap') * _swap_weights(len(positions), float(share), period)
@@ -1576,6 +1643,24 @@ def _skip(positions: FloatArray, share: float, num: int, period: float) -> Float
     blend = (np.arange(1, jump + 1) / jump)[:, None]
     rest[:jump] = (1 - blend) * positions[begin - 1] + blend * rest[:jump]
     return np.concatenate([positions[:begin], rest])
+
+
+def _lapse(positions: FloatArray, grippers: list[int], share: float, num: int) -> FloatArray:
+    """(T, J): at a share of the plan, `num` steps of the arms are lost, which are off since."""
+    steps, begin = np.diff(positions, axis=0), int(share * len(positions))
+    lost = np.zeros_like(positions)
+    lost[begin + 1 : begin + 1 + num] = steps[begin : begin + num]
+    whole = positions - np.cumsum(lost, axis=0)
+    whole[:, grippers] = positions[:, grippers]
+    return whole
+
+
+def _restart(positions: FloatArray, share: float, num: int) -> FloatArray:
+    """(T', J): at a share of the plan, it goes back in `num` samples, and carries it all out."""
+    end = 1 + int(share * (len(positions) - 1))
+    blend = (np.arange(1, num + 1) / num)[:, None]
+    back = (1 - blend) * positions[end - 1] + blend * positions[0]
+    return np.concatenate([positions[:end], back, positions[1:]])
 
 
 def _shuffle(positions: FloatArray, share: float, num: int, period: float) -> FloatArray:
@@ -1908,6 +1993,16 @@ def _tow(
     whole, ways = positions.copy(), share * (positions - positions[0])
     for arm in np.delete(np.arange(positions.shape[1]), grippers).reshape(num_arms, -1):
         whole[:, arm[1:]] += ways[:, arm[:-1]] * rng.choice((-1.0, 1.0), len(arm) - 1)
+    return whole
+
+
+def _warp(
+    positions: FloatArray, grippers: list[int], amplitude: float, rng: np.random.Generator
+) -> FloatArray:
+    """(T, J): an arm joint is off by a wave over its angle; the plan begins where the arms are."""
+    waves = np.sin(_NUM_WAVES * positions + rng.uniform(0.0, 2 * np.pi, positions.shape[1]))
+    whole = positions + amplitude * (waves - waves[0])
+    whole[:, grippers] = positions[:, grippers]
     return whole
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -135,6 +136,8 @@ _CRANK_M, _NUM_CRANK = 0.02, 5
 _HOPS, _HOP_RISE_M = (0.2, 0.4), 0.04
 #: on its way down it swings from side to side: how often, and time of a stroke [s]
 _NUM_HUNTS, _HUNT_S = 5, 0.25
+#: from how high above another arm comes for what is next to the goal [m]
+_BUDGE_RISE_M = 0.07
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +166,23 @@ class WayPoint:
 
 
 Stops = list[WayPoint]
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """What another arm closes on, pulls towards where it rests itself, and lets go.
+
+    Attributes:
+        position: (3,) where it closes [m].
+        rise: from how high above it comes, and how far it rises again [m].
+        before: number of this arm's way points that are done by then.
+        size: how far it pulls [m].
+    """
+
+    position: FloatArray
+    rise: float
+    before: int
+    size: float
 
 
 class WayPointFaults:
@@ -199,6 +219,25 @@ class WayPointFaults:
     def poached(self) -> float:
         """How far another arm carries away what this one has let go [m]; 0 = it does not."""
         return self._variant.size('poach')
+
+    def pulls(self, stops: Stops, objects: Sequence[FloatArray]) -> list[Pull]:
+        """Returns what another arm pulls at meanwhile.
+
+        Args:
+            stops: way points of the move, with its faults.
+            objects: (3,) centre of every object of the scene [m].
+        """
+        closed, opened = _first(stops, 'close'), _first(stops, 'open')
+        own, goal = stops[closed].position, stops[opened].position
+        others = [p for p in objects if np.linalg.norm((p - own)[:2]) > _VISIT_TO_M[1]]
+        near = min(others, key=lambda p: np.linalg.norm((p - goal)[:2]), default=own)
+        # the way point before the last way down
+        over = max(opened - 2, 0)
+        pulls = [
+            Pull(near, _BUDGE_RISE_M, closed + 1, self._variant.size('budge')),
+            Pull(stops[over].position, 0.0, over + 1, self._variant.size('tug')),
+        ]
+        return [pull for pull in pulls if pull.size]
 
     def move_of(self, num_moves: int) -> int:
         """Returns the number of the move that goes wrong."""
@@ -1224,6 +1263,17 @@ def _waver(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:first], away, grasp, *stops[first:]]
 
 
+def _droop(stops: Stops, size: float, side: _Side) -> Stops:
+    """The farther it has carried the object, the lower it hangs, until it has let go."""
+    lift, end = _first(stops, 'lift'), _first(stops, 'open') + 1
+    gone = 0.0
+    held: Stops = []
+    for before, stop in pairwise(stops[lift - 1 : end]):
+        gone += float(np.linalg.norm((stop.position - before.position)[:2]))
+        held.append(stop.moved(_up(-size * gone)))
+    return [*stops[:lift], *held, *stops[end:]]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1333,4 +1383,5 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'rock': _rock,
     'yawn': _yawn,
     'waver': _waver,
+    'droop': _droop,
 }

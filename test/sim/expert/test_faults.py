@@ -214,7 +214,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    for kind in ('mirror', 'swap', 'crowd', 'rival', 'poach'):
+    for kind in ('mirror', 'swap', 'crowd', 'rival', 'poach', 'tug', 'budge'):
         variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
             with_faults(one, variant, franka, np.random.default_rng(0))
@@ -264,6 +264,9 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'rock',
         'yawn',
         'waver',
+        'droop',
+        'tug',
+        'budge',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1264,6 +1267,97 @@ def test_down_at_the_object_it_goes_towards_another_one_and_comes_back():
     np.testing.assert_array_equal(alone[2].position, own)
 
 
+def test_arms_that_lose_steps_are_off_by_them_from_there_on(expert):
+    expert_plan, lapse = plan(expert, 'expert'), plan(expert, 'expert-lapse-1')
+    arms = arm_columns(expert)
+    error = lapse - expert_plan
+    assert np.abs(np.delete(error, arms, axis=1)).max() == 0
+    lost = np.flatnonzero(np.abs(np.diff(error, axis=0)).max(axis=1) > 1e-9)
+    # the 50 steps that are lost, but for some in which the arms rest
+    assert 25 < np.ptp(lost) < 50
+    first, end = int(lost[0]), int(lost[-1]) + 1
+    np.testing.assert_array_equal(error[: first + 1], 0.0)
+    stands = lapse[first : end + 1, arms]
+    np.testing.assert_allclose(stands, np.broadcast_to(stands[0], stands.shape), atol=1e-9)
+    missed = (expert_plan[first] - expert_plan[end])[arms]
+    assert np.abs(missed).max() > 0.05
+    rest = error[end:, arms]
+    np.testing.assert_allclose(rest, np.broadcast_to(missed, rest.shape), atol=1e-9)
+
+
+def test_once_it_goes_back_to_its_beginning_and_carries_all_of_it_out(expert):
+    expert_plan, restart = plan(expert, 'expert'), plan(expert, 'expert-restart-0.9')
+    num = len(expert_plan)
+    first = len(restart) - num - 39
+    # up to there, back in 40 samples, and all of it
+    assert 0 < first <= 0.9 * num + 1
+    np.testing.assert_array_equal(restart[:first], expert_plan[:first])
+    np.testing.assert_allclose(restart[-num:], expert_plan, atol=1e-12)
+    back = restart[first - 1 : first + 40]
+    steps = np.diff(back, axis=0)
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-12)
+    assert np.abs(steps).max() > 1e-3
+    assert plan(expert, 'expert-restart-0.45').shape[0] < len(restart)
+
+
+def test_the_farther_it_carries_the_object_the_lower_it_hangs():
+    stops, changed = changed_stops('expert-droop-0.3')
+    assert changed[:3] == stops[:3] and changed[7:] == stops[7:]
+    ways = [now.position - then.position for then, now in zip(stops, changed, strict=True)]
+    # it is carried by 0.2 m between the lift and the way point over its goal
+    np.testing.assert_allclose(ways[3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(ways[4:7], [[0, 0, -0.06]] * 3, atol=1e-12)
+
+
+def test_the_other_arm_pulls_at_what_is_carried_or_lies_next_to_the_goal():
+    stops, _ = changed_stops('expert')
+    own, goal = stops[1].position, stops[5].position
+    objects = [own, goal + [0, 0.03, -0.02], goal + [0, 0.3, 0]]
+    pulls = {}
+    for name in ('expert-budge-0.02', 'expert-tug-0.05'):
+        faults = WayPointFaults(parse_variant(name), np.random.default_rng(0))
+        (pulls[name],) = faults.pulls(stops, objects)
+    budge, tug = pulls.values()
+    np.testing.assert_array_equal(budge.position, objects[1])
+    assert (budge.before, budge.size) == (3, 0.02) and budge.rise > 0.05
+    np.testing.assert_array_equal(tug.position, stops[4].position)
+    assert (tug.before, tug.size, tug.rise) == (5, 0.05, 0.0)
+    assert WayPointFaults(PolicyVariant(), np.random.default_rng(0)).pulls(stops, objects) == []
+
+
+@pytest.mark.parametrize(('kind', 'size'), [('budge', 0.03), ('tug', 0.05)])
+def test_the_other_arm_closes_pulls_towards_its_rest_and_lets_go(expert, kind, size):
+    expert_plan, pulled = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
+    num, openings = len(expert_plan), expert.robot.gripper_openings(pulled)
+    used = int(np.argmax(np.ptp(expert.robot.gripper_openings(expert_plan), axis=1)))
+    own, other = (half if used == 0 else 1 - half for half in (0, 1))
+    halves = [np.split(positions, 2, axis=1) for positions in (expert_plan, pulled)]
+    np.testing.assert_array_equal(halves[1][own][:num], halves[0][own])
+    tools = expert.robot.tool_poses(pulled)[other][:, :3, 3]
+    shut = np.flatnonzero(openings[other] < 1e-3)
+    way = tools[shut[-1]] - tools[shut[0]]
+    assert np.linalg.norm(way) == pytest.approx(size, abs=2e-3)
+    assert way @ (tools[0] - tools[shut[0]]) > 0 and openings[other][-1] == pytest.approx(1)
+    # while this arm holds its object
+    held = np.flatnonzero(openings[own] < 1e-3)
+    assert held[0] - 10 <= shut[0] <= held[-1]
+
+
+def test_joints_are_off_by_a_wave_over_their_angle(expert):
+    expert_plan, warp = plan(expert, 'expert'), plan(expert, 'expert-warp-0.02')
+    arms = arm_columns(expert)
+    error = warp - expert_plan
+    assert np.abs(np.delete(error, arms, axis=1)).max() == 0 and np.abs(error[0]).max() == 0
+    moves = [j for j in arms if np.ptp(expert_plan[:, j]) > 0.2]
+    assert len(moves) >= 3
+    for joint in moves:
+        angle = 4 * expert_plan[:, joint]
+        waves = np.stack([np.sin(angle), np.cos(angle), np.ones_like(angle)], axis=1)
+        found, *_ = np.linalg.lstsq(waves, error[:, joint], rcond=None)
+        np.testing.assert_allclose(waves @ found, error[:, joint], atol=1e-9)
+        assert np.hypot(*found[:2]) == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [
@@ -1498,6 +1592,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'yawn',
         'waver',
         'drift',
+        'lapse',
+        'restart',
+        'droop',
+        'tug',
+        'budge',
+        'warp',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1604,9 +1704,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-hunt-0.03' has hunt"
+    said = r"split test are not for training: 'expert-high-0.1-droop-0.03' has droop"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-hunt-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-droop-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
