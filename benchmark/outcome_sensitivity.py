@@ -9,7 +9,9 @@ in scenes whose objects lie a little elsewhere and are turned a little (`noise`:
 plane); in the same scene from the published trajectories alone, ten points a second with cubics
 between them (`points`); and with both. `agrees`: the share that end as the undisturbed episode
 does. `within 2 cm`: the share of the objects that moved whose way ends within 2 cm of where it
-did. No world model that is given just this can do better on average.
+did. `flips`: of the episodes whose outcome is not that of the expert in the same scene, the share
+whose disturbed objects end nearer to where the undisturbed ones do than to where they do under the
+expert. No world model that is given just this can do better on average.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from mtv_world_ros.geometry.robot_file import load_robot
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.sim.expert.expert import Expert
+from mtv_world_ros.sim.expert.faults import EXPERT
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.sim.world.scene import Scene
@@ -52,6 +55,7 @@ HEAD = (
     'failures that succeed now',
     'median shift [mm]',
     'within 2 cm',
+    'flips',
 )
 
 
@@ -63,11 +67,13 @@ class Counts:
         succeeded: the undisturbed episode did.
         agrees: the disturbed one ended likewise.
         shifts: how far from where they did the ways of objects that moved ended [m].
+        flips: of episodes that do not end as the expert's: is it told from that.
     """
 
     succeeded: list[bool] = field(default_factory=list)
     agrees: list[bool] = field(default_factory=list)
     shifts: list[float] = field(default_factory=list)
+    flips: list[bool] = field(default_factory=list)
 
     def row(self) -> list[str]:
         """Returns the cells of the table."""
@@ -81,6 +87,7 @@ class Counts:
             _share(~agrees[failed]),
             f'{1e3 * np.median(shifts):.1f}' if len(shifts) else '-',
             _share(shifts < 0.02),
+            _share(np.array(self.flips)),
         ]
 
 
@@ -122,6 +129,9 @@ def main() -> None:
             continue
         scene, plan = sim.scene, policy.plan
         undisturbed = _take(sim, scene, info.task, plan)
+        right = scripted_policy(EXPERT, info.task, seed, expert)
+        right.reset(seed=seed)
+        expected = _take(sim, scene, info.task, right.plan)
         for _ in range(options.repeats):
             other = _disturbed(scene, options.noise_mm / 1e3, rng)
             for given, there, commands in (
@@ -131,7 +141,7 @@ def main() -> None:
             ):
                 take = _take(sim, there, info.task, commands)
                 for kind in {*name.split('-')[1::2], 'all'}:
-                    _add(counts[kind, given], undisturbed, take)
+                    _add(counts[kind, given], undisturbed, take, expected)
         sim.close()
     kinds = sorted({kind for kind, _ in counts}, key=lambda kind: (kind == 'all', kind))
     rows = [
@@ -174,11 +184,16 @@ def _take(sim: SimEpisode, scene: Scene, name: str, commands: JointTrajectory) -
     return carry_out(sim, task, commands, sim.load(scene, task), _CONFIG)
 
 
-def _add(counts: Counts, undisturbed: Take, take: Take) -> None:
-    succeeded = undisturbed.ever and undisturbed.final
+def _add(counts: Counts, undisturbed: Take, take: Take, expected: Take) -> None:
+    succeeded, other_succeeded, expert_succeeded = (
+        each.ever and each.final for each in (undisturbed, take, expected)
+    )
     counts.succeeded.append(succeeded)
-    counts.agrees.append((take.ever and take.final) == succeeded)
-    way, other = (_ways(each) for each in (undisturbed, take))
+    counts.agrees.append(other_succeeded == succeeded)
+    way, other, right = (_ways(each) for each in (undisturbed, take, expected))
+    if succeeded != expert_succeeded:
+        off, to_expert = (np.linalg.norm(other - each) for each in (way, right))
+        counts.flips.append(bool(off < to_expert))
     shifts = np.linalg.norm(other - way, axis=-1)
     counts.shifts += shifts[np.linalg.norm(way, axis=-1) > _MOVED_M].tolist()
 
