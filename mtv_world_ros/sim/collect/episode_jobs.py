@@ -85,7 +85,8 @@ def jobs_of(
         seed: of the data set.
         out: its folder.
         num_of_ten: how many of ten grasps of the expert miss.
-        policies: scripted policies that take turns in every task; none = the expert.
+        policies: scripted policies that take turns in every task, where each task begins further
+            down the list, so that many policies all come up in few episodes; none = the expert.
 
     Raises:
         SimulatorError: not 0 to 10 of ten episodes are to miss.
@@ -101,7 +102,10 @@ def jobs_of(
     ]
     if not policies:
         return jobs
-    return [replace(job, miss=False, policy=policies[job.index % len(policies)]) for job in jobs]
+    count = len(policies)
+    first = {task.name: number * count // len(tasks) for number, task in enumerate(tasks)}
+    turns = [policies[(first[job.task] + job.index) % count] for job in jobs]
+    return [replace(job, miss=False, policy=turn) for job, turn in zip(jobs, turns, strict=True)]
 
 
 def zero_shot_jobs(

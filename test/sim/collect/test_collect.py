@@ -80,7 +80,8 @@ def test_policies_take_turns_and_whatever_comes_of_it_is_kept(tmp_path):
         metadata = read_info(tmp_path / entry.name).metadata
         said[entry.name] = (metadata['policy'], entry.outcome)
         assert entry.attempt == 0 or entry.outcome == 'success'
-    assert [name for name, _ in said.values()] == ['expert-stop-0'] * 2 + ['expert-late-0.2'] * 2
+    turns = ['expert-stop-0', 'expert-late-0.2', 'expert-late-0.2', 'expert-stop-0']
+    assert [name for name, _ in said.values()] == turns
     stood = [outcome for name, outcome in said.values() if name == 'expert-stop-0']
     assert stood == ['failure'] * 2  # the arms never move
     still = read_episode(tmp_path / 'stack_blocks_two_00000').joint_states.positions
@@ -297,6 +298,18 @@ def test_so_many_of_ten_episodes_of_a_task_are_to_miss(tmp_path, num):
     for task in tasks:
         missed = [job.miss for job in jobs if job.task == task.name]
         assert sum(missed[:10]) == sum(missed[10:]) == num
+
+
+def test_many_policies_come_up_in_few_episodes_as_each_task_begins_elsewhere(tmp_path):
+    names = [f'expert-late-{number}' for number in range(12)]
+    tasks = tasks_named('stack_blocks_two,shake_bottle,place_cup_plate')
+    few, more = (jobs_of(tasks, count, 3, tmp_path, policies=names) for count in (4, 24))
+    assert {job.policy for job in few} == set(names)
+    turns = {(job.task, job.index): job.policy for job in more}
+    assert all(turns[job.task, job.index] == job.policy for job in few)  # a set may grow
+    for task in tasks:
+        own = [job.policy for job in more if job.task == task.name]
+        assert all(own.count(name) == 2 for name in names)
 
 
 def test_more_than_ten_of_ten_cannot_miss(tmp_path):
