@@ -114,7 +114,8 @@ def fit_solid(
             found = least_squares(
                 misses,
                 given,
-                jac=slopes,  # all differences at once: ten times as fast as one by one
+                # all differences at once: ten times as fast as one by one
+                jac=slopes,  # type: ignore[arg-type]
                 bounds=(least, np.inf),
                 x_scale=np.where(np.isfinite(least), 0.01, 0.1),
                 loss='soft_l1',

@@ -148,7 +148,7 @@ def calibrate(
     if any(sample.kinds for sample in samples):
         groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
         judgements[AFTER_KINDS] = _left_out(samples, groups, segmenter, l2)
-    special: dict[str, Weights] = {}
+    special: dict[str, Any] = {}
     for name, others in (
         (OBSERVED, [sample.as_observed for sample in samples]),
         (UNFORESEEN, [sample.as_unforeseen for sample in samples]),

@@ -38,7 +38,7 @@ class Helpers:
         self._starting: list[_Helper] | None = None
         self._ready: list[_Helper] = []
 
-    def start(self, function: Callable[[Any], Any]) -> None:
+    def start(self, function: Callable[..., Any]) -> None:
         """Lets the helpers import what a function needs, so that they are ready when jobs come."""
         self.map(function, ())
 
