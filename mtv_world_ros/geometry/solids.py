@@ -114,7 +114,7 @@ def fit_solid(
             found = least_squares(
                 misses,
                 given,
-                # all differences at once: ten times as fast as one by one
+                # all differences at once: a fit takes half of the time
                 jac=slopes,  # type: ignore[arg-type]
                 bounds=(least, np.inf),
                 x_scale=np.where(np.isfinite(least), 0.01, 0.1),

@@ -446,10 +446,6 @@ def load_predictor(folder: Path, robot: RobotModel, processes: int = 1) -> Objec
     if contact is not None:
         from mtv_world_ros.model.object_motion.contact_motions import check_robot
 
-        count = min(processes, contact.num_motions) - 1
-        if count > 0:
-            helpers = Helpers(count)
-            helpers.start(check_robot)
         response = members[0].response
         if response is None:
             raise CheckpointError(
@@ -457,6 +453,10 @@ def load_predictor(folder: Path, robot: RobotModel, processes: int = 1) -> Objec
                 "missing; run 'mtv-world train-motion'"
             )
         check_robot(contact, robot, response)
+        count = min(processes, contact.num_motions) - 1
+        if count > 0:
+            helpers = Helpers(count)
+            helpers.start(check_robot)
     return ObjectMotionPredictor(members, robot, contact, helpers=helpers)
 
 
