@@ -189,6 +189,12 @@ class Named(ColourSegmenter):
         self.name = name
 
 
+def put_to_the_left():
+    """Footage in which the red block ends to the left of the blue one."""
+    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
+    return footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+
+
 @pytest.mark.parametrize(
     ('segmenter', 'task', 'words'),
     [
@@ -203,8 +209,7 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
         calibration=CALIBRATION.replace(tasks=(task,)),
         segmenter=Named(segmenter),
     )
-    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
-    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    shown = put_to_the_left()
     found = estimator.estimate(shown, LEFT).estimate
     assert found.reasons[-1].startswith(words)
     assert 'given the world model' in found.reasons[-1]
@@ -216,8 +221,7 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
 def test_frames_that_were_seen_have_weights_of_their_own():
     seen = Weights(features=('margin',), means=(1.0,), scales=(2.0,), weights=(0.0,), bias=2.0)
     task = CALIBRATION.replace(observed=seen)
-    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
-    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    shown = put_to_the_left()
     tasks = load_tasks(share_path('config', 'tasks'))
     for calibration, expected in ((task, 1 / (1 + np.exp(-2))), (CALIBRATION, 0.5)):
         estimator = SuccessEstimator(tasks, calibration=calibration, segmenter=Named('colour'))
@@ -230,8 +234,7 @@ def test_frames_that_were_seen_have_weights_of_their_own():
 def test_where_nothing_is_foreseen_weights_are_others():
     alone = Weights(features=('margin',), means=(1.0,), scales=(2.0,), weights=(0.0,), bias=2.0)
     calibration = CALIBRATION.replace(unforeseen=alone)
-    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
-    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    shown = put_to_the_left()
     tasks = load_tasks(share_path('config', 'tasks'))
     estimator = SuccessEstimator(tasks, calibration=calibration, segmenter=Named('colour'))
     found = estimator.estimate(shown, LEFT).estimate
@@ -244,6 +247,5 @@ def test_where_nothing_is_foreseen_weights_are_others():
 )
 def test_views_that_a_task_leaves_out_do_not_count(views, word):
     tasks = [t.replace(views=views) for t in load_tasks(share_path('config', 'tasks'))]
-    end = (BLUE[0] - 0.13, BLUE[1], 0.025)
-    shown = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+    shown = put_to_the_left()
     assert_abstains(SuccessEstimator(tasks).estimate(shown, LEFT).estimate, word)
