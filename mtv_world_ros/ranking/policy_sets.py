@@ -150,6 +150,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-rock-0.48',
         'expert-waver-0.75',
         'expert-waver-1',
+        'expert-lapse-0.3',
+        'expert-lapse-0.4',
+        'expert-droop-0.4',
+        'expert-droop-0.5',
+        'expert-budge-0.01',
+        'expert-budge-0.02',
     ),
     'calibrate': (
         'expert',
@@ -266,22 +272,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-yawn-0.55',
         'expert-drift-0.01',
         'expert-drift-0.014',
-    ),
-    'test': (
-        'expert',
-        'expert-lapse-0.3',
-        'expert-lapse-0.4',
         'expert-restart-0.8',
         'expert-restart-1',
-        'expert-droop-0.4',
-        'expert-droop-0.5',
         'expert-tug-0.03',
         'expert-tug-0.06',
-        'expert-budge-0.01',
-        'expert-budge-0.02',
         'expert-warp-0.045',
         'expert-warp-0.055',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

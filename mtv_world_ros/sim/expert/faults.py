@@ -140,7 +140,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'lapse': _kind(
         'timing',
-        'test',
+        'train',
         0.35,
         2.0,
         's',
@@ -148,7 +148,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'restart': _kind(
         'timing',
-        'test',
+        'calibrate',
         0.9,
         1.0,
         '',
@@ -194,7 +194,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'droop': _kind(
         'height',
-        'test',
+        'train',
         0.45,
         1.0,
         '',
@@ -625,7 +625,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'tug': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.04,
         0.12,
         'm',
@@ -680,7 +680,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'budge': _kind(
         'object',
-        'test',
+        'train',
         0.015,
         0.12,
         'm',
@@ -874,7 +874,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'warp': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.05,
         0.5,
         'rad',
