@@ -20,6 +20,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 _STILL_M, _STILL_RAD = 0.004, 0.08
 #: what is nearer than this looks to be at the same place; what is further away, just elsewhere
 _SAME_M, _ELSEWHERE_M = 0.01, 0.05
+#: of two whose widths differ by less than this factor, neither can stand in the other
+_AS_WIDE = 1.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,8 +232,8 @@ def moved_pictures(
 
     Each object is moved as the picture of a plane through its centre that faces the camera:
     shifted by the projected way, scaled by the ratio of depths, turned by the rotation about the
-    line of sight. What has moved lies over what has not, as a thing does over the container that
-    it was put into; else near ones over far ones. What is not known, or behind a camera, is held.
+    line of sight. Near ones lie over far ones, but a thing lies over what it stands in or on,
+    whose nearer wall hides it in part only. What is not known, or behind a camera, is held.
 
     Args:
         frames: (V, H, W, 3) uint8 RGB of the reference.
@@ -245,13 +247,14 @@ def moved_pictures(
     views, _, height, width = masks.shape
     shown = np.zeros((views, num_frames, height, width, 4), np.uint8)
     moves = motion.moves()
+    holders = _holders(motion, _widths(masks, motion, cameras, reference_poses))
     for view, camera in enumerate(cameras):
         before, depth = project(camera, reference_poses[view], motion.reference)
         after, depths = project(camera, poses[view][:, None], motion.points)
         turns = _turns(motion.rotations, poses[view])
         cut = [_cut_out(frames[view], mask) for mask in masks[view]]
         for frame in range(num_frames):
-            for item in _from_behind(depths[frame], moves[frame]):
+            for item in _from_behind(depths[frame], holders[frame]):
                 picture = cut[item]
                 if moves[frame, item] and np.isfinite([*after[frame, item], *before[item]]).all():
                     zoom = float(depth[item] / depths[frame, item])
@@ -261,10 +264,32 @@ def moved_pictures(
     return shown
 
 
-def _from_behind(depths: FloatArray, moves: BoolArray) -> list[int]:
+def _widths(
+    masks: BoolArray,
+    motion: ObjectMotion,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray] | FloatArray,
+) -> FloatArray:
+    """(O,) sides of squares as large as the objects look in the views that show most [m]."""
+    found = [
+        np.sqrt(mask.sum((-2, -1))) * project(camera, pose, motion.reference)[1] / camera.K[0, 0]
+        for mask, camera, pose in zip(masks, cameras, poses, strict=True)
+    ]
+    return np.asarray(np.nan_to_num(np.max(found, axis=0)))
+
+
+def _holders(motion: ObjectMotion, widths: FloatArray) -> BoolArray:
+    """(T, O, O) which objects stand in or on which: within their width, and smaller."""
+    across = np.linalg.norm(motion.points[:, :, None, :2] - motion.points[:, None, :, :2], axis=-1)
+    return np.asarray((across < widths / 2) & (_AS_WIDE * widths[:, None] < widths))
+
+
+def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
     """Items in the order in which they are laid over each other; unknown depths count as far."""
     far = np.nan_to_num(depths, nan=np.inf)
-    return sorted(range(len(far)), key=lambda item: (bool(moves[item]), -float(far[item])))
+    nearest = np.where(holders, far, np.inf).min(1, initial=np.inf)
+    front, held = np.minimum(far, nearest), holders.sum(1)
+    return sorted(range(len(far)), key=lambda item: (-float(front[item]), int(held[item])))
 
 
 def _cut_out(frame: ByteArray, mask: BoolArray) -> ByteArray:

@@ -101,6 +101,12 @@ def test_what_was_put_into_a_container_is_seen_in_it(camera):
     moved = shown(camera, masks, [(255, 0, 0), (0, 255, 0)], reference, [into])[0]
     assert (moved[30, 50, :3] == (255, 0, 0)).all() and (moved[30, 42, :3] == (0, 255, 0)).all()
     assert not moved[30, 61, 3]  # half a millimetre is no motion
+    pushed = [into[0], [0.115, 0.005, 1.0]]
+    moved = shown(camera, masks, [(255, 0, 0), (0, 255, 0)], reference, [pushed])[0]
+    assert (moved[30, 50, :3] == (255, 0, 0)).all() and moved[30, 61, 3]
+    behind = [[0.0, 0.005, 1.02], [0.105, 0.005, 1.0]]
+    moved = shown(camera, masks, [(255, 0, 0), (0, 255, 0)], reference, [behind])[0]
+    assert (moved[30, 40, :3] == (0, 255, 0)).all() and (moved[30, 38, :3] == (255, 0, 0)).all()
 
 
 def test_what_goes_behind_the_camera_is_held(camera):
