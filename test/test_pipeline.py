@@ -16,7 +16,11 @@ from mtv_world_ros.errors import (
     RolloutPreempted,
     TrajectoryError,
 )
-from mtv_world_ros.evaluation.imagined_stretches import observe_stretch, stretches
+from mtv_world_ros.evaluation.imagined_stretches import (
+    observe_stretch,
+    resume_stretch,
+    stretches,
+)
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import project
@@ -314,6 +318,27 @@ def test_a_recording_is_judged_by_its_own_frames(pipeline: Pipeline, recording: 
     *_, last = imagine(pipeline, recording, stretch.num_frames / SPEC.fps)
     assert seen.features['moved'] == 1.0 > last.success.features['moved']
     assert seen.probability > 0.5 > last.success.probability
+
+
+def test_the_last_chunk_alone_is_imagined_from_what_was_seen(
+    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
+) -> None:
+    (stretch,) = stretches(recording, SPEC, 'imagine')
+    first, *_ = stretches(recording, SPEC, 'observe')
+    assert resume_stretch(pipeline, recording, first, 3, 1) is None and not world_model.seeds
+    found = resume_stretch(pipeline, recording, stretch, 3, 1)
+    # that it moved was seen; what moves in the last chunk, this model does not know
+    assert found.features['moved'] == 1.0 and np.isnan(found.features['foreseen'])
+    assert world_model.seeds == [3]
+    drawn = world_model.trajectories[0][:, 0].astype(int)
+    masks = pipeline.segmenter.segment(stretch.frames[:, :1], ())
+    away = [
+        np.abs(
+            pipeline.draw(recording.cameras, row[None], np.zeros(1), masks).frames[:, 0] - drawn
+        ).mean()
+        for row in stretch.positions
+    ]
+    assert np.argmin(away) == stretch.num_frames - SPEC.num_frames
 
 
 class ThreeWays:

@@ -18,6 +18,7 @@ from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
     observe_stretch,
     predicted_frames,
+    resume_stretch,
     Stretch,
     stretches,
 )
@@ -130,7 +131,7 @@ class EpisodeScorer:
             recording, donor = self._load(job.path), self._donor(job)
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
-        success, observed = None, {}
+        success, observed, resumed = None, {}, {}
         names = job.objects or self.pipeline.objects or recording.names
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
@@ -139,6 +140,15 @@ class EpisodeScorer:
                 with found.timed('segmenting'):
                     pipeline = replace(self.pipeline, objects=names)
                     observed = observe_stretch(pipeline, recording, stretch).features
+                with found.timed('imagining'):
+                    ends = resume_stretch(
+                        pipeline,
+                        recording,
+                        stretch,
+                        self.config.seed,
+                        self.config.num_inference_steps,
+                    )
+                    resumed = {} if ends is None else ends.features
             if features:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])
@@ -157,6 +167,7 @@ class EpisodeScorer:
             reasons=success.reasons if success else (),
             features=dict(success.features) if success else {},
             observed=dict(observed),
+            resumed=dict(resumed),
             notes=tuple(found.notes),
             seconds_per_chunk=float(np.mean(found.chunk_seconds)),
             seconds=found.seconds,

@@ -135,6 +135,24 @@ def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) 
     return episode.observe(stretch.frames[:, 1:], stretch.positions).success
 
 
+def resume_stretch(
+    pipeline: Pipeline, recording: Recording, stretch: Stretch, seed: int, num_inference_steps: int
+) -> SuccessEstimate | None:
+    """Returns what the estimate says where all but a stretch's last chunk was seen.
+
+    So it is with plans that are made in mid-episode. None = the stretch is no longer than a chunk.
+    """
+    num_seen = stretch.num_frames - pipeline.spec.num_frames
+    rows = frame_indices(recording, stretch.start, pipeline.spec, stretch.num_frames)
+    if num_seen < 1 or rows is None:
+        return None
+    begun = _begin(pipeline, recording, stretch, seed, num_inference_steps)
+    begun.observe(stretch.frames[:, 1 : 1 + num_seen], stretch.positions[: 1 + num_seen])
+    rest = Stretch.of(recording, stretch.index, rows[num_seen:])
+    episode = begun.branch(_seen(recording, rest))
+    return list(episode.extend(_commands(pipeline, recording, rest)))[-1].success
+
+
 def _commands(pipeline: Pipeline, actions: Recording, stretch: Stretch) -> JointTrajectory:
     start = min(stretch.start, len(actions.times) - 1)
     return commands_until(actions, start, stretch.num_frames / pipeline.spec.fps)
@@ -148,19 +166,23 @@ def _begin(
     num_inference_steps: int = 0,
     num_seeds: int = 1,
 ) -> ImaginedEpisode:
-    frames, cameras = recording.seen_at(stretch.start)
-    observation = Observation(
-        cameras=cameras,
-        frames=frames,
-        positions=recording.positions[stretch.start],
-        stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
-    )
     return pipeline.begin(
-        observation,
+        _seen(recording, stretch),
         instruction=recording.instruction,
         seed=seed,
         num_seeds=num_seeds,
         num_inference_steps=num_inference_steps,
+    )
+
+
+def _seen(recording: Recording, stretch: Stretch) -> Observation:
+    """What the robot saw at the start of a stretch."""
+    frames, cameras = recording.seen_at(stretch.start)
+    return Observation(
+        cameras=cameras,
+        frames=frames,
+        positions=recording.positions[stretch.start],
+        stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
     )
 
 

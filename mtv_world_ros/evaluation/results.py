@@ -46,6 +46,7 @@ class EpisodeResult:
         features: of that estimate, by name; empty where it abstained.
         observed: of the estimate at the end of the recorded frames, likewise; empty where they
             were not judged.
+        resumed: likewise, where all but the last chunk was seen.
         has_ids: which objects move was read from recorded identities.
     """
 
@@ -63,6 +64,7 @@ class EpisodeResult:
     has_ids: bool
     features: Mapping[str, float] = field(default_factory=dict)
     observed: Mapping[str, float] = field(default_factory=dict)
+    resumed: Mapping[str, float] = field(default_factory=dict)
 
     def means(self, view: str | None) -> dict[str, float]:
         """Returns the numbers of a view (None = all views) that are averaged over episodes."""
@@ -82,7 +84,7 @@ class EpisodeResult:
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
-        for name in ('features', 'observed'):
+        for name in ('features', 'observed', 'resumed'):
             given = values.get(name, {})
             read[name] = {k: np.nan if v is None else v for k, v in given.items()}
         return EpisodeResult(**read)

@@ -42,7 +42,8 @@ class EvaluationConfig(Schema):
     )
     observed: bool = Field(
         default=False,
-        description='also judge the recorded frames of whole episodes, for `calibrate`',
+        description='also judge the recorded frames of whole episodes, and with the last chunk '
+        'imagined, for `calibrate`',
     )
     use_ids: bool = Field(
         default=True,

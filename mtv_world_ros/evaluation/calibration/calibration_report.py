@@ -39,7 +39,7 @@ _ROWS = {
     AFTER: 'after: each task left out of the fit',
     AFTER_KINDS: 'after: each fault kind left out of the fit',
     OBSERVED: 'the recorded frames, each kind or task left out of a fit to them',
-    UNFORESEEN: 'imagined frames alone, each kind or task left out of a fit to them',
+    UNFORESEEN: 'all but the last chunk seen, each kind or task left out of a fit to them',
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }

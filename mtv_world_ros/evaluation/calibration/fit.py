@@ -43,6 +43,7 @@ class Sample:
         kinds: faults of the policy that acted; empty = none, or not a scripted policy.
         observed: features of the estimate on the recorded frames; empty where it abstained, or
             they were not judged.
+        resumed: likewise, where all but the last chunk was seen.
     """
 
     episode: str
@@ -53,6 +54,7 @@ class Sample:
     reasons: tuple[str, ...]
     kinds: tuple[str, ...] = ()
     observed: Mapping[str, float] = field(default_factory=dict)
+    resumed: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def as_observed(self) -> Sample:
@@ -60,13 +62,9 @@ class Sample:
         return replace(self, features=(self.observed,))
 
     @property
-    def as_unforeseen(self) -> Sample:
-        """The same with nothing foreseen; empty where pictures do not tell."""
-        told = [isfinite(features.get('margin', nan)) for features in self.features]
-        pairs = zip(self.features, told, strict=True)
-        return replace(
-            self, features=tuple({**f, 'foreseen': nan} if tells else {} for f, tells in pairs)
-        )
+    def as_resumed(self) -> Sample:
+        """The same with all but the last chunk seen, so that nothing is foreseen."""
+        return replace(self, features=(self.resumed,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,8 +77,8 @@ class Calibrated:
         judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
             `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
             only where there are faults), `OBSERVED` (the same of the recorded frames, by a fit to
-            them), `UNFORESEEN` (of imagined ones alone, by a fit to them), `FITTED` (on what it
-            was fitted on: too good) -> one per sample.
+            them), `UNFORESEEN` (with all but the last chunk seen, by a fit to them), `FITTED` (on
+            what it was fitted on: too good) -> one per sample.
     """
 
     calibration: Calibration
@@ -113,6 +111,7 @@ def samples_of(
                     reasons=first.reasons,
                     kinds=known_kinds.get(name, ()),
                     observed=first.observed,
+                    resumed=first.resumed,
                 )
             )
     return samples
@@ -151,7 +150,7 @@ def calibrate(
     special: dict[str, Any] = {}
     for name, others in (
         (OBSERVED, [sample.as_observed for sample in samples]),
-        (UNFORESEEN, [sample.as_unforeseen for sample in samples]),
+        (UNFORESEEN, [sample.as_resumed for sample in samples]),
     ):
         if _tells(others):
             special[name] = Weights(**_weights(others, l2))
