@@ -145,7 +145,7 @@ def found_by(plan: Plan, predictor: ObjectMotionPredictor) -> TrackedObjects:
 def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:
     """Returns what motions say by `SAID`, 0 to 1; empty = they do not tell."""
     frame = plan.frame
-    objects = FoundObjects(
+    objects = FoundObjects.at(
         names=plan.names,
         frames=np.zeros((*frame.masks[:, 0].shape, 3), np.uint8),
         masks=frame.masks,

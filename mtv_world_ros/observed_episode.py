@@ -91,7 +91,7 @@ class ObservedEpisode:
         with self._lock:
             seen, waiting = self._seen, self._waiting
             if seen is None or (seen.instruction, seen.objects) != (instruction, objects):
-                seen = self._pipeline.begin(start, instruction=instruction, objects=objects)
+                seen = self._pipeline.begin(observation, instruction=instruction, objects=objects)
                 self._seen, self._seen_ns, waiting = seen, start.stamp_ns, []
             new = [o for o in waiting if o.stamp_ns < start.stamp_ns]
             self._waiting = [o for o in waiting if o.stamp_ns > start.stamp_ns]

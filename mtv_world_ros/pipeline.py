@@ -38,7 +38,7 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
-from mtv_world_ros.rollout_state import ChunkPlan, RolloutState
+from mtv_world_ros.rollout_state import ChunkPlan, fit_observation, RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_of, ForeseenMotions
@@ -239,6 +239,7 @@ class ImaginedEpisode:
     num_chunks: int = field(default=0, init=False)
     _rollouts: tuple[RolloutState, ...]
     _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     @property
     def observation(self) -> Observation:
@@ -321,15 +322,16 @@ class ImaginedEpisode:
     def branch(self, observation: Observation) -> ImaginedEpisode:
         """Returns an episode that begins at a later real observation and remembers this one.
 
-        What the estimate remembers (grasps, first masks, where objects have been) goes on; the
-        model's history begins again. This episode stays as it is.
+        What the estimate remembers (grasps, first masks, where objects have been) goes on, and
+        what objects look like where nothing hides them; the model's history begins again. This
+        episode stays as it is.
 
         Raises:
             ObservationError: the views are not the model's.
         """
-        state = RolloutState.at(observation, self.pipeline.spec)
-        memory = self._rollouts[0].memory
-        return replace(self, _rollouts=(replace(state, memory=memory),))
+        state, before = RolloutState.at(observation, self.pipeline.spec), self._rollouts[0]
+        state = replace(state, memory=before.memory, first=before.first)
+        return replace(self, _rollouts=(state,))
 
     def _plan_chunks(self, trajectory: JointTrajectory) -> list[ChunkPlan]:
         """The trajectory on the model's clock, cut into chunks."""
@@ -432,12 +434,12 @@ class ImaginedEpisode:
         pipeline, plan = self.pipeline, plans[0]
         if pipeline.object_motion is None or not pipeline.rendering.object_motion:
             return None, ()
-        poses = self._camera_poses(plan.positions)
+        poses = self._camera_poses(plan.positions, state.observation.cameras)
         ahead = state.ahead
         if plan.chunk == 0 or not ahead or ahead[0].names != self.names:
             objects = state.objects
             if objects is None or objects.names != self.names:
-                objects = self._find_objects(state, poses[:, 0], start_masks)
+                objects = self._find_objects(state, start_masks)
             plans = plans[: ceil(_FORESEEN_S / float(plan.times[-1] - plan.times[0]))]
             ahead = objects.foresee(self._commands(plans, objects.tracked))
             shown = objects.most_like(ahead[-1], self._believed(state, plans[-1], ahead[-1]))
@@ -454,29 +456,57 @@ class ImaginedEpisode:
                 self._check_stop()
             yield plan.fine_positions(objects.step_s, objects.commands_a_step)
 
-    def _find_objects(
-        self, state: RolloutState, poses: FloatArray, start_masks: ObjectMasks
-    ) -> FoundObjects:
-        """The named objects where the rollout stands, seen from poses (V, 4, 4)."""
-        pipeline = self.pipeline
+    def _find_objects(self, state: RolloutState, start_masks: ObjectMasks) -> FoundObjects:
+        """The named objects where the rollout stands."""
         # at its own size the real frame shows better where they are; where the names have
         # changed only an imagined frame shows where they are now
         source = state.source if state.objects is None else state.observation
-        sharp = pipeline.segmenter.segment(source.frames[:, None], self.names)
-        assert pipeline.object_motion is not None
-        return FoundObjects(
-            names=self.names,
-            frames=state.observation.frames,
-            masks=start_masks.masks[:, :, 0],
-            poses=poses,
-            tracked=pipeline.object_motion.find(
-                self.names, sharp.masks[:, :, 0], source.cameras, list(poses)
-            ),
-        )
+        if source is state.first:
+            return self._find_whole(source, start_masks)
+        frames, masks = state.observation.frames, start_masks.masks[:, :, 0]
+        if state.objects is not None:
+            return self._found(source, frames, masks)
+        return self._found(source, frames, masks, self._find_whole(state.first))
 
-    def _camera_poses(self, positions: FloatArray) -> FloatArray:
-        """(V, N, 4, 4) T_base_camera at positions (N, J)."""
-        cameras, robot = self.observation.cameras, self.pipeline.robot
+    def _find_whole(
+        self, first: Observation, start_masks: ObjectMasks | None = None
+    ) -> FoundObjects:
+        """The named objects in the episode's first real frame, in which nothing may hide them."""
+        if self.names not in self._whole:
+            frames = fit_observation(first, self.pipeline.spec).frames
+            if start_masks is None:
+                start_masks = self.pipeline.segmenter.segment(frames[:, None], self.names)
+            self._whole[self.names] = self._found(first, frames, start_masks.masks[:, :, 0])
+        return self._whole[self.names]
+
+    def _found(
+        self,
+        source: Observation,
+        frames: ByteArray,
+        masks: BoolArray,
+        whole: FoundObjects | None = None,
+    ) -> FoundObjects:
+        """Objects of masks (V, O, H, W) in frames (V, H, W, 3), of the model's size.
+
+        Args:
+            source: the same frames as large as there are.
+            frames: they.
+            masks: in them.
+            whole: the same objects when nothing hid them; None = now.
+        """
+        model, names = self.pipeline.object_motion, self.names
+        assert model is not None
+        sharp = self.pipeline.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]
+        poses = self._camera_poses(source.positions[None], source.cameras)[:, 0]
+        given = names, sharp, source.cameras, list(poses)
+        if whole is None:
+            return FoundObjects.at(names, frames, masks, poses, model.find(*given))
+        tracked, same = model.find_again(whole.tracked, *given)
+        return FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, same)
+
+    def _camera_poses(self, positions: FloatArray, cameras: Sequence[CameraModel]) -> FloatArray:
+        """(V, N, 4, 4) T_base_camera of V cameras at positions (N, J)."""
+        robot = self.pipeline.robot
         return np.stack([camera_poses(camera, robot, positions) for camera in cameras])
 
     def _find_start_masks(self, state: RolloutState) -> ObjectMasks:

@@ -30,7 +30,8 @@ class RolloutState:
     Attributes:
         observation: its last frame, at the model's size.
         history: the frames before that one.
-        source: the last real observation, at its own size.
+        first: the episode's first real observation, at its own size.
+        source: the last one, likewise.
         objects: where the named objects are; None before the first chunk after `source`.
         ahead: where they are foreseen to be after each further chunk of the trajectory.
         memory: what the estimate remembers; None before the first chunk.
@@ -39,6 +40,7 @@ class RolloutState:
 
     observation: Observation
     history: History
+    first: Observation
     source: Observation
     objects: FoundObjects | None = None
     ahead: tuple[FoundObjects, ...] = ()
@@ -53,7 +55,12 @@ class RolloutState:
             ObservationError: the views are not the model's.
         """
         start = fit_observation(observation, spec)
-        return cls(observation=start, history=History.begin(start.frames), source=observation)
+        return cls(
+            observation=start,
+            history=History.begin(start.frames),
+            first=observation,
+            source=observation,
+        )
 
     def after(
         self,
@@ -80,6 +87,7 @@ class RolloutState:
                 start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
             ),
             history=self.history.after(start.frames, frames, num_history),
+            first=self.first,
             source=self.source,
             objects=objects[0] if objects else None,
             ahead=tuple(objects[1:]),

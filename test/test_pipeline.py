@@ -17,8 +17,9 @@ from mtv_world_ros.errors import (
     TrajectoryError,
 )
 from mtv_world_ros.evaluation.imagined_stretches import (
+    imagine_stretch,
+    last_chunk,
     observe_stretch,
-    resume_stretch,
     stretches,
 )
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
@@ -325,8 +326,12 @@ def test_the_last_chunk_alone_is_imagined_from_what_was_seen(
 ) -> None:
     (stretch,) = stretches(recording, SPEC, 'imagine')
     first, *_ = stretches(recording, SPEC, 'observe')
-    assert resume_stretch(pipeline, recording, first, 3, 1) is None and not world_model.seeds
-    found = resume_stretch(pipeline, recording, stretch, 3, 1)
+    assert last_chunk(recording, first, SPEC) is None
+    last = last_chunk(recording, stretch, SPEC)
+    (chunk,) = imagine_stretch(
+        pipeline, recording, last, actions=recording, seed=3, num_inference_steps=1
+    )
+    found = chunk.success
     # that it moved was seen; what moves in the last chunk, this model does not know
     assert found.features['moved'] == 1.0 and np.isnan(found.features['foreseen'])
     assert world_model.seeds == [3]
@@ -409,6 +414,11 @@ class DriftingObjects:
         self._log.append(0)
         return self
 
+    def find_again(self, whole, names, masks, cameras, poses):
+        assert whole is self and masks.shape[:2] == (len(cameras), 2)
+        self._log.append(1)
+        return self, np.array([True, False])
+
     def advance(self, positions):
         count = len(positions) - 1
         points = np.zeros((count + 1, 2, 3))
@@ -431,7 +441,32 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
     assert not np.array_equal(first[:, -1], second[:, -1])
     episode.observe(recording.frames[:, 17:25], recording.positions[16:25])
     list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
-    assert log == [0, 16, 32, 0, 16]
+    assert log == [0, 16, 32, 1, 16]
+
+
+def test_what_is_hidden_by_now_is_shown_as_it_was_when_it_was_whole(
+    recording: Recording, world_model: CountingWorldModel
+) -> None:
+    log: list[int] = []
+    pipeline = with_motion(world_model, DriftingObjects(log))
+    begun = pipeline.begin(observe(recording), instruction=recording.instruction)
+    begun.observe(recording.frames[:, 1:9], recording.positions[:9])
+    episode = begun.branch(
+        Observation(
+            cameras=recording.cameras,
+            frames=np.zeros_like(recording.frames[:, 8]),
+            positions=recording.positions[8],
+            stamp_ns=recording.stamp_ns + 1_600_000_000,
+        )
+    )
+    for _ in range(2):
+        list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
+        assert log.count(0) == 1
+        episode.observe(recording.frames[:, 17:25], recording.positions[16:25])
+    shown = world_model.trajectories[0][:, 0]
+    masks = pipeline.segmenter.segment(recording.frames[:, :1], begun.names).masks[:, :, 0]
+    whole, anew = ((shown * mask[..., None]).sum() for mask in masks.swapaxes(0, 1))
+    assert whole > 0 and masks[:, 1].any()
 
 
 def test_an_episode_in_which_nobody_names_an_object_is_imagined(

@@ -16,9 +16,9 @@ from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
+    last_chunk,
     observe_stretch,
     predicted_frames,
-    resume_stretch,
     Stretch,
     stretches,
 )
@@ -140,15 +140,10 @@ class EpisodeScorer:
                 with found.timed('segmenting'):
                     pipeline = replace(self.pipeline, objects=names)
                     observed = observe_stretch(pipeline, recording, stretch).features
-                with found.timed('imagining'):
-                    ends = resume_stretch(
-                        pipeline,
-                        recording,
-                        stretch,
-                        self.config.seed,
-                        self.config.num_inference_steps,
-                    )
-                    resumed = {} if ends is None else ends.features
+                last = last_chunk(recording, stretch, pipeline.spec)
+                if last is not None:
+                    chunk = self._imagine(recording, last, recording, names, found)[-1]
+                    resumed = chunk.success.features
             if features:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])

@@ -20,7 +20,8 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 
-#: observe: every chunk from real frames; imagine: chunks chained from the episode's first frame
+#: observe: every chunk from the real frames until its start; imagine: chunks chained from the
+#: episode's first frame
 MODES = ('observe', 'imagine')
 
 
@@ -103,6 +104,14 @@ def _cut(
     return None if rows is None else Stretch.of(recording, index, rows)
 
 
+def last_chunk(recording: Recording, stretch: Stretch, spec: WorldModelSpec) -> Stretch | None:
+    """Returns the last chunk of a longer stretch; None = it is no longer than that."""
+    rows = frame_indices(recording, stretch.start, spec, stretch.num_frames)
+    if rows is None or stretch.num_frames <= spec.num_frames:
+        return None
+    return Stretch.of(recording, stretch.index, rows[-1 - spec.num_frames :])
+
+
 def imagine_stretch(
     pipeline: Pipeline,
     recording: Recording,
@@ -113,7 +122,7 @@ def imagine_stretch(
     num_inference_steps: int,
     num_seeds: int = 1,
 ) -> list[Prediction]:
-    """Imagines a stretch from its recorded first frame; returns its chunks.
+    """Imagines a stretch from the recorded frames until its start; returns its chunks.
 
     Args:
         pipeline: imagines.
@@ -130,27 +139,9 @@ def imagine_stretch(
 
 
 def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) -> SuccessEstimate:
-    """Returns what the estimate says at the end of a stretch's recorded frames."""
+    """Returns what the estimate says of recorded frames, those of a stretch the last ones."""
     episode = _begin(pipeline, recording, stretch)
     return episode.observe(stretch.frames[:, 1:], stretch.positions).success
-
-
-def resume_stretch(
-    pipeline: Pipeline, recording: Recording, stretch: Stretch, seed: int, num_inference_steps: int
-) -> SuccessEstimate | None:
-    """Returns what the estimate says where all but a stretch's last chunk was seen.
-
-    So it is with plans that are made in mid-episode. None = the stretch is no longer than a chunk.
-    """
-    num_seen = stretch.num_frames - pipeline.spec.num_frames
-    rows = frame_indices(recording, stretch.start, pipeline.spec, stretch.num_frames)
-    if num_seen < 1 or rows is None:
-        return None
-    begun = _begin(pipeline, recording, stretch, seed, num_inference_steps)
-    begun.observe(stretch.frames[:, 1 : 1 + num_seen], stretch.positions[: 1 + num_seen])
-    rest = Stretch.of(recording, stretch.index, rows[num_seen:])
-    episode = begun.branch(_seen(recording, rest))
-    return list(episode.extend(_commands(pipeline, recording, rest)))[-1].success
 
 
 def _commands(pipeline: Pipeline, actions: Recording, stretch: Stretch) -> JointTrajectory:
@@ -166,23 +157,31 @@ def _begin(
     num_inference_steps: int = 0,
     num_seeds: int = 1,
 ) -> ImaginedEpisode:
-    return pipeline.begin(
-        _seen(recording, stretch),
+    """An episode that has seen all that was recorded before the stretch, as a node's has."""
+    episode = pipeline.begin(
+        _seen(recording, 0),
         instruction=recording.instruction,
         seed=seed,
         num_seeds=num_seeds,
         num_inference_steps=num_inference_steps,
     )
+    if not stretch.start:
+        return episode
+    seconds = float(recording.times[stretch.start] - recording.times[0])
+    rows = frame_indices(recording, 0, pipeline.spec, round(seconds * pipeline.spec.fps))
+    if rows is not None:  # else there are gaps
+        episode.observe(recording.frames[:, rows[1:]], recording.positions[rows])
+    return episode.branch(_seen(recording, stretch.start))
 
 
-def _seen(recording: Recording, stretch: Stretch) -> Observation:
-    """What the robot saw at the start of a stretch."""
-    frames, cameras = recording.seen_at(stretch.start)
+def _seen(recording: Recording, frame: int) -> Observation:
+    """What the robot saw at a recorded frame."""
+    frames, cameras = recording.seen_at(frame)
     return Observation(
         cameras=cameras,
         frames=frames,
-        positions=recording.positions[stretch.start],
-        stamp_ns=recording.stamp_ns + round(float(recording.times[stretch.start]) * 1e9),
+        positions=recording.positions[frame],
+        stamp_ns=recording.stamp_ns + round(float(recording.times[frame]) * 1e9),
     )
 
 

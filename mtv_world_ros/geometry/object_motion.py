@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -118,6 +118,29 @@ class ObjectMotionModel(Protocol):
         """Returns the objects of O names and masks (V, O, H, W), seen at T_base_camera (4, 4)."""
         ...
 
+    def find_again(
+        self,
+        whole: Any,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+    ) -> tuple[TrackedObjects, BoolArray]:
+        """Returns the same, of objects that something may hide in part by now.
+
+        Args:
+            whole: what `find` returned when they were seen whole.
+            names: see `find`; so are the others.
+            masks: of what is seen of them now.
+            cameras: V cameras.
+            poses: V of T_base_camera.
+
+        Returns:
+            The objects, and which of them (O,) are as large as they were: their motions count
+            from where they were then. The others are found anew.
+        """
+        ...
+
     def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
         """Returns the same for a robot of the same joints and tools."""
         ...
@@ -125,15 +148,14 @@ class ObjectMotionModel(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundObjects:
-    """The named objects as the last real frame shows them, and where they are now.
+    """The named objects as a real frame shows them, and where they are now.
 
     Attributes:
         names: O of them.
-        frames: (V, H, W, 3) that frame, at the model's size.
-        masks: (V, O, H, W) in it.
-        poses: (V, 4, 4) T_base_camera then.
+        cuts: (V, O, H, W, 4) `cut_outs` of the frame that shows each best, at the model's size.
+        poses: (V, O, 4, 4) T_base_camera then.
         tracked: where they are now.
-        motions: since that frame, `tracked.step_s` apart; of the first one places and sizes are as
+        motions: from there on, `tracked.step_s` apart; of the first one places and sizes are as
             the masks have them.
         positions: (N, J) joints at their rows [rad or m].
         part_row: row at which the last part of a plan begins.
@@ -141,14 +163,33 @@ class FoundObjects:
     """
 
     names: tuple[str, ...]
-    frames: ByteArray
-    masks: BoolArray
+    cuts: ByteArray
     poses: FloatArray
     tracked: TrackedObjects
     motions: tuple[ObjectMotion, ...] = ()
     positions: FloatArray | None = None
     part_row: int = 0
     shown: int = 0
+
+    @classmethod
+    def at(
+        cls,
+        names: tuple[str, ...],
+        frames: ByteArray,
+        masks: BoolArray,
+        poses: FloatArray,
+        tracked: TrackedObjects,
+    ) -> FoundObjects:
+        """Returns objects of masks (V, O, H, W) in frames (V, H, W, 3), seen at (V, 4, 4)."""
+        of_each = np.repeat(poses[:, None], len(names), axis=1)
+        return cls(names=names, cuts=cut_outs(frames, masks), poses=of_each, tracked=tracked)
+
+    def shown_as(self, whole: FoundObjects, same: BoolArray) -> FoundObjects:
+        """Returns these, those of `same` (O,) with the pictures of when they were seen whole."""
+        cuts = np.where(same[:, None, None, None], whole.cuts, self.cuts)
+        return replace(
+            self, cuts=cuts, poses=np.where(same[:, None, None], whole.poses, self.poses)
+        )
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
         """Returns the objects after each part of a plan, which show the same motion as before.
@@ -196,7 +237,7 @@ class FoundObjects:
         motion = self.motions[self.shown]
         rows = self.part_row + np.rint(times / self.tracked.step_s).astype(int)
         shown = motion[np.minimum(rows, len(motion.points) - 1)]
-        return moved_pictures(self.frames, self.masks, shown, cameras, self.poses, poses)
+        return moved_pictures(self.cuts, shown, cameras, self.poses, poses)
 
     def _then(self, positions: FloatArray) -> FoundObjects:
         motions, tracked = self.tracked.advance(positions)
@@ -220,12 +261,23 @@ def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
     return np.nan_to_num(np.minimum(apart, _ELSEWHERE_M))
 
 
+def cut_outs(frames: ByteArray, masks: BoolArray) -> ByteArray:
+    """Returns (V, O, H, W, 4) colours of objects, black elsewhere, and masks as 0 or 255.
+
+    Args:
+        frames: (V, H, W, 3) uint8 RGB.
+        masks: (V, O, H, W) in them.
+    """
+    cover = np.where(masks, 255, 0).astype(np.uint8)[..., None]
+    colours = np.where(masks[..., None], frames[:, None], 0).astype(np.uint8)
+    return np.concatenate([colours, cover], axis=-1)
+
+
 def moved_pictures(
-    frames: ByteArray,
-    masks: BoolArray,
+    cuts: ByteArray,
     motion: ObjectMotion,
     cameras: Sequence[CameraModel],
-    reference_poses: Sequence[FloatArray] | FloatArray,
+    reference_poses: FloatArray,
     poses: FloatArray,
 ) -> ByteArray:
     """Returns the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
@@ -236,26 +288,24 @@ def moved_pictures(
     whose nearer wall hides it in part only. What is not known, or behind a camera, is held.
 
     Args:
-        frames: (V, H, W, 3) uint8 RGB of the reference.
-        masks: (V, O, H, W) in it.
+        cuts: (V, O, H, W, 4) of the reference, see `cut_outs`.
         motion: T frames.
-        cameras: V cameras at the masks' size.
-        reference_poses: V of T_base_camera (4, 4) at the reference.
+        cameras: V cameras at the pictures' size.
+        reference_poses: (V, O or 1, 4, 4) T_base_camera at the reference.
         poses: (V, T, 4, 4) T_base_camera.
     """
     num_frames = len(motion.points)
-    views, _, height, width = masks.shape
+    views, _, height, width, _ = cuts.shape
     shown = np.zeros((views, num_frames, height, width, 4), np.uint8)
     moves = motion.moves()
-    holders = _holders(motion, _widths(masks, motion, cameras, reference_poses))
+    holders = _holders(motion, _widths(cuts, motion, cameras, reference_poses))
     for view, camera in enumerate(cameras):
         before, depth = project(camera, reference_poses[view], motion.reference)
         after, depths = project(camera, poses[view][:, None], motion.points)
         turns = _turns(motion.rotations, poses[view])
-        cut = [_cut_out(frames[view], mask) for mask in masks[view]]
         for frame in range(num_frames):
             for item in _from_behind(depths[frame], holders[frame]):
-                picture = cut[item]
+                picture = cuts[view, item]
                 if moves[frame, item] and np.isfinite([*after[frame, item], *before[item]]).all():
                     zoom = float(depth[item] / depths[frame, item])
                     turn = float(turns[frame, item])
@@ -265,15 +315,13 @@ def moved_pictures(
 
 
 def _widths(
-    masks: BoolArray,
-    motion: ObjectMotion,
-    cameras: Sequence[CameraModel],
-    poses: Sequence[FloatArray] | FloatArray,
+    cuts: ByteArray, motion: ObjectMotion, cameras: Sequence[CameraModel], poses: FloatArray
 ) -> FloatArray:
     """(O,) sides of squares as large as the objects look in the views that show most [m]."""
     found = [
-        np.sqrt(mask.sum((-2, -1))) * project(camera, pose, motion.reference)[1] / camera.K[0, 0]
-        for mask, camera, pose in zip(masks, cameras, poses, strict=True)
+        np.sqrt((cut[..., 3] > 0).sum((-2, -1)))
+        * (project(camera, pose, motion.reference)[1] / camera.K[0, 0])
+        for cut, camera, pose in zip(cuts, cameras, poses, strict=True)
     ]
     return np.asarray(np.nan_to_num(np.max(found, axis=0)))
 
@@ -290,12 +338,6 @@ def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
     nearest = np.where(holders, far, np.inf).min(1, initial=np.inf)
     front, held = np.minimum(far, nearest), holders.sum(1)
     return sorted(range(len(far)), key=lambda item: (-float(front[item]), int(held[item])))
-
-
-def _cut_out(frame: ByteArray, mask: BoolArray) -> ByteArray:
-    """(H, W, 4) the object's colours, black elsewhere, and its mask as 0 or 255."""
-    cover = np.where(mask, 255, 0).astype(np.uint8)[..., None]
-    return np.concatenate([np.where(mask[..., None], frame, 0).astype(np.uint8), cover], axis=-1)
 
 
 def _lay(image: ByteArray, picture: ByteArray) -> None:

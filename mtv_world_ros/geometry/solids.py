@@ -5,9 +5,11 @@ V views, H W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import re
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +29,13 @@ _ROUND, _SQUARE = _DIRECTIONS / 2, np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]
 _TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
 #: a box must fit by so much better than a cylinder, which has two numbers less
 _BETTER = 0.9
+#: further turns to begin with where a solid was moved [rad]
+_FURTHER = (0.5, -0.5, 1.0, -1.0)
+#: a solid is found again where no mask reaches beyond it by more than this, or so much more than
+#: it did when it was whole [px]; and where this share of its outline is as near to the masks'
+_FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.3
+#: what fits so well from where it was has stayed there [px]
+_STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
 #: relative step of finite differences
 _DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
@@ -53,6 +62,11 @@ class Solid:
     is_round: bool = False
     is_open: bool = False
     error_px: float = 0.0
+
+    def turn_to(self, now: Solid) -> FloatArray:
+        """Returns (3, 3) how it has turned."""
+        cos, sin = np.cos(now.yaw - self.yaw), np.sin(now.yaw - self.yaw)
+        return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def is_vessel(name: str) -> bool:
@@ -88,19 +102,11 @@ def fit_solid(
     seen = [view for view in range(len(masks)) if masks[view].any()]
     if len(seen) < 2 or not np.isfinite(point).all():
         return None
-    wanted = [_reach(_corners(masks[view])) + _PIXEL for view in seen]
+    outlines = _Outlines.of(masks, cameras, poses)
 
     def misses(numbers: FloatArray, outline: FloatArray) -> FloatArray:
-        corners = _in_space(numbers, outline)
-        found = [_reach(project(cameras[view], poses[view], corners)[0]) for view in seen]
         stands = (numbers[..., -1:] - floor) / _STANDS_M
-        away = np.nan_to_num(np.concatenate(found, -1) - np.concatenate(wanted), nan=1e3)
-        return np.concatenate([away, stands], -1)
-
-    def slopes(numbers: FloatArray, outline: FloatArray) -> FloatArray:
-        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
-        rows = misses(np.concatenate([numbers[None], numbers + np.diag(steps)]), outline)
-        return ((rows[1:] - rows[0]) / steps[:, None]).T
+        return np.concatenate([outlines.misses(_in_space(numbers, outline)), stands], -1)
 
     height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
     best = None
@@ -111,16 +117,12 @@ def fit_solid(
             sizes = slice(2 if turn is None else 3, -1)
             least = np.full(len(given), -np.inf)
             least[sizes] = _LEAST_M
-            found = least_squares(
-                misses,
+            found = _nearest(
+                partial(misses, outline=outline),
                 given,
-                # all differences at once: a fit takes half of the time
-                jac=slopes,  # type: ignore[arg-type]
                 bounds=(least, np.inf),
                 x_scale=np.where(np.isfinite(least), 0.01, 0.1),
                 loss='soft_l1',
-                max_nfev=_MAX_EVALUATIONS,
-                args=(outline,),
             )
             is_round = best is not None and best[1].is_round
             if best is None or found.cost < best[0] * (_BETTER if is_round else 1.0):
@@ -128,6 +130,109 @@ def fit_solid(
                 best = found.cost, _solid(found.x, turn is None, error)
     assert best is not None
     return replace(best[1], is_open=is_open)
+
+
+def find_solid(
+    solid: Solid,
+    masks: BoolArray,
+    point: FloatArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> Solid | None:
+    """Returns where a solid of known size is that something may hide in part.
+
+    Most of its outline is that of the masks; what is hidden is left out of account.
+
+    Args:
+        solid: as it was when it was seen whole.
+        masks: (V, H, W) of what is seen of it now.
+        point: (3,) the middle of that, NaN = not known [m].
+        cameras: V cameras at the masks' size.
+        poses: V of T_base_camera (4, 4).
+
+    Returns:
+        None where no view sees it, or where it does not look as it did: it lies on its side.
+    """
+    if not masks.any():
+        return None
+    outlines, outline = _Outlines.of(masks, cameras, poses), _SQUARE
+    wide, long, height = size = solid.size
+    if solid.is_round:
+        outline, size = _ROUND, np.array([wide, height])
+
+    def misses(places: FloatArray) -> FloatArray:
+        sizes = np.broadcast_to(size, (*places.shape[:-1], len(size)))
+        numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
+        return outlines.misses(_in_space(numbers, outline))
+
+    best = None
+    for centre, turn in _starts(solid, point):
+        given = [] if solid.is_round else [solid.yaw + turn]
+        given = np.array([*centre[:2], *given, centre[2] - height / 2])
+        scale = np.where(np.arange(len(given)) == 2, 0.1, 0.01)
+        found = _nearest(misses, given, x_scale=scale, loss='cauchy')
+        if best is None or found.cost < best.cost:
+            best = found
+        if np.abs(found.fun).max() < _STAYED_PX:
+            break
+    assert best is not None
+    error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
+    enough = max(_FOUND_PX, _FOUND * solid.error_px)
+    if error > enough or np.mean(np.abs(best.fun) < enough) < _SHOWN:
+        return None
+    now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
+    return replace(now, is_open=solid.is_open)
+
+
+def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:
+    """Where to look for it: where it was, then where it is seen, turned or not."""
+    yield solid.centre, 0.0
+    if np.isfinite(point).all():
+        for turn in (0.0,) if solid.is_round else (0.0, *_FURTHER):
+            yield point, turn
+
+
+@dataclass(frozen=True, slots=True)
+class _Outlines:
+    """Those of masks in the views that see something of them.
+
+    Attributes:
+        views: camera and T_base_camera of each.
+        reach: (N,) how far they reach along each direction in each view [px].
+    """
+
+    views: tuple[tuple[CameraModel, FloatArray], ...]
+    reach: FloatArray
+
+    @classmethod
+    def of(
+        cls, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+    ) -> _Outlines:
+        seen = [view for view, mask in enumerate(masks) if mask.any()]
+        reach = np.concatenate([_reach(_corners(masks[view])) + _PIXEL for view in seen])
+        return cls(tuple((cameras[view], poses[view]) for view in seen), reach)
+
+    def misses(self, corners: FloatArray) -> FloatArray:
+        """(..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
+        found = [_reach(project(camera, pose, corners)[0]) for camera, pose in self.views]
+        return np.nan_to_num(np.concatenate(found, -1) - self.reach, nan=1e3)
+
+
+def _nearest(misses: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any) -> Any:
+    """The numbers (N,) that miss by least, from some on; all differences are taken at once."""
+
+    def slopes(numbers: FloatArray) -> FloatArray:
+        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
+        rows = misses(np.concatenate([numbers[None], numbers + np.diag(steps)]))
+        return ((rows[1:] - rows[0]) / steps[:, None]).T
+
+    return least_squares(
+        misses,
+        given,
+        jac=slopes,  # type: ignore[arg-type]
+        max_nfev=_MAX_EVALUATIONS,
+        **how,
+    )
 
 
 def _solid(numbers: FloatArray, is_round: bool, error_px: float) -> Solid:

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.geometry.object_motion import FoundObjects, moved_pictures, ObjectMotion
+from mtv_world_ros.geometry.object_motion import (
+    cut_outs,
+    FoundObjects,
+    moved_pictures,
+    ObjectMotion,
+)
 
 FOCAL, SIZE = 100.0, (60, 80)
 POSE = np.eye(4)
@@ -44,7 +49,8 @@ def shown(camera, masks, colours, reference, points, rotations=None):
     turns = np.tile(np.eye(3), (*points.shape[:2], 1, 1)) if rotations is None else rotations
     motion = ObjectMotion(reference=np.asarray(reference, float), points=points, rotations=turns)
     poses = np.tile(POSE, (1, len(points), 1, 1))
-    return moved_pictures(frame[None], np.stack(masks)[None], motion, [camera], [POSE], poses)[0]
+    cuts = cut_outs(frame[None], np.stack(masks)[None])
+    return moved_pictures(cuts, motion, [camera], POSE[None, None], poses)[0]
 
 
 def centre_and_area(picture: np.ndarray) -> tuple[np.ndarray, float]:
@@ -141,7 +147,7 @@ class Foreseen:
 
 
 def found(*speeds: float) -> FoundObjects:
-    return FoundObjects(
+    return FoundObjects.at(
         names=('block',),
         frames=np.full((1, *SIZE, 3), 200, np.uint8),
         masks=square(30, 40, 3)[None, None],

@@ -8,7 +8,7 @@ import pytest
 
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.solids import fit_solid
+from mtv_world_ros.geometry.solids import find_solid, fit_solid
 
 
 def looking_at(origin: np.ndarray, target: np.ndarray) -> tuple[CameraModel, np.ndarray]:
@@ -83,3 +83,33 @@ def test_one_view_does_not_tell():
     assert fit_solid(masks, TARGET, CAMERAS, POSES) is None
     masks = masks_of(SQUARE, np.full(3, 0.05), np.array([0.3, 0.05, 0.025]), 0.0)
     assert fit_solid(masks, np.full(3, np.nan), CAMERAS, POSES) is None
+
+
+@pytest.mark.parametrize(('outline', 'yaw'), [(SQUARE, 0.4), (CIRCLE, 0.0)])
+@pytest.mark.parametrize('turn', [0.0, 0.6])
+def test_what_is_half_hidden_is_found_again_to_two_millimetres(outline, yaw, turn):
+    size, centre = np.array([0.05, 0.05, 0.06]), np.array([0.31, 0.04, 0.03])
+    whole = fit_solid(masks_of(outline, size, centre, yaw), TARGET, CAMERAS, POSES)
+    assert whole is not None
+    way = np.array([-0.05, 0.04, 0.0])
+    masks = masks_of(outline, size, centre + way, yaw + turn)
+    for mask in masks:
+        rows, columns = np.nonzero(mask)
+        mask[: int(np.quantile(rows, 0.4)), int(np.quantile(columns, 0.2)) :] = False
+    found = find_solid(whole, masks, TARGET, CAMERAS, POSES)
+    assert found is not None
+    np.testing.assert_allclose(found.centre - whole.centre, way, atol=0.002)
+    np.testing.assert_array_equal(found.size, whole.size)
+    turned = turn if outline is SQUARE else 0.0
+    x, y = whole.turn_to(found)[:2, 0]
+    assert abs(np.sin(2 * (np.arctan2(y, x) - turned))) < 0.1
+    anew = fit_solid(masks, TARGET, CAMERAS, POSES)
+    assert anew is None or np.abs(anew.centre - whole.centre - way).max() > 0.003
+
+
+def test_what_lies_on_its_side_is_another_solid():
+    size = np.array([0.03, 0.03, 0.09])
+    whole = fit_solid(masks_of(SQUARE, size, TARGET, 0.0), TARGET, CAMERAS, POSES)
+    lying = masks_of(SQUARE, size[[2, 0, 1]], TARGET, 0.0)
+    assert whole is not None and find_solid(whole, lying, TARGET, CAMERAS, POSES) is None
+    assert find_solid(whole, np.zeros_like(lying), TARGET, CAMERAS, POSES) is None

@@ -111,9 +111,8 @@ def test_motions_that_foresee_no_fingers_are_told_by_others(shares, told):
 
     found = FoundObjects(
         names=(),
-        frames=np.zeros((2, 4, 4, 3), np.uint8),
-        masks=np.zeros((2, 0, 4, 4), bool),
-        poses=np.tile(np.eye(4), (2, 1, 1)),
+        cuts=np.zeros((2, 0, 4, 4, 4), np.uint8),
+        poses=np.zeros((2, 0, 4, 4)),
         tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3))),
         motions=tuple(map(motion, shares)),
         positions=positions,

@@ -39,6 +39,7 @@ from mtv_world_ros.model.object_motion.stacked import stacked
 from mtv_world_ros.model.tensor_files import disk_errors
 
 if TYPE_CHECKING:
+    from mtv_world_ros.geometry.solids import Solid
     from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 
 #: settings of rigid bodies, beside the networks
@@ -153,32 +154,90 @@ class ObjectMotionPredictor:
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
-        points = locate_all(cameras, poses, centroids(masks))
-        features = object_shapes(masks, points, cameras, poses)
-        contact = self._solids(names, masks, points, cameras, poses)
-        return TrackedObjects(model=self, reference=points, features=features, contact=contact)
+        return self._find(names, masks, cameras, poses, [None] * len(names))
 
-    def _solids(
+    def find_again(
+        self,
+        whole: TrackedObjects,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+    ) -> tuple[TrackedObjects, BoolArray]:
+        """Returns objects that something may hide in part by now; see `ObjectMotionModel`.
+
+        Only where motions of rigid bodies are foreseen; without them all are found anew.
+        """
+        nothing = np.zeros(len(names), np.bool_)
+        if whole.contact is None:
+            return self.find(names, masks, cameras, poses), nothing
+        from mtv_world_ros.geometry.solids import find_solid
+
+        points = locate_all(cameras, poses, centroids(masks))
+        before = whole.contact.solids
+        solids = [
+            solid and find_solid(solid, masks[:, item], points[item], cameras, poses)
+            for item, solid in enumerate(before)
+        ]
+        anew = self._find(names, masks, cameras, poses, solids)
+        same = np.array([solid is not None for solid in solids], np.bool_)
+        centres, turned = whole.contact.centres, np.tile(np.eye(3), (len(names), 1, 1))
+        for item in map(int, np.flatnonzero(same)):
+            was, now = before[item], solids[item]
+            assert was is not None and now is not None
+            turned[item] = was.turn_to(now)
+            anew.reference[item] = now.centre + turned[item] @ (whole.reference[item] - was.centre)
+            anew.features[item] = whole.features[item]
+        assert anew.contact is not None
+        seen = Seen(
+            reference=np.where(same[:, None], whole.reference, anew.reference),
+            centres=np.where(same[:, None], centres, anew.contact.centres),
+            turned=turned,
+        )
+        return replace(anew, seen=seen), same
+
+    def _find(
         self,
         names: Sequence[str],
         masks: BoolArray,
-        points: FloatArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
-    ) -> ContactMotions | None:
+        known: Sequence[Solid | None],
+    ) -> TrackedObjects:
+        """What `find` returns; solids that are not known are fitted."""
+        points = locate_all(cameras, poses, centroids(masks))
+        features = object_shapes(masks, points, cameras, poses)
+        found = TrackedObjects(model=self, reference=points, features=features)
         response = self.members[0].response
         if self.contact is None:
-            return None
+            return found
         assert response is not None  # checked when it was loaded
         from mtv_world_ros.geometry.solids import fit_solid, is_vessel
         from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 
         table = self.contact.table_m
+        rows = enumerate(zip(known, names, points, strict=True))
         solids = [
-            fit_solid(masks[:, item], point, cameras, poses, table, is_open=is_vessel(name))
-            for item, (name, point) in enumerate(zip(names, points, strict=True))
+            solid or fit_solid(masks[:, k], at, cameras, poses, table, is_open=is_vessel(name))
+            for k, (solid, name, at) in rows
         ]
-        return ContactMotions(settings=self.contact, response=response, solids=tuple(solids))
+        contact = ContactMotions(settings=self.contact, response=response, solids=tuple(solids))
+        return replace(found, contact=contact)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """How O objects were in the frames that their motions count from.
+
+    Attributes:
+        reference: (O, 3) where they were [m].
+        centres: (O, 3) where their solids were [m].
+        turned: (O, 3, 3) from there to where they were found.
+    """
+
+    reference: FloatArray
+    centres: FloatArray
+    turned: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,6 +250,7 @@ class TrackedObjects:
         features: (O, V, F) of `object_shapes`.
         before: when they were last asked; None = nothing has moved yet.
         contact: the same objects as rigid bodies; None = networks alone.
+        seen: what their motions count from; None = from where they were found.
     """
 
     model: ObjectMotionPredictor
@@ -198,6 +258,7 @@ class TrackedObjects:
     features: FloatArray
     before: _Before | None = None
     contact: ContactMotions | None = None
+    seen: Seen | None = None
 
     @property
     def step_s(self) -> float:
@@ -217,7 +278,8 @@ class TrackedObjects:
         """
         widths = self.features[..., :4]
         least = np.where((widths > 0).any(-1, keepdims=True), widths, np.inf).min(1).mean(-1)
-        height = 2 * np.maximum(self.reference[:, 2], _LEAST_HEIGHT_M)
+        stood = self.reference if self.seen is None else self.seen.reference
+        height = 2 * np.maximum(stood[:, 2], _LEAST_HEIGHT_M)
         sizes = np.stack([least, least, height], axis=-1)
         sizes = np.broadcast_to(sizes, (1 + self.model.num_disturbed, *sizes.shape))
         return sizes if self.contact is None else np.concatenate([sizes, self.contact.sizes])
@@ -261,17 +323,18 @@ class TrackedObjects:
         ways = motion.points.double().numpy() - places[rows, None]
         points = np.where(known[:, None], self.reference + ways, np.nan)[kept]
         rotations = motion.rotations.double().numpy()[kept]
+        contact, seen = self.contact, self.seen
+        reference = self.reference if seen is None else seen.reference
         motions = [
-            ObjectMotion(reference=self.reference, points=way, rotations=turns)
+            ObjectMotion(reference=reference, points=way, rotations=turns)
             for way, turns in zip(points, rotations, strict=True)
         ]
-        contact = self.contact
         if contact is not None:
             robot, every = self.model.robot, self.commands_a_step
             bodies, contact = contact.advance(robot, positions, every, self.model.helpers)
             motions += [
                 ObjectMotion(
-                    reference=contact.centres,
+                    reference=contact.centres if seen is None else seen.centres,
                     points=way,
                     rotations=turns,
                     openings=robot.gripper_openings(joints).T,
@@ -281,6 +344,8 @@ class TrackedObjects:
                     bodies.points, bodies.rotations, bodies.joints, strict=True
                 )
             ]
+        if seen is not None:
+            motions = [replace(one, rotations=one.rotations @ seen.turned) for one in motions]
         before = _Before(
             memory=memory, tools=tools[:, -2], gaps=gaps[:, -2], arms=arms, steps=first + count
         )

@@ -10,7 +10,7 @@ import numpy as np
 from mtv_world_ros.data.recording import Clip
 from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.object_motion import moved_pictures, ObjectMotion
+from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
@@ -107,10 +107,9 @@ class ControlMaker:
         )
         at_first = origin.positions[None]
         return moved_pictures(
-            origin.frames,
-            self._masks(origin.frames, names),
+            cut_outs(origin.frames, self._masks(origin.frames, names)),
             motion,
             clip.cameras,
-            [camera_poses(camera, self.robot, at_first)[0] for camera in clip.cameras],
+            np.stack([camera_poses(camera, self.robot, at_first) for camera in clip.cameras]),
             np.stack([camera_poses(c, self.robot, clip.positions) for c in clip.cameras]),
         )

@@ -430,6 +430,38 @@ def test_a_checkpoint_foresees_by_both(folder, robot, recording):
     np.testing.assert_allclose(on[-1].points[0], moved[-1].points[-1], atol=1e-9)
 
 
+def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, robot, recording):
+    model = load_predictor(folder, robot)
+    frame, names = recording.frame, ['red block'] * len(recording.solids)
+    whole = model.find(names, frame.masks, frame.cameras, frame.poses)
+    hidden = frame.masks.copy()
+    rows = np.nonzero(hidden[0, 0])[0]
+    hidden[:, :, : int(np.median(rows))] = False
+    hidden[:, 1] = False
+    now, same = model.find_again(whole, names, hidden, frame.cameras, frame.poses)
+    np.testing.assert_array_equal(same, [True, False])
+    np.testing.assert_allclose(now.reference[0], whole.reference[0], atol=0.002)
+    motions, _ = now.advance(recording.positions[:51])
+    for motion in motions:
+        assert np.abs(motion.ways[0, 0]).max() < 0.006 and np.isnan(motion.ways[0, 1]).all()
+    np.testing.assert_allclose(now.sizes[:, 0], whole.sizes[:, 0], atol=1e-9)
+    was = whole.contact.solids[0]
+    moved = replace(was, centre=was.centre + [0.05, 0.0, 0.02], yaw=was.yaw + 0.5)
+    seen = replace(whole, contact=replace(whole.contact, solids=(moved, whole.contact.solids[1])))
+    now, same = model.find_again(seen, names, frame.masks, frame.cameras, frame.poses)
+    assert same.all()
+    motions, _ = now.advance(recording.positions[:6])
+    np.testing.assert_allclose(motions[-2].ways[0, 0], [-0.05, 0, -0.02], atol=0.003)
+    turned = motions[-2].rotations[0, 0]
+    assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(-0.5, abs=0.05)
+    np.testing.assert_allclose(motions[0].rotations[0, 0], turned, atol=1e-6)
+    (folder / CONTACT_FILE).unlink()
+    alone = load_predictor(folder, robot)
+    one = alone.find(names, frame.masks, frame.cameras, frame.poses)
+    _, same = alone.find_again(one, names, frame.masks, frame.cameras, frame.poses)
+    assert not same.any()
+
+
 def test_a_bad_contact_file_is_named(folder, robot, monkeypatch):
     file = folder / CONTACT_FILE
     values = json.loads(file.read_text())
