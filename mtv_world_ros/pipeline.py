@@ -553,9 +553,9 @@ class ImaginedEpisode:
         self, state: RolloutState, objects: FoundObjects, num_left: int
     ) -> ForeseenMotions | None:
         """Motions until the end of a chunk without its last frames; None = they do not count."""
-        # where the rollout began earlier, objects were found half hidden, or off the table
+        # where the rollout began earlier, objects may have been found half hidden, or in a grip
         begun = state.memory is None or state.memory.num_frames == 1 + state.num_imagined
-        if not begun:
+        if not begun and not objects.is_whole:
             return None
         left_s = num_left / self.pipeline.spec.fps
         num = len(objects.motions[0].points) - round(left_s / objects.tracked.step_s)

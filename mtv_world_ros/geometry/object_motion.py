@@ -160,6 +160,7 @@ class FoundObjects:
         positions: (N, J) joints at their rows [rad or m].
         part_row: row at which the last part of a plan begins.
         shown: which of the motions pictures show.
+        is_whole: whether all were seen whole, now or before.
     """
 
     names: tuple[str, ...]
@@ -170,6 +171,7 @@ class FoundObjects:
     positions: FloatArray | None = None
     part_row: int = 0
     shown: int = 0
+    is_whole: bool = False
 
     @classmethod
     def at(
@@ -187,9 +189,8 @@ class FoundObjects:
     def shown_as(self, whole: FoundObjects, same: BoolArray) -> FoundObjects:
         """Returns these, those of `same` (O,) with the pictures of when they were seen whole."""
         cuts = np.where(same[:, None, None, None], whole.cuts, self.cuts)
-        return replace(
-            self, cuts=cuts, poses=np.where(same[:, None, None], whole.poses, self.poses)
-        )
+        poses = np.where(same[:, None, None], whole.poses, self.poses)
+        return replace(self, cuts=cuts, poses=poses, is_whole=bool(same.all()))
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
         """Returns the objects after each part of a plan, which show the same motion as before.

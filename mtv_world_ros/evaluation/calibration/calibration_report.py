@@ -15,6 +15,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
     Calibrated,
     FITTED,
     OBSERVED,
+    RESUMED,
     Sample,
     UNFORESEEN,
 )
@@ -39,7 +40,8 @@ _ROWS = {
     AFTER: 'after: each task left out of the fit',
     AFTER_KINDS: 'after: each fault kind left out of the fit',
     OBSERVED: 'the recorded frames, each kind or task left out of a fit to them',
-    UNFORESEEN: 'all but the last chunk seen, each kind or task left out of a fit to them',
+    RESUMED: 'all but the last chunk seen, each kind or task left out',
+    UNFORESEEN: 'the same with nothing foreseen, each kind or task left out of a fit to them',
     FITTED: 'on what it was fitted on (too good)',
     ALWAYS: 'to say "success" always',
 }

@@ -25,7 +25,7 @@ MIN_EPISODES = 8
 MAX_BIAS = 30.0
 #: what the scores are called, in the order of the tables
 BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
-OBSERVED, UNFORESEEN = 'observed', 'unforeseen'
+OBSERVED, UNFORESEEN, RESUMED = 'observed', 'unforeseen', 'resumed'
 ALWAYS = 'always success'
 
 
@@ -63,8 +63,14 @@ class Sample:
 
     @property
     def as_resumed(self) -> Sample:
-        """The same with all but the last chunk seen, so that nothing is foreseen."""
+        """The same with all but the last chunk seen."""
         return replace(self, features=(self.resumed,))
+
+    @property
+    def as_unforeseen(self) -> Sample:
+        """The same with nothing foreseen; empty where pictures do not tell."""
+        told = isfinite(self.resumed.get('margin', nan))
+        return replace(self, features=({**self.resumed, 'foreseen': nan} if told else {},))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,8 +83,10 @@ class Calibrated:
         judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
             `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
             only where there are faults), `OBSERVED` (the same of the recorded frames, by a fit to
-            them), `UNFORESEEN` (with all but the last chunk seen, by a fit to them), `FITTED` (on
-            what it was fitted on: too good) -> one per sample.
+            them), `UNFORESEEN` (with all but the last chunk seen and nothing foreseen, by a fit to
+            them), `RESUMED` (with all but the last chunk seen, by the fit for where something is
+            foreseen or by that for where nothing is), `FITTED` (on what it was fitted on: too
+            good) -> one per sample.
     """
 
     calibration: Calibration
@@ -150,11 +158,18 @@ def calibrate(
     special: dict[str, Any] = {}
     for name, others in (
         (OBSERVED, [sample.as_observed for sample in samples]),
-        (UNFORESEEN, [sample.as_resumed for sample in samples]),
+        (UNFORESEEN, [sample.as_unforeseen for sample in samples]),
     ):
         if _tells(others):
             special[name] = Weights(**_weights(others, l2))
             judgements[name] = _left_out(others, groups, segmenter, l2)
+    if UNFORESEEN in judgements:
+        resumed = [sample.as_resumed for sample in samples]
+        told = _left_out(samples, groups, segmenter, l2, resumed)
+        judgements[RESUMED] = tuple(
+            one if isfinite(sample.resumed.get('foreseen', nan)) else other
+            for sample, one, other in zip(samples, told, judgements[UNFORESEEN], strict=True)
+        )
     scores = {name: agreement(found) for name, found in judgements.items()}
     calibration = Calibration(**fitted, **special, scores=scores, made=dict(made or {}))
     return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
@@ -177,9 +192,16 @@ def _tells(samples: Sequence[Sample]) -> bool:
 
 
 def _left_out(
-    samples: Sequence[Sample], groups: Sequence[set[str]], segmenter: str, l2: float
+    samples: Sequence[Sample],
+    groups: Sequence[set[str]],
+    segmenter: str,
+    l2: float,
+    judged_as: Sequence[Sample] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Every sample judged by a fit that has seen no sample which shares a group with it."""
+    """Every sample judged by a fit that has seen no sample which shares a group with it.
+
+    Samples may be judged as others of the same episodes, `judged_as`.
+    """
     fits: dict[frozenset[str], dict[str, Any] | None] = {}
     for left_out in set(map(frozenset, groups)):
         others = [
@@ -190,7 +212,7 @@ def _left_out(
         enough = len({sample.success for sample in others}) == 2
         fits[left_out] = _fit(others, segmenter, l2) if enough else None
     judged = []
-    for sample, group in zip(samples, groups, strict=True):
+    for sample, group in zip(judged_as or samples, groups, strict=True):
         fit = fits[frozenset(group)]
         judged.append(_judged(sample, nan if fit is None else _probability(fit, sample)))
     return tuple(judged)

@@ -23,6 +23,7 @@ from mtv_world_ros.evaluation.calibration.fit import (
     fit_logistic,
     FITTED,
     OBSERVED,
+    RESUMED,
     Sample,
     UNFORESEEN,
 )
@@ -304,7 +305,16 @@ def test_where_nothing_is_foreseen_what_began_in_mid_episode_is_fitted():
     assert usual.weights == calibrate(samples, segmenter='colour').calibration.weights
     assert found.calibration.given(True, False) == found.calibration.given(True)
     text = markdown(found, None)
-    assert '| all but the last chunk seen, each kind or task left out of a fit to them |' in text
+    assert (
+        '| the same with nothing foreseen, each kind or task left out of a fit to them |' in text
+    )
+    assert found.judgements[RESUMED] == found.judgements[UNFORESEEN]
+    foreseen = [replace(s, resumed={**s.resumed, 'foreseen': 0.9}) for s in begun]
+    both = calibrate(foreseen, segmenter='colour')
+    assert both.calibration.unforeseen == found.calibration.unforeseen
+    assert both.judgements[UNFORESEEN] == found.judgements[UNFORESEEN]
+    told = [judged.probability for judged in both.judgements[RESUMED]]
+    assert told[1] != both.judgements[UNFORESEEN][1].probability
     assert '## Weights where no motion is foreseen' in text
 
 
