@@ -279,7 +279,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-warp-0.045',
         'expert-warp-0.055',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-slump-0.06',
+        'expert-slump-0.15',
+        'expert-grid-0.05',
+        'expert-grid-0.06',
+        'expert-vise-0.015',
+        'expert-vise-0.025',
+        'expert-slap-0.03',
+        'expert-slap-0.07',
+        'expert-roam-2',
+        'expert-roam-3',
+        'expert-wane-0.18',
+        'expert-wane-0.22',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

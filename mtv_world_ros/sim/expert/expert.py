@@ -12,7 +12,7 @@ from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
-from mtv_world_ros.sim.expert.way_points import Pull, WayPoint, WayPointFaults
+from mtv_world_ros.sim.expert.way_points import Pull, pushed, WayPoint, WayPointFaults
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.sim.world.placement import side_of
@@ -22,6 +22,8 @@ from mtv_world_ros.sim.world.workcell import Workcell, workcell_of
 #: how long an arm stays where it crowds another, before scaling [s]; by how much of the whole way
 #: its share is reduced until it reaches so far
 _STAYS_S, _LESS = 0.4, 0.05
+#: time in which an arm strikes what another carries, before scaling [s]
+_SLAP_S = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,6 +206,12 @@ def _rise(height: float) -> FloatArray:
     return np.array([0.0, 0.0, height])
 
 
+def _flat(way: FloatArray) -> FloatArray:
+    """Unit vector (3,) of a way in the plane; none where there is no way."""
+    flat = way * (1, 1, 0)
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
 def _missed_move(task: Task, rng: np.random.Generator) -> int:
     return int(rng.integers(len(task.moves)))
 
@@ -255,33 +263,23 @@ class Expert:
         for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
             pick = self._pick(now, move, rng, miss=number == missed)
             stops = usual = self._stops(pick, move, now, goal, rng)
-            crowds: dict[str, float] = {}
-            poached, pulls = 0.0, list[Pull]()
-            if faults is not None and number == faults.move_of(len(task.moves)):
-                objects = [np.asarray(item.position) for item in now.values()]
-                stops, crowds = faults.applied(stops, pick.yaw, objects), faults.crowds
-                poached, pulls = faults.poached, faults.pulls(stops, objects)
-                usual = usual if faults.keeps_tempo else stops
+            objects = [np.asarray(item.position) for item in now.values()]
+            is_wrong = faults is not None and number == faults.move_of(len(task.moves))
+            wrong = faults if is_wrong else None
+            if wrong is not None:
+                stops = wrong.applied(stops, pick.yaw, objects)
+                usual = usual if wrong.keeps_tempo else stops
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
+            others = [arm for arm in self._tools if arm != pick.arm]
+            comes: list[tuple[FloatArray, int]] = []
+            if wrong is not None and others:
+                stops, comes = self._company(pick.arm, others[0], stops, wrong, objects, pace)
             rows = self._follow(pick.arm, stops, pace)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
             start = max(1, busy - overlap, free.get(pick.arm, 1))
             busy = free[pick.arm] = start + len(rows)
             last_arm = pick.arm
             positions = self._lay(positions, rows, start, pick.arm)
-            others = [arm for arm in self._tools if arm != pick.arm]
-            comes = [
-                self._crowd(pick.arm, other, stops, phase, share, pace)
-                for other in others[:1]
-                for phase, share in crowds.items()
-            ]
-            if poached and others:
-                comes.append(self._poach(pick.arm, others[0], stops, poached, pace))
-            comes += [
-                self._pull(pick.arm, other, stops, pull, pace)
-                for other in others[:1]
-                for pull in pulls
-            ]
             for rows, before in comes:
                 first = max(start + before, free.get(others[0], 1))
                 free[others[0]] = first + len(rows)
@@ -408,6 +406,32 @@ class Expert:
         wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
         return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
 
+    def _company(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        faults: WayPointFaults,
+        objects: list[FloatArray],
+        pace: tuple[float, float],
+    ) -> tuple[list[WayPoint], list[tuple[FloatArray, int]]]:
+        """Way points of a move, and what another arm does meanwhile: rows, and how late."""
+        comes: list[tuple[FloatArray, int]] = []
+        if faults.squeezed:
+            first, came = self._squeeze(arm, other, stops, faults.squeezed, pace)
+            stops, comes = [*first, *stops], [came]
+        for phase, share in faults.crowds.items():
+            comes.append(self._crowd(arm, other, stops, phase, share, pace))
+        if faults.poached:
+            comes.append(self._poach(arm, other, stops, faults.poached, pace))
+        for pull in faults.pulls(stops, objects):
+            comes.append(self._pull(arm, other, stops, pull, pace))
+        if faults.slapped:
+            comes.append(self._slap(arm, other, stops, faults.slapped, pace))
+        if places := faults.roams(objects):
+            comes.append((self._roam(other, places, pace), 0))
+        return stops, comes
+
     def _crowd(
         self,
         arm: str,
@@ -494,6 +518,79 @@ class Expert:
         arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
         begins = (arrives - sum(self._timed(done[:3], home))) * pace[0] / pace[1]
         return rows, max(round(begins * config.rate_hz), 0)
+
+    def _squeeze(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[list[WayPoint], tuple[FloatArray, int]]:
+        """Way points of an arm that squeezes its object against another one's hand.
+
+        And rows of that one, which pushes from its side, and how late they begin. Where it does
+        not reach so far, it pushes nearer to where it rests.
+        """
+        own, home = (self.workcell.home_tools[one] for one in (arm, other))
+        to, rise = _flat(home - own), _rise(self._config.above_grasp[0])
+        at = replace(next(stop for stop in stops if stop.phase == 'close'), seconds=None)
+
+        def ways(share: float) -> list[WayPoint]:
+            there = at.moved((1 - share) * (home - at.position) * (1, 1, 0))
+            return [*pushed(there, size, rise, -to), self._rests(other)]
+
+        first = pushed(at, size, rise, to)
+        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        # both are down beside it at the same time: the one that is sooner there starts later
+        (over, down, *_), (far, near, *_) = self._timed(first, own), self._timed(done, home)
+        late = over + down - far - near
+        first[0] = replace(first[0], seconds=over + max(-late, 0.0))
+        return first, (rows, round(max(late, 0.0) * pace[0] / pace[1] * self._config.rate_hz))
+
+    def _slap(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that strikes what this one carries, and how late they begin.
+
+        That is when it is over its goal. Where the other does not reach so far, it strikes nearer
+        to where it rests.
+        """
+        over, home = max([s.phase for s in stops].index('open') - 2, 0), self._rests(other)
+        met = stops[over]
+
+        def ways(share: float) -> list[WayPoint]:
+            at = met.moved((1 - share) * (home.position - met.position) * (1, 1, 0))
+            to = _flat(at.position - home.position)
+            _, back, hit, _ = pushed(replace(at, seconds=None), size, _rise(0.0), to)
+            return [back, replace(hit, seconds=_SLAP_S), home]
+
+        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        arrives = sum(self._timed(stops[: over + 1], self._rests(arm).position))
+        begins = (arrives - self._timed(done, home.position)[0]) * pace[0] / pace[1]
+        return rows, max(round(begins * self._config.rate_hz), 0)
+
+    def _roam(self, other: str, places: list[FloatArray], pace: tuple[float, float]) -> FloatArray:
+        """Rows of another arm that roams through places, low and open, as far as it reaches."""
+        home, rise = self._rests(other), _rise(self._config.retreat)
+
+        def ways(share: float) -> list[WayPoint]:
+            ends = (home.position * (1, 1, 0) + place * (0, 0, 1) for place in places)
+            low = [
+                replace(home, phase='above', position=end + share * (place - end))
+                for place, end in zip(places, ends, strict=True)
+            ]
+            return [low[0].moved(rise), *low, low[-1].moved(rise), home]
+
+        return self._as_far_as_it_reaches(other, ways, 1.0, pace)[0]
+
+    def _rests(self, arm: str) -> WayPoint:
+        return WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
 
     def _as_far_as_it_reaches(
         self,

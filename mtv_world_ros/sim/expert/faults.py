@@ -200,6 +200,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of how far it has carried the object by which the arm hangs too low',
     ),
+    'slump': _kind(
+        'height',
+        'test',
+        0.1,
+        0.3,
+        'm',
+        'once, the arms give way under their weight, sink this far, and rise again',
+    ),
     # lateral
     'shift': _kind(
         'lateral',
@@ -258,6 +266,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'on its way down, it swings from side to side with open fingers, this far',
+    ),
+    'grid': _kind(
+        'lateral',
+        'test',
+        0.05,
+        0.15,
+        'm',
+        'all places are those of a grid in the plane with cells of this width',
     ),
     # wrist
     'turn': _kind('wrist', 'train', 0.8, 1.6, 'rad', 'the wrist is turned about the vertical'),
@@ -631,6 +647,30 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'over the goal, the other arm closes on what this one holds, and pulls it this far',
     ),
+    'vise': _kind(
+        'collision',
+        'test',
+        0.02,
+        0.06,
+        'm',
+        'the shut hands of both arms first squeeze the object from either side, this deep',
+    ),
+    'slap': _kind(
+        'collision',
+        'test',
+        0.05,
+        0.12,
+        'm',
+        'over the goal, the other arm hits what this one holds in one quick stroke, this far',
+    ),
+    'roam': _kind(
+        'collision',
+        'test',
+        2,
+        6,
+        '',
+        'number of places near objects that the other arm roams through meanwhile, low and open',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -879,6 +919,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.5,
         'rad',
         'every arm joint is off by a wave over its angle, with this amplitude',
+    ),
+    'wane': _kind(
+        'joint',
+        'test',
+        0.2,
+        0.5,
+        '',
+        'share that all arm joints lack of their travel at the end; at first they lack none',
     ),
     # regrasp
     'retry': _kind(
@@ -1130,6 +1178,9 @@ _BACK_S = 0.4
 _RESTART_S = 0.8
 #: periods of a wavy error over one turn of a joint
 _NUM_WAVES = 4
+#: time in which arms that give way sink, lie, and rise again [s]; a step to find out which joint
+#: lowers the tool by how much [rad]; squares of those that are too small to sink by [m2/rad2]
+_SLUMP_S, _STEP_RAD, _LEAST_SLOPE = (0.3, 0.4, 0.6), 1e-4, 1e-3
 #: time in which a constant error sets in [s]
 _SET_IN_S = 1.0
 #: how often commands are lost
@@ -1156,7 +1207,18 @@ _DAMPING = 0.2
 #: time in which the arms begin to swap their commands, and in which they do [s]
 _SWAP_S = (0.2, 0.4)
 #: kinds in which one arm does what another should
-_OF_TWO_ARMS = ('mirror', 'swap', 'crowd', 'rival', 'poach', 'budge', 'tug')
+_OF_TWO_ARMS = (
+    'mirror',
+    'swap',
+    'crowd',
+    'rival',
+    'poach',
+    'budge',
+    'tug',
+    'vise',
+    'slap',
+    'roam',
+)
 #: kinds of what a gripper does
 _OF_GRIPPERS = (
     'starve',
@@ -1203,6 +1265,8 @@ _OF_GRIPPERS = (
     'droop',
     'budge',
     'tug',
+    'vise',
+    'slap',
 )
 #: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
 #: one command to the next, both as shares of its range; how much faster they go back
@@ -1469,6 +1533,11 @@ def _off_course(
             positions, grippers, float(share), round(variant.size('lapse') / period)
         )
         positions = np.clip(positions, robot.lower, robot.upper)
+    if variant.size('slump'):
+        share, depth = _own(rng).uniform(*_BRAKES), variant.size('slump')
+        positions = _slump(positions, robot, float(share), depth, period)
+        positions = np.clip(positions, robot.lower, robot.upper)
+    positions = _wane(positions, grippers, variant.size('wane'))
     if variant.size('warp'):
         positions = _warp(positions, grippers, variant.size('warp'), _own(rng))
         positions = np.clip(positions, robot.lower, robot.upper)
@@ -1993,6 +2062,37 @@ def _tow(
     whole, ways = positions.copy(), share * (positions - positions[0])
     for arm in np.delete(np.arange(positions.shape[1]), grippers).reshape(num_arms, -1):
         whole[:, arm[1:]] += ways[:, arm[:-1]] * rng.choice((-1.0, 1.0), len(arm) - 1)
+    return whole
+
+
+def _slump(
+    positions: FloatArray, robot: RobotModel, share: float, depth: float, period: float
+) -> FloatArray:
+    """(T, J): at a share of the plan, all tools sink, and rise again.
+
+    A joint gives way by as much as its arm's weight turns it: by how much it lowers the tool.
+    """
+
+    def heights(at: FloatArray) -> FloatArray:
+        return np.stack([poses[:, 2, 3] for poses in robot.tool_poses(at)], axis=1)
+
+    since = (np.arange(len(positions)) - share * len(positions)) * period
+    sunk = depth * np.interp(since, np.cumsum([0.0, *_SLUMP_S]), [0.0, 1.0, 1.0, 0.0])
+    now, slopes = heights(positions), np.zeros((len(robot.tools), *positions.shape))
+    for joint in np.delete(np.arange(positions.shape[1]), _grippers(robot)):
+        step = _STEP_RAD * (np.arange(positions.shape[1]) == joint)
+        slopes[:, :, joint] = ((heights(positions + step) - now) / _STEP_RAD).T
+    squares = np.maximum((slopes**2).sum(axis=2, keepdims=True), _LEAST_SLOPE)
+    return positions - (sunk[:, None] * slopes / squares).sum(axis=0)
+
+
+def _wane(positions: FloatArray, grippers: list[int], lacking: float) -> FloatArray:
+    """(T, J): the later it is, the less far all arm joints go, by a share at the end."""
+    if not lacking:
+        return positions
+    shares = np.linspace(0.0, lacking, len(positions))[:, None]
+    whole = positions - shares * (positions - positions[0])
+    whole[:, grippers] = positions[:, grippers]
     return whole
 
 

@@ -78,6 +78,7 @@ _KEEP_TEMPO = frozenset(
         'hunt',
         'yawn',
         'waver',
+        'vise',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -138,6 +139,8 @@ _HOPS, _HOP_RISE_M = (0.2, 0.4), 0.04
 _NUM_HUNTS, _HUNT_S = 5, 0.25
 #: from how high above another arm comes for what is next to the goal [m]
 _BUDGE_RISE_M = 0.07
+#: another arm roams: standard deviation of how far off objects [m], and how low at least [m]
+_ROAM_BESIDE_M, _ROAM_LEAST_M = 0.04, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +222,29 @@ class WayPointFaults:
     def poached(self) -> float:
         """How far another arm carries away what this one has let go [m]; 0 = it does not."""
         return self._variant.size('poach')
+
+    @property
+    def squeezed(self) -> float:
+        """How deep the hands of two arms squeeze the object first [m]; 0 = they do not."""
+        return self._variant.size('vise')
+
+    @property
+    def slapped(self) -> float:
+        """How far another arm strikes what this one carries [m]; 0 = it does not."""
+        return self._variant.size('slap')
+
+    def roams(self, objects: Sequence[FloatArray]) -> list[FloatArray]:
+        """Returns the places (3,) that another arm roams through meanwhile [m], drawn.
+
+        Args:
+            objects: (3,) centre of every object of the scene [m].
+        """
+        places, rng = list[FloatArray](), self._play
+        for _ in range(round(self._variant.size('roam'))):
+            x, y, z = objects[int(rng.integers(len(objects)))]
+            beside = rng.normal(0.0, _ROAM_BESIDE_M, 2)
+            places.append(np.array([x + beside[0], y + beside[1], max(z, _ROAM_LEAST_M)]))
+        return places
 
     def pulls(self, stops: Stops, objects: Sequence[FloatArray]) -> list[Pull]:
         """Returns what another arm pulls at meanwhile.
@@ -453,7 +479,7 @@ def _dive(stops: Stops, size: float, side: _Side) -> Stops:
 def _sweep(stops: Stops, size: float, side: _Side) -> Stops:
     """Shut fingers come down beside the object and push it across the fingers."""
     above, grasp = stops[0], stops[_first(stops, 'grasp')]
-    return [*_pushed(grasp, size, above.position - grasp.position, side.across), *stops]
+    return [*pushed(grasp, size, above.position - grasp.position, side.across), *stops]
 
 
 def _stir(stops: Stops, size: float, side: _Side) -> Stops:
@@ -471,13 +497,21 @@ def _knock(stops: Stops, size: float, side: _Side) -> Stops:
     floor = stops[_first(stops, 'grasp')].position[2]
     place = lower.position - _up(min(0.02, max(lower.position[2] - floor, 0.0)))
     there = replace(lower, position=place)
-    return [*_pushed(there, size, _up(0.09), side.anywhere), *stops]
+    return [*pushed(there, size, _up(0.09), side.anywhere), *stops]
 
 
-def _pushed(
+def pushed(
     at: WayPoint, size: float, rise: FloatArray, to: FloatArray, before: float = 0.0
 ) -> Stops:
-    """Down `before` and more beside a way point, shut, and on until `size` behind it; up again."""
+    """Returns four way points of shut fingers that push what is at another one.
+
+    Args:
+        at: where they push.
+        size: how far behind it they come [m].
+        rise: (3,) from which they come down, and to which they rise again [m].
+        to: unit vector (3,) in which they push.
+        before: how much farther off they come down [m].
+    """
     shut = replace(at, phase='above', opening=0.0)
     # half a finger and half a small object lie between the tool and the object's centre
     away, end = -(before + 0.07) * to, (size - 0.03) * to
@@ -492,7 +526,7 @@ def _herd(stops: Stops, size: float, side: _Side) -> Stops:
     above, grasp = stops[0], stops[_first(stops, 'grasp')]
     along, across = (float(side.play.choice((-1.0, 1.0))) * to for to in (side.along, side.across))
     there = grasp.moved(size * along + _HERD_BESIDE_M * across)
-    push = _pushed(there, 0.0, above.position - grasp.position, along, size)
+    push = pushed(there, 0.0, above.position - grasp.position, along, size)
     return [*push, *_changed(stops, (*_GRASP, 'lift'), lambda stop: stop.moved(size * along))]
 
 
@@ -532,7 +566,7 @@ def _putt(stops: Stops, size: float, side: _Side) -> Stops:
     on = _direction(stops[_first(stops, 'grasp')], goal, size, lambda: side.anywhere)
     short = [stop.moved(-size * on) for stop in stops[lower - 1 : end]]
     beside = side.play.normal(0.0, _PUTT_BESIDE_M) * np.array([-on[1], on[0], 0.0])
-    push = _pushed(goal.moved(beside), 0.0, rise, on, size)
+    push = pushed(goal.moved(beside), 0.0, rise, on, size)
     return [*stops[: lower - 1], *short, *push, *stops[end:]]
 
 
@@ -793,7 +827,7 @@ def _tidy(stops: Stops, size: float, side: _Side) -> Stops:
     cos, sin = np.cos(angle), np.sin(angle)
     beside = side.play.normal(0.0, _TIDY_BESIDE_M) * np.array([-sin, cos, 0.0])
     rise = retreat.position - opened.position
-    push = _pushed(opened.moved(beside), size, rise, np.array([cos, sin, 0.0]))
+    push = pushed(opened.moved(beside), size, rise, np.array([cos, sin, 0.0]))
     return [*stops[:end], *push, *stops[end:]]
 
 
@@ -1082,7 +1116,7 @@ def _swat(stops: Stops, size: float, side: _Side) -> Stops:
     """
     above, grasp = stops[0], stops[_first(stops, 'grasp')]
     rise = above.position - grasp.position
-    over, down, hit, left = _pushed(grasp, size, rise, _drawn_way(side))
+    over, down, hit, left = pushed(grasp, size, rise, _drawn_way(side))
     return [over, down, replace(hit, seconds=_SWAT_S), left, *stops]
 
 
@@ -1111,7 +1145,7 @@ def _jostle(stops: Stops, size: float, side: _Side) -> Stops:
     at = _next_to_goal(stops, side, opened.position)
     there = replace(opened, phase='retreat', position=at, seconds=None)
     rise = _up(retreat.position[2] - at[2])
-    return [*stops[:end], *_pushed(there, size, rise, _drawn_way(side)), *stops[end:]]
+    return [*stops[:end], *pushed(there, size, rise, _drawn_way(side)), *stops[end:]]
 
 
 def _toss(stops: Stops, size: float, side: _Side) -> Stops:
@@ -1274,6 +1308,12 @@ def _droop(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:lift], *held, *stops[end:]]
 
 
+def _grid(stops: Stops, size: float, side: _Side) -> Stops:
+    """All places are the next ones of a grid."""
+    nexts = (size * np.rint(stop.position / size) - stop.position for stop in stops[:-1])
+    return [*(s.moved(way * (1, 1, 0)) for s, way in zip(stops, nexts, strict=False)), stops[-1]]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1384,4 +1424,5 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'yawn': _yawn,
     'waver': _waver,
     'droop': _droop,
+    'grid': _grid,
 }

@@ -214,7 +214,8 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    for kind in ('mirror', 'swap', 'crowd', 'rival', 'poach', 'tug', 'budge'):
+    kinds = 'mirror swap crowd rival poach tug budge vise slap roam'
+    for kind in kinds.split():
         variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
             with_faults(one, variant, franka, np.random.default_rng(0))
@@ -267,6 +268,8 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'droop',
         'tug',
         'budge',
+        'vise',
+        'slap',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1343,6 +1346,108 @@ def test_the_other_arm_closes_pulls_towards_its_rest_and_lets_go(expert, kind, s
     assert held[0] - 10 <= shut[0] <= held[-1]
 
 
+def arms_of(expert, name: str, *, kept: bool = True):
+    """Tool and opening of the arm that the expert uses; with a fault, of this and of the other.
+
+    If `kept`, the arm does what it does without the fault.
+    """
+    plans = [plan(expert, one) for one in ('expert', name)]
+    openings = [expert.robot.gripper_openings(positions) for positions in plans]
+    used = int(np.argmax(np.ptp(openings[0], axis=1)))
+    if kept:
+        halves = [np.split(positions, 2, axis=1)[used] for positions in plans]
+        np.testing.assert_array_equal(halves[1][: len(plans[0])], halves[0])
+    tools = [[poses[:, :3, 3] for poses in expert.robot.tool_poses(p)] for p in plans]
+    order = (used, 1 - used)
+    return (tools[0][used], openings[0][used]), [
+        (tools[1][arm], openings[1][arm]) for arm in order
+    ]
+
+
+def test_shut_hands_squeeze_the_object_from_either_side(expert):
+    (usual, opening), arms = arms_of(expert, 'expert-vise-0.01', kept=False)
+    place = usual[int(np.argmax(opening < 1e-3))]
+    (own, own_shut), (other, other_shut) = ((tool, opened < 1e-3) for tool, opened in arms)
+    # the first time that it is down there, and shut
+    is_low = (own[:, 2] < place[2] + 2e-3) & own_shut
+    first = int(np.argmax(is_low))
+    last = first + int(np.argmin(is_low[first:])) - 1
+    side = np.sign((other - own)[0, 0])
+    # from 7 cm off on its side, 3 cm of which are object and finger
+    np.testing.assert_allclose(own[first] - place, [-0.07 * side, 0, 0], atol=4e-3)
+    np.testing.assert_allclose(own[last] - place, [-0.02 * side, 0, 0], atol=4e-3)
+    # against the other one
+    assert other_shut[first:last].all() and (other[first:last, 2] < place[2] + 3e-3).all()
+    np.testing.assert_allclose((other[last] - other[first])[0], -0.05 * side, atol=5e-3)
+    assert (other - own)[last, 0] * side > 0
+
+
+def test_the_other_arm_hits_what_is_carried_in_one_quick_stroke(expert):
+    (usual, opening), (_, (tool, shut)) = arms_of(expert, 'expert-slap-0.05')
+    held, num = np.flatnonzero(opening < 1e-3), len(usual)
+    steps = np.linalg.norm(np.diff(tool, axis=0), axis=1)
+    quick = int(np.argmax(steps))
+    assert held[0] < quick < held[-1] and shut[quick] < 1e-3 and len(tool) >= num
+    # past what is held, away from where it rests: 7 cm before, 2 cm behind
+    stroke = tool[quick + 12] - tool[quick - 12]
+    way = usual[quick] - tool[0]
+    assert stroke @ way > 0.9 * np.linalg.norm(stroke) * np.linalg.norm(way * (1, 1, 0))
+    assert np.linalg.norm(stroke) == pytest.approx(0.09, abs=0.01)
+    assert abs(tool[quick, 2] - usual[quick, 2]) < 0.02
+
+
+def test_the_other_arm_roams_low_and_open_through_places_near_objects(expert):
+    _, (_, (tool, opening)) = arms_of(expert, 'expert-roam-3')
+    assert opening.min() == pytest.approx(1)
+    assert 0.015 < tool[:, 2].min() < 0.04 and np.ptp(tool[:, :2], axis=0).max() > 0.05
+    np.testing.assert_allclose(tool[-1], tool[0], atol=1e-3)
+    objects, places = [np.array([0.1, 0.3, 0.01]), np.array([-0.1, 0.3, 0.03])], []
+    for seed in range(40):
+        faults = WayPointFaults(parse_variant('expert-roam-2'), np.random.default_rng(seed))
+        places += faults.roams(objects)
+    assert len(places) == 80 and {place[2] for place in places} == {0.02, 0.03}
+    nearest = [min(np.linalg.norm((p - item)[:2]) for item in objects) for p in places]
+    assert 0.02 < np.mean(nearest) < 0.06
+    assert WayPointFaults(PolicyVariant(), np.random.default_rng(0)).roams(objects) == []
+
+
+def test_all_places_are_those_of_a_grid():
+    stops, changed = changed_stops('expert-grid-0.07')
+    assert changed[-1] == stops[-1]
+    for stop, snapped in zip(stops[:-1], changed[:-1], strict=True):
+        way = snapped.position - stop.position
+        assert way[2] == 0 and np.abs(way).max() <= 0.035
+        cells = snapped.position[:2] / 0.07
+        np.testing.assert_allclose(cells, np.rint(cells), atol=1e-9)
+        assert replace(snapped, position=stop.position) == stop
+
+
+def test_once_the_arms_give_way_under_their_weight_and_rise_again(expert):
+    expert_plan, slump = plan(expert, 'expert'), plan(expert, 'expert-slump-0.04')
+    assert len(slump) == len(expert_plan)
+    arms = arm_columns(expert)
+    assert np.abs(np.delete(slump - expert_plan, arms, axis=1)).max() == 0
+    rows = np.flatnonzero(np.abs(slump - expert_plan).max(axis=1) > 1e-9)
+    assert 60 <= len(rows) <= 66 and np.ptp(rows) == len(rows) - 1
+    heights = [
+        np.stack([poses[:, 2, 3] for poses in expert.robot.tool_poses(positions)])
+        for positions in (expert_plan, slump)
+    ]
+    sunk = (heights[0] - heights[1])[:, rows]
+    np.testing.assert_allclose(sunk[:, 18:32], 0.04, atol=6e-3)
+    assert (np.diff(sunk[:, :14], axis=1) > 0).all() and (np.diff(sunk[:, 38:], axis=1) < 0).all()
+
+
+def test_joints_go_ever_less_far(expert):
+    expert_plan, wane = plan(expert, 'expert'), plan(expert, 'expert-wane-0.3')
+    arms, num = arm_columns(expert), len(expert_plan)
+    assert np.abs(np.delete(wane - expert_plan, arms, axis=1)).max() == 0
+    ways = [(positions - positions[0])[:, arms] for positions in (expert_plan, wane)]
+    for row in (num // 4, num // 2, 3 * num // 4):
+        share = 0.3 * row / (num - 1)
+        np.testing.assert_allclose(ways[1][row], (1 - share) * ways[0][row], atol=1e-9)
+
+
 def test_joints_are_off_by_a_wave_over_their_angle(expert):
     expert_plan, warp = plan(expert, 'expert'), plan(expert, 'expert-warp-0.02')
     arms = arm_columns(expert)
@@ -1598,6 +1703,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'tug',
         'budge',
         'warp',
+        'slump',
+        'grid',
+        'vise',
+        'slap',
+        'roam',
+        'wane',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1704,9 +1815,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-droop-0.03' has droop"
+    said = r"split test are not for training: 'expert-high-0.1-slump-0.03' has slump"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-droop-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-slump-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
