@@ -37,6 +37,7 @@ DESCRIBES = {
     'distillation': ('mtv_world_ros/training', 'mtv_world_ros/model'),
     'evaluation': ('mtv_world_ros/evaluation',),
     'foresight': ('mtv_world_ros/ros',),
+    'found_again': ('mtv_world_ros/geometry/solids.py',),
     'forward_kinematics': ('mtv_world_ros/geometry',),
     'interval_coverage': ('mtv_world_ros/evaluation/metrics',),
     'learned_policies': ('mtv_world_ros/ranking', 'mtv_world_ros/policies', 'mtv_world_ros/sim'),

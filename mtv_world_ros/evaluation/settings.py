@@ -21,7 +21,7 @@ class EvaluationConfig(Schema):
 
     mode: str = Field(
         default='observe',
-        description='observe: every chunk from the real frames at its start; imagine: chunks '
+        description='observe: every chunk from the real frames until its start; imagine: chunks '
         "chained from the episode's first frame",
     )
     seed: int = Field(default=0, description='of the noise and of the choice of shuffled actions')
