@@ -37,6 +37,8 @@ _FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.3
 #: what fits so well from where it was has stayed there [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
+#: parts of a mask that are smaller than this share of its largest one are not the object's
+_PART = 0.2
 #: relative step of finite differences
 _DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
 #: words for what is hollow and open at the top
@@ -259,7 +261,10 @@ def _in_space(numbers: FloatArray, outline: FloatArray) -> FloatArray:
 
 
 def _corners(mask: BoolArray) -> FloatArray:
-    rows, columns = np.nonzero(mask)
+    """(N, 2) of the hull of its parts but small ones, which belong to what looks alike."""
+    _, parts, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = sizes[1:, cv2.CC_STAT_AREA]
+    rows, columns = np.nonzero(np.isin(parts, 1 + np.flatnonzero(areas >= _PART * areas.max())))
     return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(float)
 
 

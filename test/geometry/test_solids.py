@@ -77,6 +77,23 @@ def test_a_cylinder_is_found_to_be_round():
     np.testing.assert_allclose(solid.centre, centre, atol=0.0015)
 
 
+def test_a_speck_that_looks_alike_is_not_part_of_an_object():
+    size, centre = np.array([0.06, 0.04, 0.05]), np.array([0.31, 0.04, 0.025])
+    masks = masks_of(SQUARE, size, centre, 0.5)
+    whole = fit_solid(masks, TARGET, CAMERAS, POSES)
+    masks[:, 20:24, 30:36] = True
+    found = fit_solid(masks, TARGET, CAMERAS, POSES)
+    assert found is not None and whole is not None
+    np.testing.assert_array_equal(found.centre, whole.centre)
+    masks = masks_of(SQUARE, size, centre, 0.5)
+    for mask in masks:  # a finger before its middle
+        middle = int(np.nonzero(mask)[1].mean())
+        mask[:, middle - 3 : middle + 3] = False
+    found = fit_solid(masks, TARGET, CAMERAS, POSES)
+    assert found is not None
+    np.testing.assert_allclose(found.centre, whole.centre, atol=0.001)
+
+
 def test_one_view_does_not_tell():
     masks = masks_of(SQUARE, np.full(3, 0.05), np.array([0.3, 0.05, 0.025]), 0.0)
     masks[1] = False
