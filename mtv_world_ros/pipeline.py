@@ -501,8 +501,9 @@ class ImaginedEpisode:
         given = names, sharp, source.cameras, list(poses)
         if whole is None:
             return FoundObjects.at(names, frames, masks, poses, model.find(*given))
-        tracked, same = model.find_again(whole.tracked, *given)
-        return FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, same)
+        tracked, same, hidden = model.find_again(whole.tracked, *given)
+        found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
+        return replace(found, is_whole=bool(same.all()))
 
     def _camera_poses(self, positions: FloatArray, cameras: Sequence[CameraModel]) -> FloatArray:
         """(V, N, 4, 4) T_base_camera of V cameras at positions (N, J)."""

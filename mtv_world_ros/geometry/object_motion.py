@@ -125,7 +125,7 @@ class ObjectMotionModel(Protocol):
         masks: BoolArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
-    ) -> tuple[TrackedObjects, BoolArray]:
+    ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
         """Returns the same, of objects that something may hide in part by now.
 
         Args:
@@ -136,8 +136,8 @@ class ObjectMotionModel(Protocol):
             poses: V of T_base_camera.
 
         Returns:
-            The objects, and which of them (O,) are as large as they were: their motions count
-            from where they were then. The others are found anew.
+            The objects; which of them (O,) are as large as they were, others are found anew; and
+            which of those are hidden in part: their motions count from where they were whole.
         """
         ...
 
@@ -186,11 +186,11 @@ class FoundObjects:
         of_each = np.repeat(poses[:, None], len(names), axis=1)
         return cls(names=names, cuts=cut_outs(frames, masks), poses=of_each, tracked=tracked)
 
-    def shown_as(self, whole: FoundObjects, same: BoolArray) -> FoundObjects:
-        """Returns these, those of `same` (O,) with the pictures of when they were seen whole."""
-        cuts = np.where(same[:, None, None, None], whole.cuts, self.cuts)
-        poses = np.where(same[:, None, None], whole.poses, self.poses)
-        return replace(self, cuts=cuts, poses=poses, is_whole=bool(same.all()))
+    def shown_as(self, whole: FoundObjects, hidden: BoolArray) -> FoundObjects:
+        """Returns these, those of `hidden` (O,) with the pictures of when they were whole."""
+        cuts = np.where(hidden[:, None, None, None], whole.cuts, self.cuts)
+        poses = np.where(hidden[:, None, None], whole.poses, self.poses)
+        return replace(self, cuts=cuts, poses=poses)
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
         """Returns the objects after each part of a plan, which show the same motion as before.

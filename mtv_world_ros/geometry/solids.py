@@ -27,13 +27,16 @@ _PIXEL = np.abs(_DIRECTIONS).sum(1) / 2
 _ROUND, _SQUARE = _DIRECTIONS / 2, np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
 #: turns to begin with [rad]; least size [m]; how well it is known that things stand [m]
 _TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
-#: a box must fit by so much better than a cylinder, which has two numbers less
+#: a box must fit by so much better than a cylinder, which has two numbers less, and what was
+#: turned by more than what was turned by less
 _BETTER = 0.9
 #: further turns to begin with where a solid was moved [rad]
 _FURTHER = (0.5, -0.5, 1.0, -1.0)
-#: a solid is found again where no mask reaches beyond it by more than this, or so much more than
-#: it did when it was whole [px]; and where this share of its outline is as near to the masks'
+#: a solid is found again where masks reach beyond it by no more than this, or so much more than
+#: they did when it was whole [px]; and where this share of its outline is about as near to theirs
 _FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.3
+#: what shows less of its outline is hidden in part
+_WHOLE = 0.95
 #: what fits so well from where it was has stayed there [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
@@ -55,6 +58,7 @@ class Solid:
         yaw: about z [rad].
         is_round: a cylinder.
         is_open: at the top, and hollow.
+        is_hidden: in part, where it was found again.
         error_px: by how much its outline misses those of the masks, root mean square.
     """
 
@@ -63,6 +67,7 @@ class Solid:
     yaw: float = 0.0
     is_round: bool = False
     is_open: bool = False
+    is_hidden: bool = False
     error_px: float = 0.0
 
     def turn_to(self, now: Solid) -> FloatArray:
@@ -173,17 +178,19 @@ def find_solid(
         given = np.array([*centre[:2], *given, centre[2] - height / 2])
         scale = np.where(np.arange(len(given)) == 2, 0.1, 0.01)
         found = _nearest(misses, given, x_scale=scale, loss='cauchy')
-        if best is None or found.cost < best.cost:
+        # a square looks the same after a quarter turn: the least turn is believed
+        if best is None or found.cost < _BETTER * best.cost:
             best = found
         if np.abs(found.fun).max() < _STAYED_PX:
             break
     assert best is not None
     error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
     enough = max(_FOUND_PX, _FOUND * solid.error_px)
-    if error > enough or np.mean(np.abs(best.fun) < enough) < _SHOWN:
+    shown = np.mean(np.abs(best.fun) < 2 * enough)
+    if error > enough or shown < _SHOWN:
         return None
     now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
-    return replace(now, is_open=solid.is_open)
+    return replace(now, is_open=solid.is_open, is_hidden=bool(shown < _WHOLE))
 
 
 def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:

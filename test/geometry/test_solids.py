@@ -114,7 +114,7 @@ def test_what_is_half_hidden_is_found_again_to_two_millimetres(outline, yaw, tur
         rows, columns = np.nonzero(mask)
         mask[: int(np.quantile(rows, 0.4)), int(np.quantile(columns, 0.2)) :] = False
     found = find_solid(whole, masks, TARGET, CAMERAS, POSES)
-    assert found is not None
+    assert found is not None and found.is_hidden
     np.testing.assert_allclose(found.centre - whole.centre, way, atol=0.002)
     np.testing.assert_array_equal(found.size, whole.size)
     turned = turn if outline is SQUARE else 0.0
@@ -122,6 +122,16 @@ def test_what_is_half_hidden_is_found_again_to_two_millimetres(outline, yaw, tur
     assert abs(np.sin(2 * (np.arctan2(y, x) - turned))) < 0.1
     anew = fit_solid(masks, TARGET, CAMERAS, POSES)
     assert anew is None or np.abs(anew.centre - whole.centre - way).max() > 0.003
+
+
+@pytest.mark.parametrize(('outline', 'yaw'), [(SQUARE, 0.4), (CIRCLE, 0.0)])
+def test_what_nothing_hides_is_not_hidden(outline, yaw):
+    size, centre = np.array([0.05, 0.05, 0.06]), np.array([0.31, 0.04, 0.03])
+    whole = fit_solid(masks_of(outline, size, centre, yaw), TARGET, CAMERAS, POSES)
+    now = masks_of(outline, size, centre + [-0.06, 0.05, 0.0], yaw + 0.3)
+    assert whole is not None
+    found = find_solid(whole, now, TARGET, CAMERAS, POSES)
+    assert found is not None and not found.is_hidden
 
 
 def test_what_lies_on_its_side_is_another_solid():

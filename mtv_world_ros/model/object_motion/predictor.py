@@ -163,14 +163,14 @@ class ObjectMotionPredictor:
         masks: BoolArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
-    ) -> tuple[TrackedObjects, BoolArray]:
+    ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
         """Returns objects that something may hide in part by now; see `ObjectMotionModel`.
 
         Only where motions of rigid bodies are foreseen; without them all are found anew.
         """
         nothing = np.zeros(len(names), np.bool_)
         if whole.contact is None:
-            return self.find(names, masks, cameras, poses), nothing
+            return self.find(names, masks, cameras, poses), nothing, nothing
         from mtv_world_ros.geometry.solids import find_solid
 
         points = locate_all(cameras, poses, centroids(masks))
@@ -181,8 +181,9 @@ class ObjectMotionPredictor:
         ]
         anew = self._find(names, masks, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
-        centres, turned = whole.contact.centres, np.tile(np.eye(3), (len(names), 1, 1))
-        for item in map(int, np.flatnonzero(same)):
+        hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
+        turned = np.tile(np.eye(3), (len(names), 1, 1))
+        for item in map(int, np.flatnonzero(hidden)):
             was, now = before[item], solids[item]
             assert was is not None and now is not None
             turned[item] = was.turn_to(now)
@@ -190,11 +191,11 @@ class ObjectMotionPredictor:
             anew.features[item] = whole.features[item]
         assert anew.contact is not None
         seen = Seen(
-            reference=np.where(same[:, None], whole.reference, anew.reference),
-            centres=np.where(same[:, None], centres, anew.contact.centres),
+            reference=np.where(hidden[:, None], whole.reference, anew.reference),
+            centres=np.where(hidden[:, None], whole.contact.centres, anew.contact.centres),
             turned=turned,
         )
-        return replace(anew, seen=seen), same
+        return replace(anew, seen=seen), same, hidden
 
     def _find(
         self,

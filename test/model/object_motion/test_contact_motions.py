@@ -438,8 +438,9 @@ def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, ro
     rows = np.nonzero(hidden[0, 0])[0]
     hidden[:, :, : int(np.median(rows))] = False
     hidden[:, 1] = False
-    now, same = model.find_again(whole, names, hidden, frame.cameras, frame.poses)
+    now, same, hides = model.find_again(whole, names, hidden, frame.cameras, frame.poses)
     np.testing.assert_array_equal(same, [True, False])
+    np.testing.assert_array_equal(hides, [True, False])
     np.testing.assert_allclose(now.reference[0], whole.reference[0], atol=0.002)
     motions, _ = now.advance(recording.positions[:51])
     for motion in motions:
@@ -448,8 +449,11 @@ def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, ro
     was = whole.contact.solids[0]
     moved = replace(was, centre=was.centre + [0.05, 0.0, 0.02], yaw=was.yaw + 0.5)
     seen = replace(whole, contact=replace(whole.contact, solids=(moved, whole.contact.solids[1])))
-    now, same = model.find_again(seen, names, frame.masks, frame.cameras, frame.poses)
-    assert same.all()
+    masks = frame.masks.copy()
+    masks[:, 0, : int(np.quantile(rows, 0.25))] = False
+    now, same, hides = model.find_again(seen, names, masks, frame.cameras, frame.poses)
+    assert same.all() and hides[0] and not hides[1]
+    np.testing.assert_array_equal(now.seen.centres[1], now.contact.solids[1].centre)
     motions, _ = now.advance(recording.positions[:6])
     np.testing.assert_allclose(motions[-2].ways[0, 0], [-0.05, 0, -0.02], atol=0.003)
     turned = motions[-2].rotations[0, 0]
@@ -458,8 +462,8 @@ def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, ro
     (folder / CONTACT_FILE).unlink()
     alone = load_predictor(folder, robot)
     one = alone.find(names, frame.masks, frame.cameras, frame.poses)
-    _, same = alone.find_again(one, names, frame.masks, frame.cameras, frame.poses)
-    assert not same.any()
+    _, same, hides = alone.find_again(one, names, frame.masks, frame.cameras, frame.poses)
+    assert not same.any() and not hides.any()
 
 
 def test_a_bad_contact_file_is_named(folder, robot, monkeypatch):
