@@ -31,7 +31,17 @@ from mtv_world_ros.geometry.solids import find_solid, fit_solid, is_vessel, Soli
 from mtv_world_ros.pipeline import Pipeline
 
 _MOVED_M, _WHOLE = 0.004, 0.9
-HEAD = ('objects', 'n', 'not found again', 'again [mm]', '90 %', 'anew [mm]', '90 %')
+HEAD = (
+    'objects',
+    'n',
+    'not found again',
+    'over 1 cm',
+    'again [mm]',
+    '90 %',
+    'anew: over 1 cm',
+    'anew [mm]',
+    '90 %',
+)
 
 
 class Seen(NamedTuple):
@@ -60,10 +70,11 @@ def main() -> None:
             errors[kind].append((again, anew))
     rows = []
     for kind, found in sorted(errors.items()):
-        again, anew = 1e3 * np.array(found).T
-        quantiles = np.nanquantile([again, anew], (0.5, 0.9), axis=1).T.ravel()
-        lost = str(int(np.isnan(again).sum()))
-        rows.append([kind, str(len(found)), lost, *(f'{error:.1f}' for error in quantiles)])
+        row = [kind, str(len(found)), str(int(np.isnan(found).sum(0)[0]))]
+        for each in 1e3 * np.array(found).T:
+            middle, most = np.nanquantile(each, (0.5, 0.9))
+            row += [str(int((each > 10).sum())), f'{middle:.1f}', f'{most:.1f}']
+        rows.append(row)
     options.seed, options.repeats = 0, sum(map(len, errors.values()))
     publish(
         'found_again',
@@ -95,7 +106,8 @@ def _errors(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, flo
             areas = now.masks[:, item].sum((-2, -1)) / first.masks[:, item].sum((-2, -1)).clip(1)
             moved = 'moved' if np.linalg.norm(true - was.centre) > _MOVED_M else 'still'
             hidden = 'hidden' if areas.min() < _WHOLE else 'whole'
-            again = find_solid(was, now.masks[:, item], now.points[item], now.cameras, now.poses)
+            at = now.masks[:, item], now.points[item], now.cameras, now.poses, floor
+            again = find_solid(was, *at)
             found, anew = (
                 np.nan if solid is None else float(np.linalg.norm(solid.centre - true))
                 for solid in (again, _anew(now, item, name, floor))

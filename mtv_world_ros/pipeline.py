@@ -259,7 +259,7 @@ class ImaginedEpisode:
             self._described[self.instruction] = name_objects(
                 self.instruction,
                 describer=self.pipeline.describer,
-                first_frame=lambda: self._rollouts[0].source.frames[0],
+                first_frame=lambda: self._rollouts[0].first.frames[0],
             )
         return self._described[self.instruction]
 
@@ -471,12 +471,13 @@ class ImaginedEpisode:
     def _find_whole(
         self, first: Observation, start_masks: ObjectMasks | None = None
     ) -> FoundObjects:
-        """The named objects in the episode's first real frame, in which nothing may hide them."""
+        """The named objects in the episode's first real frame, in which they count as whole."""
         if self.names not in self._whole:
             frames = fit_observation(first, self.pipeline.spec).frames
             if start_masks is None:
                 start_masks = self.pipeline.segmenter.segment(frames[:, None], self.names)
-            self._whole[self.names] = self._found(first, frames, start_masks.masks[:, :, 0])
+            found = self._found(first, frames, start_masks.masks[:, :, 0])
+            self._whole[self.names] = replace(found, is_whole=True)
         return self._whole[self.names]
 
     def _found(
@@ -560,7 +561,7 @@ class ImaginedEpisode:
             return None
         left_s = num_left / self.pipeline.spec.fps
         num = len(objects.motions[0].points) - round(left_s / objects.tracked.step_s)
-        return foreseen_of(self.pipeline.robot, objects, num)
+        return foreseen_of(self.pipeline.robot, objects, num, is_begun=begun)
 
     def _believed(
         self, state: RolloutState, plan: ChunkPlan, objects: FoundObjects

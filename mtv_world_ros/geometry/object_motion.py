@@ -20,6 +20,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 _STILL_M, _STILL_RAD = 0.004, 0.08
 #: what is nearer than this looks to be at the same place; what is further away, just elsewhere
 _SAME_M, _ELSEWHERE_M = 0.01, 0.05
+#: what differs by less in a pose is the same pose
+_SAME_POSE = 1e-4
 #: of two whose widths differ by less than this factor, neither can stand in the other
 _AS_WIDE = 1.25
 
@@ -286,7 +288,8 @@ def moved_pictures(
     Each object is moved as the picture of a plane through its centre that faces the camera:
     shifted by the projected way, scaled by the ratio of depths, turned by the rotation about the
     line of sight. Near ones lie over far ones, but a thing lies over what it stands in or on,
-    whose nearer wall hides it in part only. What is not known, or behind a camera, is held.
+    whose nearer wall hides it in part only. What is not known, or behind a camera, is held, as is
+    what stands still before a camera that does.
 
     Args:
         cuts: (V, O, H, W, 4) of the reference, see `cut_outs`.
@@ -304,10 +307,14 @@ def moved_pictures(
         before, depth = project(camera, reference_poses[view], motion.reference)
         after, depths = project(camera, poses[view][:, None], motion.points)
         turns = _turns(motion.rotations, poses[view])
+        shifted = moves | _pans(reference_poses[view], poses[view])
         for frame in range(num_frames):
             for item in _from_behind(depths[frame], holders[frame]):
                 picture = cuts[view, item]
-                if moves[frame, item] and np.isfinite([*after[frame, item], *before[item]]).all():
+                if (
+                    shifted[frame, item]
+                    and np.isfinite([*after[frame, item], *before[item]]).all()
+                ):
                     zoom = float(depth[item] / depths[frame, item])
                     turn = float(turns[frame, item])
                     picture = _warped(picture, before[item], after[frame, item], zoom, turn)
@@ -315,15 +322,22 @@ def moved_pictures(
     return shown
 
 
+def _pans(reference_poses: FloatArray, poses: FloatArray) -> BoolArray:
+    """(T, O or 1) whether a camera is elsewhere at (T, 4, 4) than before, at (O or 1, 4, 4)."""
+    return np.asarray((np.abs(poses[:, None] - reference_poses) > _SAME_POSE).any((-2, -1)))
+
+
 def _widths(
     cuts: ByteArray, motion: ObjectMotion, cameras: Sequence[CameraModel], poses: FloatArray
 ) -> FloatArray:
-    """(O,) sides of squares as large as the objects look in the views that show most [m]."""
-    found = [
-        np.sqrt((cut[..., 3] > 0).sum((-2, -1)))
-        * (project(camera, pose, motion.reference)[1] / camera.K[0, 0])
-        for cut, camera, pose in zip(cuts, cameras, poses, strict=True)
-    ]
+    """(O,) sides of squares as large as the objects look in the views that show most [m].
+
+    But not wider than they look: a bottle is high.
+    """
+    found = []
+    for cut, camera, pose in zip(cuts[..., 3] > 0, cameras, poses, strict=True):
+        side = np.minimum(np.sqrt(cut.sum((-2, -1))), cut.any(-2).sum(-1))
+        found.append(side * project(camera, pose, motion.reference)[1] / camera.K[0, 0])
     return np.asarray(np.nan_to_num(np.max(found, axis=0)))
 
 

@@ -6,7 +6,7 @@ V views, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 import re
 from typing import Any
@@ -33,10 +33,10 @@ _BETTER = 0.9
 #: further turns to begin with where a solid was moved [rad]
 _FURTHER = (0.5, -0.5, 1.0, -1.0)
 #: a solid is found again where masks reach beyond it by no more than this, or so much more than
-#: they did when it was whole [px]; and where this share of its outline is about as near to theirs
-_FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.3
-#: what shows less of its outline is hidden in part
-_WHOLE = 0.95
+#: they did when it was whole [px]; and where this share of its outline is as near to theirs
+_FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.4
+#: what fills its outline by less than this share of what it did when it was whole, is hidden
+_WHOLE = 0.9
 #: what fits so well from where it was has stayed there [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
@@ -59,6 +59,7 @@ class Solid:
         is_round: a cylinder.
         is_open: at the top, and hollow.
         is_hidden: in part, where it was found again.
+        fills: (V,) how much of its outline its mask fills in each view, 0 = not seen.
         error_px: by how much its outline misses those of the masks, root mean square.
     """
 
@@ -68,6 +69,7 @@ class Solid:
     is_round: bool = False
     is_open: bool = False
     is_hidden: bool = False
+    fills: FloatArray = field(default_factory=lambda: np.zeros(0))
     error_px: float = 0.0
 
     def turn_to(self, now: Solid) -> FloatArray:
@@ -136,7 +138,8 @@ def fit_solid(
                 error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
                 best = found.cost, _solid(found.x, turn is None, error)
     assert best is not None
-    return replace(best[1], is_open=is_open)
+    solid = replace(best[1], is_open=is_open)
+    return replace(solid, fills=_fills(solid, masks, cameras, poses))
 
 
 def find_solid(
@@ -145,6 +148,7 @@ def find_solid(
     point: FloatArray,
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
+    floor: float = 0.0,
 ) -> Solid | None:
     """Returns where a solid of known size is that something may hide in part.
 
@@ -156,6 +160,7 @@ def find_solid(
         point: (3,) the middle of that, NaN = not known [m].
         cameras: V cameras at the masks' size.
         poses: V of T_base_camera (4, 4).
+        floor: height under which nothing is [m].
 
     Returns:
         None where no view sees it, or where it does not look as it did: it lies on its side.
@@ -170,13 +175,14 @@ def find_solid(
     def misses(places: FloatArray) -> FloatArray:
         sizes = np.broadcast_to(size, (*places.shape[:-1], len(size)))
         numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
-        return outlines.misses(_in_space(numbers, outline))
+        under = np.minimum(places[..., -1:] - floor, 0.0) / _STANDS_M
+        return np.concatenate([outlines.misses(_in_space(numbers, outline)), under], -1)
 
     best = None
     for centre, turn in _starts(solid, point):
         given = [] if solid.is_round else [solid.yaw + turn]
         given = np.array([*centre[:2], *given, centre[2] - height / 2])
-        scale = np.where(np.arange(len(given)) == 2, 0.1, 0.01)
+        scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
         found = _nearest(misses, given, x_scale=scale, loss='cauchy')
         # a square looks the same after a quarter turn: the least turn is believed
         if best is None or found.cost < _BETTER * best.cost:
@@ -184,13 +190,36 @@ def find_solid(
         if np.abs(found.fun).max() < _STAYED_PX:
             break
     assert best is not None
-    error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
+    misses_px = best.fun[:-1]
+    error = float(np.sqrt(np.mean(np.minimum(misses_px, 0.0) ** 2)))
     enough = max(_FOUND_PX, _FOUND * solid.error_px)
-    shown = np.mean(np.abs(best.fun) < 2 * enough)
-    if error > enough or shown < _SHOWN:
+    if error > enough or np.mean(np.abs(misses_px) < enough) < _SHOWN:
         return None
     now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
-    return replace(now, is_open=solid.is_open, is_hidden=bool(shown < _WHOLE))
+    now = replace(now, is_open=solid.is_open)
+    fills = _fills(now, masks, cameras, poses)
+    return replace(now, fills=solid.fills, is_hidden=bool((fills < _WHOLE * solid.fills).any()))
+
+
+def _fills(
+    solid: Solid,
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> FloatArray:
+    """(V,) share of a solid's outline that its masks (V, H, W) fill; 0 = it is in no picture."""
+    wide, long, height = solid.size
+    sizes = [wide] if solid.is_round else [solid.yaw, wide, long]
+    x, y, z = solid.centre
+    numbers = np.array([x, y, *sizes, height, z - height / 2])
+    corners = _in_space(numbers, _ROUND if solid.is_round else _SQUARE)
+    fills = []
+    for mask, camera, pose in zip(masks, cameras, poses, strict=True):
+        pixels = project(camera, pose, corners)[0]
+        known = np.isfinite(pixels).all()
+        area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if known else 0.0
+        fills.append(mask.sum() / area if area > 0 else 0.0)
+    return np.array(fills)
 
 
 def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:

@@ -52,10 +52,11 @@ class ForeseenMotions:
     Attributes:
         names: of O objects.
         points: (K, N, O, 3) [m], NaN where not known.
-        rotations: (K, N, O, 3, 3) from row 0.
+        rotations: (K, N, O, 3, 3) since the objects were found, or were whole.
         sizes: (K, O, 3) extents [m].
         openings: (K, A, N) of the grippers, 0 closed to 1 open.
         weights: (K,) how much each counts.
+        is_begun: whether they begin with the rollout, and not later.
     """
 
     names: tuple[str, ...]
@@ -64,6 +65,7 @@ class ForeseenMotions:
     sizes: FloatArray
     openings: FloatArray
     weights: FloatArray
+    is_begun: bool = True
 
     def ends(
         self, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
@@ -76,6 +78,8 @@ class ForeseenMotions:
             starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.
         """
         if not set(bound.values()) <= set(self.names):
+            return None
+        if not self.is_begun and any(relation.is_of_course for relation in task.relations):
             return None
         items = {role: self.names.index(name) for role, name in bound.items()}
         if not np.isfinite(self.points[:, :, list(items.values())]).all():
@@ -108,7 +112,9 @@ class ForeseenMotions:
         return ever_and_final(task.holds(poses, openings))[1]
 
 
-def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> ForeseenMotions:
+def foreseen_of(
+    robot: RobotModel, objects: FoundObjects, num_steps: int, *, is_begun: bool = True
+) -> ForeseenMotions:
     """Returns what was foreseen of objects, without the last chunk's steps after `num_steps`.
 
     Networks do not foresee what stops fingers, as a rim that they close on: they are told by
@@ -126,6 +132,7 @@ def foreseen_of(robot: RobotModel, objects: FoundObjects, num_steps: int) -> For
         sizes=objects.tracked.sizes,
         openings=np.stack([rows[kept].T for rows in openings]),
         weights=np.array([motion.weight for motion in objects.motions]),
+        is_begun=is_begun,
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
@@ -99,8 +99,10 @@ class Relation(Schema):
         kind: its name in task files, a key of `KINDS`.
         subject: placeholder of the object that moves.
         target: placeholder of the object that it is placed by, where there is one.
+        is_of_course: whether it holds by all that happened so far, not by how things are now.
     """
 
+    is_of_course: ClassVar[bool] = False
     kind: str
     subject: str
 
@@ -393,6 +395,7 @@ class Shaken(Relation):
         min_swing_rad: smaller turns do not count.
     """
 
+    is_of_course: ClassVar[bool] = True
     min_lift_m: Length = 0.06
     num_reversals: Annotated[int, Field(ge=1), expected('a count of at least 1', EXPECTED)] = 2
     min_swing_rad: _Angle = 0.15

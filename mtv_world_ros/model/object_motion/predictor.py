@@ -173,10 +173,11 @@ class ObjectMotionPredictor:
             return self.find(names, masks, cameras, poses), nothing, nothing
         from mtv_world_ros.geometry.solids import find_solid
 
-        points = locate_all(cameras, poses, centroids(masks))
+        assert self.contact is not None
+        points, floor = locate_all(cameras, poses, centroids(masks)), self.contact.table_m
         before = whole.contact.solids
         solids = [
-            solid and find_solid(solid, masks[:, item], points[item], cameras, poses)
+            solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
             for item, solid in enumerate(before)
         ]
         anew = self._find(names, masks, cameras, poses, solids)
@@ -194,6 +195,7 @@ class ObjectMotionPredictor:
             reference=np.where(hidden[:, None], whole.reference, anew.reference),
             centres=np.where(hidden[:, None], whole.contact.centres, anew.contact.centres),
             turned=turned,
+            heights=np.where(same, whole.reference[:, 2], anew.reference[:, 2]),
         )
         return replace(anew, seen=seen), same, hidden
 
@@ -234,11 +236,13 @@ class Seen:
         reference: (O, 3) where they were [m].
         centres: (O, 3) where their solids were [m].
         turned: (O, 3, 3) from there to where they were found.
+        heights: (O,) of their centres when they were whole, on the table most of them [m].
     """
 
     reference: FloatArray
     centres: FloatArray
     turned: FloatArray
+    heights: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,8 +283,8 @@ class TrackedObjects:
         """
         widths = self.features[..., :4]
         least = np.where((widths > 0).any(-1, keepdims=True), widths, np.inf).min(1).mean(-1)
-        stood = self.reference if self.seen is None else self.seen.reference
-        height = 2 * np.maximum(stood[:, 2], _LEAST_HEIGHT_M)
+        middle = self.reference[:, 2] if self.seen is None else self.seen.heights
+        height = 2 * np.maximum(middle, _LEAST_HEIGHT_M)
         sizes = np.stack([least, least, height], axis=-1)
         sizes = np.broadcast_to(sizes, (1 + self.model.num_disturbed, *sizes.shape))
         return sizes if self.contact is None else np.concatenate([sizes, self.contact.sizes])
