@@ -175,25 +175,24 @@ def find_solid(
     def misses(places: FloatArray) -> FloatArray:
         sizes = np.broadcast_to(size, (*places.shape[:-1], len(size)))
         numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
-        under = np.minimum(places[..., -1:] - floor, 0.0) / _STANDS_M
-        return np.concatenate([outlines.misses(_in_space(numbers, outline)), under], -1)
+        return outlines.misses(_in_space(numbers, outline))
 
     best = None
     for centre, turn in _starts(solid, point):
         given = [] if solid.is_round else [solid.yaw + turn]
-        given = np.array([*centre[:2], *given, centre[2] - height / 2])
+        given = np.array([*centre[:2], *given, max(centre[2] - height / 2, floor)])
+        least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
         scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
-        found = _nearest(misses, given, x_scale=scale, loss='cauchy')
+        found = _nearest(misses, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy')
         # a square looks the same after a quarter turn: the least turn is believed
         if best is None or found.cost < _BETTER * best.cost:
             best = found
         if np.abs(found.fun).max() < _STAYED_PX:
             break
     assert best is not None
-    misses_px = best.fun[:-1]
-    error = float(np.sqrt(np.mean(np.minimum(misses_px, 0.0) ** 2)))
+    error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
     enough = max(_FOUND_PX, _FOUND * solid.error_px)
-    if error > enough or np.mean(np.abs(misses_px) < enough) < _SHOWN:
+    if error > enough or np.mean(np.abs(best.fun) < enough) < _SHOWN:
         return None
     now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
     now = replace(now, is_open=solid.is_open)

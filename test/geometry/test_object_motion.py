@@ -115,6 +115,32 @@ def test_what_was_put_into_a_container_is_seen_in_it(camera):
     assert (moved[30, 40, :3] == (0, 255, 0)).all() and (moved[30, 38, :3] == (255, 0, 0)).all()
 
 
+def test_what_is_behind_something_high_does_not_stand_in_it(camera):
+    bottle = np.zeros(SIZE, bool)
+    bottle[14:47, 46:55] = True
+    reference = [[-0.195, 0.005, 1.0], [0.105, 0.005, 1.0]]
+    behind = [[0.165, 0.005, 1.1], [0.105, 0.005, 1.0]]
+    moved = shown(
+        camera, [square(30, 20, 3), bottle], [(255, 0, 0), (0, 255, 0)], reference, [behind]
+    )
+    assert (moved[0, 30, 53, :3] == (0, 255, 0)).all() and (
+        moved[0, 30, 56, :3] == (255, 0, 0)
+    ).all()
+
+
+def test_what_stands_still_goes_through_the_picture_of_a_camera_that_moves(camera):
+    mask, start = square(30, 40, 4), np.array([[0.005, 0.005, 1.0]])
+    motion = ObjectMotion(
+        reference=start, points=start[None], rotations=np.tile(np.eye(3), (1, 1, 1, 1))
+    )
+    cuts = cut_outs(np.full((1, *SIZE, 3), 200, np.uint8), mask[None, None])
+    pose = POSE.copy()
+    pose[0, 3] -= 0.1
+    (moved,) = moved_pictures(cuts, motion, [camera], POSE[None, None], pose[None, None])
+    at, _ = centre_and_area(moved[0])
+    np.testing.assert_allclose(at, [50.0, 30.0], atol=0.1)
+
+
 def test_what_goes_behind_the_camera_is_held(camera):
     mask = square(30, 40, 4)
     start = [0.005, 0.005, 1.0]

@@ -134,6 +134,30 @@ def test_what_nothing_hides_is_not_hidden(outline, yaw):
     assert found is not None and not found.is_hidden
 
 
+def test_a_mug_whose_top_is_hidden_stands_on_the_table():
+    size, centre = np.array([0.05, 0.05, 0.08]), np.array([0.31, 0.04, 0.04])
+    handle = masks_of(SQUARE, np.array([0.05, 0.01, 0.05]), centre + [0.03, 0.0, 0.0], 0.0)
+    masks = masks_of(CIRCLE, size, centre, 0.0) | handle
+    whole = fit_solid(masks, TARGET, CAMERAS, POSES)
+    assert whole is not None and whole.error_px > 1.0
+    for mask in masks:
+        mask[: int(np.quantile(np.nonzero(mask)[0], 0.25))] = False
+    found = find_solid(whole, masks, TARGET, CAMERAS, POSES)
+    assert found is not None and found.is_hidden
+    assert abs(found.centre[2] - found.size[2] / 2) < 0.005
+
+
+def test_what_one_view_shows_alone_is_hidden():
+    size, centre = np.array([0.05, 0.05, 0.06]), np.array([0.31, 0.04, 0.03])
+    masks = masks_of(SQUARE, size, centre, 0.4)
+    whole = fit_solid(masks, TARGET, CAMERAS, POSES)
+    assert whole is not None
+    masks[1] = False
+    found = find_solid(whole, masks, np.full(3, np.nan), CAMERAS, POSES)
+    assert found is not None and found.is_hidden
+    np.testing.assert_allclose(found.centre, whole.centre, atol=0.002)
+
+
 def test_what_lies_on_its_side_is_another_solid():
     size = np.array([0.03, 0.03, 0.09])
     whole = fit_solid(masks_of(SQUARE, size, TARGET, 0.0), TARGET, CAMERAS, POSES)

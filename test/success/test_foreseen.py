@@ -130,6 +130,16 @@ def test_fingers_that_are_stopped_are_not_open():
     np.testing.assert_array_equal(ends.done, [True, False])
 
 
+def test_what_was_shaken_before_is_not_told_by_motions_that_begin_later():
+    task, bound = match_task(TASKS, 'shake the green bottle')
+    moved = replace(held(GOAL), names=('green bottle', 'blue block'))
+    assert moved.ends(task, bound, np.full((2, 3), np.nan)) is not None
+    later = replace(moved, is_begun=False)
+    assert later.ends(task, bound, np.full((2, 3), np.nan)) is None
+    stays = replace(held(GOAL), is_begun=False)
+    assert stays.ends(*matched(), np.full((2, 3), np.nan)).done.all()
+
+
 def test_objects_that_were_not_found_leave_it_open():
     task, bound = matched()
     seen = held(GOAL)

@@ -454,6 +454,8 @@ def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, ro
     now, same, hides = model.find_again(seen, names, masks, frame.cameras, frame.poses)
     assert same.all() and hides[0] and not hides[1]
     np.testing.assert_array_equal(now.seen.centres[1], now.contact.solids[1].centre)
+    # where they are does not make them higher
+    np.testing.assert_allclose(now.sizes[:, :, 2], whole.sizes[:, :, 2], rtol=1e-6)
     motions, _ = now.advance(recording.positions[:6])
     np.testing.assert_allclose(motions[-2].ways[0, 0], [-0.05, 0, -0.02], atol=0.003)
     turned = motions[-2].rotations[0, 0]
