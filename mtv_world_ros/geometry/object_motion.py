@@ -138,8 +138,8 @@ class ObjectMotionModel(Protocol):
             poses: V of T_base_camera.
 
         Returns:
-            The objects; which of them (O,) are as large as they were, others are found anew; and
-            which of those are hidden in part: their motions count from where they were whole.
+            The objects; which of them (O,) are surely where they are said to be, as large as they
+            were; and which are hidden in part: their motions count from where they were whole.
         """
         ...
 
@@ -348,8 +348,11 @@ def _holders(motion: ObjectMotion, widths: FloatArray) -> BoolArray:
 
 
 def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
-    """Items in the order in which they are laid over each other; unknown depths count as far."""
-    far = np.nan_to_num(depths, nan=np.inf)
+    """Items in the order in which they are laid over each other.
+
+    Those of unknown depth come last: what is seen of them is not hidden, at least at first.
+    """
+    far = np.nan_to_num(depths, nan=-np.inf)
     nearest = np.where(holders, far, np.inf).min(1, initial=np.inf)
     front, held = np.minimum(far, nearest), holders.sum(1)
     return sorted(range(len(far)), key=lambda item: (-float(front[item]), int(held[item])))

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.camera import project, unproject
+from mtv_world_ros.geometry.mask_geometry import centroids
 
 #: directions in the image along which outlines are compared
 _ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False)
@@ -157,7 +158,8 @@ def find_solid(
     Args:
         solid: as it was when it was seen whole.
         masks: (V, H, W) of what is seen of it now.
-        point: (3,) the middle of that, NaN = not known [m].
+        point: (3,) the middle of that; NaN = not known, as of one view: then where it would look
+            as large as it does there [m].
         cameras: V cameras at the masks' size.
         poses: V of T_base_camera (4, 4).
         floor: height under which nothing is [m].
@@ -177,8 +179,10 @@ def find_solid(
         numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
         return outlines.misses(_in_space(numbers, outline))
 
+    is_known = bool(np.isfinite(point).all())
+    likely = point if is_known else _at_size(solid, masks, cameras, poses)
     best = None
-    for centre, turn in _starts(solid, point):
+    for centre, turn in _starts(solid, likely):
         given = [] if solid.is_round else [solid.yaw + turn]
         given = np.array([*centre[:2], *given, max(centre[2] - height / 2, floor)])
         least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
@@ -198,6 +202,25 @@ def find_solid(
     now = replace(now, is_open=solid.is_open)
     fills = _fills(now, masks, cameras, poses)
     return replace(now, fills=solid.fills, is_hidden=bool((fills < _WHOLE * solid.fills).any()))
+
+
+def _at_size(
+    solid: Solid,
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> FloatArray:
+    """(3,) where a solid looks as large as the largest mask; NaN = it was not seen there whole."""
+    view = int(np.argmax(masks.sum((-2, -1))))
+    camera, pose, mask = cameras[view], poses[view], masks[view]
+    _, depth = project(camera, pose, solid.centre)
+    fills = _fills(solid, mask[None], [camera], [pose])
+    if not fills[0] or not solid.fills[view]:
+        return np.full(3, np.nan)
+    # so many times as near as where it was
+    nearer = np.sqrt(fills[0] / solid.fills[view])
+    ray = unproject(camera, centroids(mask)) @ pose[:3, :3].T
+    return np.asarray(pose[:3, 3] + ray / (ray @ pose[:3, 2]) * float(depth) / nearer)
 
 
 def _fills(

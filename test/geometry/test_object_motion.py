@@ -97,6 +97,13 @@ def test_near_objects_hide_far_ones_and_unknown_ones_stay(camera):
     assert (moved[30, 40, :3] == (255, 0, 0)).all()  # the red one came nearer, before the green
     assert moved[30, 20, 3] == 0
     assert (moved[10, 60] == (0, 0, 255, 255)).all()
+    over = [
+        [0.2025, -0.1755, 0.9],
+        reference[1],
+        [np.nan] * 3,
+    ]  # the red one comes where it is seen
+    moved = shown(camera, masks, colours, reference, [over])[0]
+    assert (moved[10, 60] == (0, 0, 255, 255)).all() and (moved[10, 65, :3] == (255, 0, 0)).all()
     assert not moved[50:, :, 3].any()
 
 

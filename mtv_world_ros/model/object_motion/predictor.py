@@ -197,7 +197,9 @@ class ObjectMotionPredictor:
             turned=turned,
             heights=np.where(same, whole.reference[:, 2], anew.reference[:, 2]),
         )
-        return replace(anew, seen=seen), same, hidden
+        # one view alone tells how far away it is by its size, which is not to be relied on
+        by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1)
+        return replace(anew, seen=seen), same & by_two, hidden
 
     def _find(
         self,
