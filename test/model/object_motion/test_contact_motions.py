@@ -461,6 +461,10 @@ def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, ro
     turned = motions[-2].rotations[0, 0]
     assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(-0.5, abs=0.05)
     np.testing.assert_allclose(motions[0].rotations[0, 0], turned, atol=1e-6)
+    masks[0, 1] = False  # one view tells less surely
+    _, same, hides = model.find_again(whole, names, masks, frame.cameras, frame.poses)
+    np.testing.assert_array_equal(same, [True, False])
+    assert hides.all()
     (folder / CONTACT_FILE).unlink()
     alone = load_predictor(folder, robot)
     one = alone.find(names, frame.masks, frame.cameras, frame.poses)
