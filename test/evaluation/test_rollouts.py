@@ -37,7 +37,10 @@ def test_recorded_frames_are_judged_with_the_joints_that_were_measured(
     pipeline = make_pipeline()
     stretch = stretches(recordings[0], pipeline.spec, 'observe')[1]
     assert observe_stretch(pipeline, recordings[0], stretch) == 'estimate'
-    ((frames, positions),) = judged
+    (before, positions_before), (frames, positions) = judged
+    # as a node's, its estimate remembers what was seen before
+    np.testing.assert_array_equal(before, recordings[0].frames[:, 2:9:2])
+    np.testing.assert_array_equal(positions_before, recordings[0].positions[:9:2])
     np.testing.assert_array_equal(frames, stretch.frames[:, 1:])
     np.testing.assert_array_equal(positions, recordings[0].positions[8:17:2])
 
