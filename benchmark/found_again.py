@@ -61,6 +61,7 @@ def main() -> None:
     parser.add_argument('data', type=Path)
     parser.add_argument('--every', type=int, default=1, help='take every n-th episode')
     parser.add_argument('--machine', default='unknown')
+    parser.add_argument('--out', type=Path, help='page to write')
     options = parser.parse_args()
     pipeline = load_pipeline('bundled', num_threads=1)
     errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
