@@ -131,7 +131,9 @@ def test_fingers_that_are_stopped_are_not_open():
 
 
 def test_what_was_shaken_before_is_not_told_by_motions_that_begin_later():
-    task, bound = match_task(TASKS, 'shake the green bottle')
+    matches = match_task(TASKS, 'shake the green bottle')
+    assert matches is not None
+    task, bound = matches
     moved = replace(held(GOAL), names=('green bottle', 'blue block'))
     assert moved.ends(task, bound, np.full((2, 3), np.nan)) is not None
     later = replace(moved, is_begun=False)
