@@ -303,7 +303,9 @@ def test_pre_emption_in_imagine_mode_goes_on_from_the_last_whole_chunk(client):
 
 def test_reset_starts_again_from_the_real_frames(client):
     client.imagine(True)
+    client.received[PREDICTED['low']].clear()
     client.imagine_one()
+    wait_for_frames(client, NUM_FRAMES)
     assert client.reset().success
     stamp_ns = client.send_scene()
     client.received[PREDICTED['low']].clear()
