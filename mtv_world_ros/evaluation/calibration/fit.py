@@ -145,16 +145,18 @@ def calibrate(
     """
     _check(samples)
     fitted = _fit(samples, segmenter, l2)
+    groups = [{s.task} for s in samples]
+    fits = _fits_without(samples, groups, segmenter, l2)
     judgements = {
         BEFORE: tuple(_judged(s, _mean_of(s.before)) for s in samples),
-        AFTER: _left_out(samples, [{s.task} for s in samples], segmenter, l2),
+        AFTER: _judged_by(fits, samples),
         FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
         ALWAYS: tuple(_judged(s, 1.0) for s in samples),
     }
-    groups = [{s.task} for s in samples]
     if any(sample.kinds for sample in samples):
         groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
-        judgements[AFTER_KINDS] = _left_out(samples, groups, segmenter, l2)
+        fits = _fits_without(samples, groups, segmenter, l2)
+        judgements[AFTER_KINDS] = _judged_by(fits, samples)
     special: dict[str, Any] = {}
     for name, others in (
         (OBSERVED, [sample.as_observed for sample in samples]),
@@ -162,10 +164,10 @@ def calibrate(
     ):
         if _tells(others):
             special[name] = Weights(**_weights(others, l2))
-            judgements[name] = _left_out(others, groups, segmenter, l2)
+            of_others = _fits_without(others, groups, segmenter, l2)
+            judgements[name] = _judged_by(of_others, others)
     if UNFORESEEN in judgements:
-        resumed = [sample.as_resumed for sample in samples]
-        told = _left_out(samples, groups, segmenter, l2, resumed)
+        told = _judged_by(fits, [sample.as_resumed for sample in samples])
         judgements[RESUMED] = tuple(
             one if isfinite(sample.resumed.get('foreseen', nan)) else other
             for sample, one, other in zip(samples, told, judgements[UNFORESEEN], strict=True)
@@ -191,17 +193,10 @@ def _tells(samples: Sequence[Sample]) -> bool:
     return len(outcomes) >= MIN_EPISODES and len(set(outcomes)) == 2
 
 
-def _left_out(
-    samples: Sequence[Sample],
-    groups: Sequence[set[str]],
-    segmenter: str,
-    l2: float,
-    judged_as: Sequence[Sample] | None = None,
-) -> tuple[Judgement, ...]:
-    """Every sample judged by a fit that has seen no sample which shares a group with it.
-
-    Samples may be judged as others of the same episodes, `judged_as`.
-    """
+def _fits_without(
+    samples: Sequence[Sample], groups: Sequence[set[str]], segmenter: str, l2: float
+) -> list[dict[str, Any] | None]:
+    """For each sample the fit to those that share no group with it; None = of one outcome."""
     fits: dict[frozenset[str], dict[str, Any] | None] = {}
     for left_out in set(map(frozenset, groups)):
         others = [
@@ -211,11 +206,17 @@ def _left_out(
         ]
         enough = len({sample.success for sample in others}) == 2
         fits[left_out] = _fit(others, segmenter, l2) if enough else None
-    judged = []
-    for sample, group in zip(judged_as or samples, groups, strict=True):
-        fit = fits[frozenset(group)]
-        judged.append(_judged(sample, nan if fit is None else _probability(fit, sample)))
-    return tuple(judged)
+    return [fits[frozenset(group)] for group in groups]
+
+
+def _judged_by(
+    fits: Sequence[dict[str, Any] | None], samples: Sequence[Sample]
+) -> tuple[Judgement, ...]:
+    """Each sample judged by a fit of its own."""
+    return tuple(
+        _judged(sample, nan if fit is None else _probability(fit, sample))
+        for fit, sample in zip(fits, samples, strict=True)
+    )
 
 
 def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:

@@ -154,7 +154,8 @@ class ObjectMotionPredictor:
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
-        return self._find(names, masks, cameras, poses, [None] * len(names))
+        points = locate_all(cameras, poses, centroids(masks))
+        return self._find(names, masks, points, cameras, poses, [None] * len(names))
 
     def find_again(
         self,
@@ -180,7 +181,7 @@ class ObjectMotionPredictor:
             solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
             for item, solid in enumerate(before)
         ]
-        anew = self._find(names, masks, cameras, poses, solids)
+        anew = self._find(names, masks, points, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
         hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
         turned = np.tile(np.eye(3), (len(names), 1, 1))
@@ -205,12 +206,12 @@ class ObjectMotionPredictor:
         self,
         names: Sequence[str],
         masks: BoolArray,
+        points: FloatArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
         known: Sequence[Solid | None],
     ) -> TrackedObjects:
         """What `find` returns; solids that are not known are fitted."""
-        points = locate_all(cameras, poses, centroids(masks))
         features = object_shapes(masks, points, cameras, poses)
         found = TrackedObjects(model=self, reference=points, features=features)
         response = self.members[0].response

@@ -449,12 +449,11 @@ class Expert:
 
         def ways(share: float) -> list[WayPoint]:
             near = WayPoint('above', home + share * (stops[met].position - home), 0.0, 1.0)
-            return [near, replace(near, seconds=_STAYS_S), WayPoint('home', home, 0.0, 1.0)]
+            return [near, replace(near, seconds=_STAYS_S), self._rests(other)]
 
         rows, done = self._as_far_as_it_reaches(other, ways, share, pace)
         arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
-        begins = (arrives - self._timed(done, home)[0]) * pace[0] / pace[1]
-        return rows, max(round(begins * self._config.rate_hz), 0)
+        return rows, self._late(arrives - self._timed(done, home)[0], pace)
 
     def _poach(
         self,
@@ -481,11 +480,11 @@ class Expert:
             lifted = replace(over, opening=0.0)
             carried = lifted.moved(pull)
             opened = replace(carried, opening=1.0, seconds=self._config.open_s)
-            return [over, down, shut, lifted, carried, opened, WayPoint('home', home, 0.0, 1.0)]
+            return [over, down, shut, lifted, carried, opened, self._rests(other)]
 
         rows, _ = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         leaves = sum(self._timed(stops[: met + 2], self.workcell.home_tools[arm]))
-        return rows, round(leaves * pace[0] / pace[1] * self._config.rate_hz)
+        return rows, self._late(leaves, pace)
 
     def _pull(
         self,
@@ -511,13 +510,11 @@ class Expert:
             pulled = replace(shut, seconds=None).moved(way)
             opened = replace(pulled, opening=1.0, seconds=config.open_s)
             left = replace(opened, seconds=None).moved(rise)
-            rest = WayPoint('home', home, 0.0, 1.0)
-            return [down.moved(rise), down, shut, pulled, opened, left, rest]
+            return [down.moved(rise), down, shut, pulled, opened, left, self._rests(other)]
 
         rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
-        begins = (arrives - sum(self._timed(done[:3], home))) * pace[0] / pace[1]
-        return rows, max(round(begins * config.rate_hz), 0)
+        return rows, self._late(arrives - sum(self._timed(done[:3], home)), pace)
 
     def _squeeze(
         self,
@@ -546,7 +543,7 @@ class Expert:
         (over, down, *_), (far, near, *_) = self._timed(first, own), self._timed(done, home)
         late = over + down - far - near
         first[0] = replace(first[0], seconds=over + max(-late, 0.0))
-        return first, (rows, round(max(late, 0.0) * pace[0] / pace[1] * self._config.rate_hz))
+        return first, (rows, self._late(late, pace))
 
     def _slap(
         self,
@@ -572,8 +569,7 @@ class Expert:
 
         rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         arrives = sum(self._timed(stops[: over + 1], self._rests(arm).position))
-        begins = (arrives - self._timed(done, home.position)[0]) * pace[0] / pace[1]
-        return rows, max(round(begins * self._config.rate_hz), 0)
+        return rows, self._late(arrives - self._timed(done, home.position)[0], pace)
 
     def _roam(self, other: str, places: list[FloatArray], pace: tuple[float, float]) -> FloatArray:
         """Rows of another arm that roams through places, low and open, as far as it reaches."""
@@ -588,6 +584,10 @@ class Expert:
             return [low[0].moved(rise), *low, low[-1].moved(rise), home]
 
         return self._as_far_as_it_reaches(other, ways, 1.0, pace)[0]
+
+    def _late(self, seconds: float, pace: tuple[float, float]) -> int:
+        """Rows before something begins, of a time before scaling [s]; none if it is too late."""
+        return max(round(seconds * pace[0] / pace[1] * self._config.rate_hz), 0)
 
     def _rests(self, arm: str) -> WayPoint:
         return WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
@@ -612,7 +612,7 @@ class Expert:
     def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
         """Minimum-jerk blends between way points, at a pace."""
         config = self._config
-        home = WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
+        home = self._rests(arm)
         seconds, (wanted, unscaled) = self._timed(stops, home.position), pace
         ends = np.cumsum([0.0, *seconds]) * wanted / unscaled
         points, solver = [home, *stops], self._solvers[arm]

@@ -267,14 +267,19 @@ def test_left_out_fault_kinds_do_not_leak_into_what_judges_them():
     assert '## By fault kind' in text and '| (no fault) |' in text
 
 
-def test_recorded_frames_are_fitted_by_themselves():
-    samples = made_samples()
-    assert calibrate(samples, segmenter='colour').calibration.observed is None
-    seen = [
-        replace(s, observed={**s.features[0], 'margin': 2.0 if s.success else -2.0})
+def with_telling_margins(samples, name):
+    """Those that were judged, with other features whose margin tells what happened."""
+    return [
+        replace(s, **{name: {**s.features[0], 'margin': 2.0 if s.success else -2.0}})
         for s in samples
         if s.features[0]
     ]
+
+
+def test_recorded_frames_are_fitted_by_themselves():
+    samples = made_samples()
+    assert calibrate(samples, segmenter='colour').calibration.observed is None
+    seen = with_telling_margins(samples, 'observed')
     found = calibrate(seen, segmenter='colour')
     assert OBSERVED in found.judgements and found.calibration.scores[OBSERVED]['auroc'] > 0.99
     observed, imagined = found.calibration.given(True), found.calibration.given(False)
@@ -291,11 +296,7 @@ def test_recorded_frames_are_fitted_by_themselves():
 def test_where_nothing_is_foreseen_what_began_in_mid_episode_is_fitted():
     samples = made_samples()
     assert calibrate(samples, segmenter='colour').calibration.unforeseen is None
-    begun = [
-        replace(s, resumed={**s.features[0], 'margin': 2.0 if s.success else -2.0})
-        for s in samples
-        if s.features[0]
-    ]
+    begun = with_telling_margins(samples, 'resumed')
     begun[0] = replace(begun[0], resumed={})
     found = calibrate(begun, segmenter='colour')
     assert isnan(found.judgements[UNFORESEEN][0].probability)
