@@ -90,7 +90,6 @@ def fit_solid(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
     floor: float = 0.0,
-    *,
     is_open: bool = False,
 ) -> Solid | None:
     """Returns the solid whose outlines are nearest to those of an object.

@@ -11,6 +11,7 @@ Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,7 +24,7 @@ from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.helpers import Helpers
+from mtv_world_ros.model.object_motion.helpers import Helpers, Work
 from mtv_world_ros.model.object_motion.rigid_bodies import Arms, BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
@@ -79,13 +80,19 @@ class ContactMotions:
     pose: FloatArray | None = None
 
     def advance(
+        self, robot: RobotModel, positions: FloatArray, rows: int
+    ) -> tuple[BodyMotions, ContactMotions]:
+        """Returns where everything is at each of 1 + T rows, and then; see `begin`."""
+        return self.begin(robot, positions, rows)()
+
+    def begin(
         self,
         robot: RobotModel,
         positions: FloatArray,
         rows: int,
         helpers: Helpers | None = None,
-    ) -> tuple[BodyMotions, ContactMotions]:
-        """Returns where everything is at each of 1 + T rows, and then.
+    ) -> Callable[[], tuple[BodyMotions, ContactMotions]]:
+        """Lets helpers begin; returns what tells where everything is at 1 + T rows, and then.
 
         Args:
             robot: whose joints are commanded.
@@ -100,10 +107,14 @@ class ContactMotions:
         where, arms = free.follow(robot, positions, self.arms)
         begun = self if self.pose is not None else replace(self, pose=positions[0])
         move = partial(begun._moved, robot, where, rows)
-        numbers = range(self.settings.num_motions)
-        moved = list(map(move, numbers)) if helpers is None else helpers.map(move, numbers)
+        numbers = [(number,) for number in range(self.settings.num_motions)]
+        work = Work(move, numbers) if helpers is None else helpers.begin(move, numbers)
+        return partial(begun._finish, work, arms)
+
+    def _finish(self, work: Work[_Moved], arms: ArmState) -> tuple[BodyMotions, ContactMotions]:
+        moved = work.finish()
         then = replace(
-            begun,
+            self,
             states=tuple(one.state for one in moved),
             arms=arms,
             speeds=tuple(one.speeds for one in moved),

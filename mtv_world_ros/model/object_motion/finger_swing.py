@@ -45,13 +45,14 @@ class FingerDrives:
             start: (2, ..., F) how far they are off in the first row, and how fast that grows.
         """
         off, speed = start
+        gain = step_s / self.mass
+        spring, brake = gain * self.stiffness, gain * self.damping
         rows = [off]
         for pull, way in zip(pulls, ways[1:], strict=True):
-            push = pull - self.stiffness * off - self.damping * speed
-            speed = speed + step_s * push / self.mass
-            off = off + step_s * speed
-            least, most = np.minimum(self.lower - way, 0.0), np.maximum(self.upper - way, 0.0)
-            speed = np.where((off < least) | (off > most), 0.0, speed)
-            off = np.minimum(np.maximum(off, least), most)
+            speed = speed + gain * pull - spring * off - brake * speed
+            free = off + step_s * speed
+            off = np.maximum(free, np.minimum(self.lower - way, 0.0))
+            off = np.minimum(off, np.maximum(self.upper - way, 0.0))
+            speed = np.where(off == free, speed, 0.0)
             rows.append(off)
         return np.stack(rows, axis=-2), np.stack([off, speed])

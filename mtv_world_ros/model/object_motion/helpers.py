@@ -7,6 +7,7 @@ processes of `multiprocessing` would: whoever loads a pipeline need not guard it
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 import logging
@@ -15,13 +16,10 @@ from multiprocessing.connection import Connection
 import signal
 import subprocess
 import sys
-from threading import Lock
-from typing import Any, TypeVar
+from threading import Lock, Thread
+from typing import Any, Generic, TypeVar
 
-Job = TypeVar('Job')
 Answer = TypeVar('Answer')
-#: what each job gives, or what one of them raised
-Answers = list[Any] | Exception
 
 logger = logging.getLogger(__name__)
 
@@ -38,55 +36,91 @@ class Helpers:
         self._starting: list[_Helper] | None = None
         self._ready: list[_Helper] = []
 
+    @property
+    def num_ready(self) -> int:
+        """How many of them help by now."""
+        return len(self._ready)
+
     def start(self, function: Callable[..., Any]) -> None:
         """Lets the helpers import what a function needs, so that they are ready when jobs come."""
-        self.map(function, ())
+        self.begin(function, ())
 
-    def map(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
-        """Returns what a function gives for each job, in their order.
-
-        This process does its share, and that of a helper that died.
+    def begin(
+        self, function: Callable[..., Answer], jobs: Sequence[tuple[Any, ...]]
+    ) -> Work[Answer]:
+        """Lets the helpers begin, each with one job after the other, while this process goes on.
 
         Args:
-            function: it, the jobs and what it gives or raises can be pickled.
-            jobs: any number of them.
+            function: it, what it is given and what it gives or raises can be pickled.
+            jobs: the arguments of each call, any number of them.
         """
         with self._lock:
-            self._gather(function)
-            sides = 1 + len(self._ready)
-            shares = [jobs[number::sides] for number in range(sides)]
-            for helper, share in zip(self._ready, shares[1:], strict=True):
-                helper.give(function, share)
-            answers = [_answers(function, shares[0])]
-            for helper, share in zip(list(self._ready), shares[1:], strict=True):
-                answer = helper.answer()
-                if answer is None:
-                    logger.warning('a process that computes motions died; this one goes on alone')
-                    self._ready.remove(helper)
-                    answer = _answers(function, share)
-                answers.append(answer)
-        found: list[Any] = [None] * len(jobs)
-        for number, answer in enumerate(answers):
+            if self._starting is None:
+                self._starting = [_Helper(function) for _ in range(self._count)]
+            for helper in [one for one in self._starting if one.line.poll()]:
+                self._starting.remove(helper)
+                helper.answer()
+                self._ready.append(helper)
+            self._ready = [helper for helper in self._ready if helper.lives]
+            return Work(function, jobs, self._ready)
+
+
+class Work(Generic[Answer]):
+    """Jobs that helpers have begun with; see `Helpers.begin`."""
+
+    def __init__(
+        self,
+        function: Callable[..., Answer],
+        jobs: Sequence[tuple[Any, ...]],
+        helpers: Sequence[_Helper] = (),
+    ) -> None:
+        self._function = function
+        self._found: list[Any] = [None] * len(jobs)
+        self._left = deque(enumerate(jobs))
+        self._feeders = [
+            Thread(target=self._feed, args=(helper,), daemon=True)
+            for helper in helpers[: len(jobs)]
+        ]
+        for feeder in self._feeders:
+            feeder.start()
+
+    def finish(self) -> list[Answer]:
+        """Returns what the function gives for each job, in their order.
+
+        This process does what is left, and what a helper died of.
+        """
+        self._do_left()
+        for feeder in self._feeders:
+            feeder.join()
+        self._do_left()
+        for answer in self._found:
             if isinstance(answer, Exception):
                 raise answer
-            found[number::sides] = answer
-        return found
+        return self._found
 
-    def _gather(self, function: Callable[[Any], Any]) -> None:
-        """Starts helpers at first, and finds out which are ready by now."""
-        if self._starting is None:
-            self._starting = [_Helper(function) for _ in range(self._count)]
-        for helper in [one for one in self._starting if one.line.poll()]:
-            self._starting.remove(helper)
-            if helper.answer() is not None:
-                self._ready.append(helper)
+    def _do_left(self) -> None:
+        with suppress(IndexError):  # none is left
+            while True:
+                number, job = self._left.popleft()
+                self._found[number] = _answer(self._function, *job)
+
+    def _feed(self, helper: _Helper) -> None:
+        with suppress(IndexError), helper.lock:
+            while helper.lives:
+                number, job = self._left.popleft()
+                helper.give(self._function, job)
+                self._found[number] = helper.answer()
+                if not helper.lives:
+                    logger.warning('a process that computes motions died; the others go on')
+                    self._left.append((number, job))
 
 
 class _Helper:
-    """One process; the answer to no jobs tells that it has imported what the function needs."""
+    """One process; its first answer tells that it has imported what the function needs."""
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
+    def __init__(self, function: Callable[..., Any]) -> None:
         self.line, end = Pipe()
+        self.lock, self.lives = Lock(), True
         with end:
             number = end.fileno()
             self.process = subprocess.Popen(
@@ -94,23 +128,24 @@ class _Helper:
                 stdin=subprocess.DEVNULL,
                 pass_fds=[number],
             )
-        self.give(function, ())
+        self.give(function, None)
 
-    def give(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> None:
+    def give(self, function: Callable[..., Any], job: tuple[Any, ...] | None) -> None:
         with suppress(OSError):  # it has died: there will be no answer
-            self.line.send((function, jobs))
+            self.line.send((function, job))
 
-    def answer(self) -> Answers | None:
-        """Waits for what the jobs give; None = it has died."""
+    def answer(self) -> Any:
+        """Waits for what a call gives, or raised; None = it has died."""
         try:
             return self.line.recv()
         except (EOFError, OSError):
+            self.lives = False
             return None
 
 
-def _answers(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Answers:
+def _answer(function: Callable[..., Any], *job: Any) -> Any:
     try:
-        return [function(job) for job in jobs]
+        return function(*job)
     except Exception as error:  # whatever it is, the caller is told
         return error
 
@@ -120,8 +155,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side ends it
     with Connection(int(sys.argv[1])) as line, suppress(EOFError, OSError):
         while True:
-            function, jobs = line.recv()
-            line.send(_answers(function, jobs))
+            function, job = line.recv()
+            line.send(None if job is None else _answer(function, *job))
 
 
 if __name__ == '__main__':

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from safetensors import SafetensorError
@@ -27,7 +27,7 @@ from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.helpers import Helpers
+from mtv_world_ros.model.object_motion.helpers import Answer, Helpers, Work
 from mtv_world_ros.model.object_motion.network import (
     COMMANDS_A_STEP,
     Memory,
@@ -175,12 +175,13 @@ class ObjectMotionPredictor:
         from mtv_world_ros.geometry.solids import find_solid
 
         assert self.contact is not None
-        points, floor = locate_all(cameras, poses, centroids(masks)), self.contact.table_m
-        before = whole.contact.solids
-        solids = [
-            solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
+        points = locate_all(cameras, poses, centroids(masks))
+        before, floor = whole.contact.solids, self.contact.table_m
+        rows = [
+            solid and (solid, masks[:, item], points[item], cameras, poses, floor)
             for item, solid in enumerate(before)
         ]
+        solids = self._shared(find_solid, rows)
         anew = self._find(names, masks, points, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
         hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
@@ -202,6 +203,15 @@ class ObjectMotionPredictor:
         by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1)
         return replace(anew, seen=seen), same & by_two, hidden
 
+    def _shared(
+        self, function: Callable[..., Answer | None], rows: Sequence[tuple[Any, ...] | None]
+    ) -> list[Answer | None]:
+        """What a function gives for the arguments of each row, if any; helpers do their share."""
+        jobs = [row for row in rows if row is not None]
+        work = Work(function, jobs) if self.helpers is None else self.helpers.begin(function, jobs)
+        found = iter(work.finish())
+        return [None if row is None else next(found) for row in rows]
+
     def _find(
         self,
         names: Sequence[str],
@@ -221,12 +231,15 @@ class ObjectMotionPredictor:
         from mtv_world_ros.geometry.solids import fit_solid, is_vessel
         from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
 
-        table = self.contact.table_m
-        rows = enumerate(zip(known, names, points, strict=True))
-        solids = [
-            solid or fit_solid(masks[:, k], at, cameras, poses, table, is_open=is_vessel(name))
-            for k, (solid, name, at) in rows
+        floor = self.contact.table_m
+        rows = [
+            (masks[:, item], points[item], cameras, poses, floor, is_vessel(names[item]))
+            if solid is None
+            else None
+            for item, solid in enumerate(known)
         ]
+        fitted = self._shared(fit_solid, rows)
+        solids = [solid or anew for solid, anew in zip(known, fitted, strict=True)]
         contact = ContactMotions(settings=self.contact, response=response, solids=tuple(solids))
         return replace(found, contact=contact)
 
@@ -308,6 +321,8 @@ class TrackedObjects:
         first = self.before.steps if self.before else 0
         count = (len(positions) - 1) // self.commands_a_step
         errors = self.model.errors(first, count, known.size)
+        contact, robot, every = self.contact, self.model.robot, self.commands_a_step
+        finish = contact and contact.begin(robot, positions, every, self.model.helpers)
         tools, gaps, arms = self._tools(positions)
         # a part of the batch each, of the same size; what fills it up is left out again
         most = max(map(len, self.model.shares))
@@ -331,15 +346,14 @@ class TrackedObjects:
         ways = motion.points.double().numpy() - places[rows, None]
         points = np.where(known[:, None], self.reference + ways, np.nan)[kept]
         rotations = motion.rotations.double().numpy()[kept]
-        contact, seen = self.contact, self.seen
+        seen = self.seen
         reference = self.reference if seen is None else seen.reference
         motions = [
             ObjectMotion(reference=reference, points=way, rotations=turns)
             for way, turns in zip(points, rotations, strict=True)
         ]
-        if contact is not None:
-            robot, every = self.model.robot, self.commands_a_step
-            bodies, contact = contact.advance(robot, positions, every, self.model.helpers)
+        if finish is not None:
+            bodies, contact = finish()
             motions += [
                 ObjectMotion(
                     reference=contact.centres if seen is None else seen.centres,

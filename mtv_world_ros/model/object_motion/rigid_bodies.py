@@ -587,7 +587,7 @@ def _settle(
         for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
             node.setShape(_boxed(node.getShape()))
             if not body.getNumDependentGenCoords() and node.getCollisionAspect():
-                node.getCollisionAspect().setCollidable(False)  # it stands on the table
+                node.removeCollisionAspect()  # it stands on the table
             aspect = node.getDynamicsAspect()
             if aspect is not None:
                 aspect.setFrictionCoeff(friction)

@@ -287,7 +287,7 @@ def test_motions_are_the_same_in_one_process_and_in_two(robot, response, recordi
     motions, half = motions_of(response, AWAY, num_motions=3), 8 * ROWS
     for positions in recording.positions[: half + 1], recording.positions[half : 2 * half]:
         alone, then = motions.advance(robot, positions, ROWS)
-        shared, motions = motions.advance(robot, positions, ROWS, helpers)
+        shared, motions = motions.begin(robot, positions, ROWS, helpers)()
         for name in ('points', 'rotations', 'joints'):
             np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
         np.testing.assert_array_equal(then.swings, motions.swings)
