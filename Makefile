@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test fuzz kills soak lint format docs clean distclean
+.PHONY: help install demo test tests style types fuzz kills soak lint format docs clean distclean
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -24,13 +24,20 @@ $(STAMP): setup.py requirements/constraints.txt requirements/install.sh
 demo: $(STAMP)  ## replay the bundled episode through the node; results under out/demo/
 	$(BIN)/mtv-world demo --overwrite
 
-lint: $(STAMP)  ## ruff, pyright and import-linter
+lint: style types  ## ruff, import-linter and pyright
+
+style: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo
 
-test: lint  ## the linters, then all tests (about 10 minutes)
+types: $(STAMP)
+	$(BIN)/pyright
+
+test: style  ## the linters and all tests (about 10 minutes)
+	@$(MAKE) --no-print-directory --jobs=2 types tests
+
+tests: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
