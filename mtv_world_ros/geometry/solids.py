@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project, unproject
 from mtv_world_ros.geometry.mask_geometry import centroids
+from mtv_world_ros.geometry.transforms import about_z
 
 #: directions in the image along which outlines are compared
 _ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False)
@@ -75,8 +76,7 @@ class Solid:
 
     def turn_to(self, now: Solid) -> FloatArray:
         """Returns (3, 3) how it has turned."""
-        cos, sin = np.cos(now.yaw - self.yaw), np.sin(now.yaw - self.yaw)
-        return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        return about_z(now.yaw - self.yaw)
 
 
 def is_vessel(name: str) -> bool:

@@ -35,6 +35,11 @@ def quaternion(R: FloatArray) -> FloatArray:
     return np.asarray(pin.Quaternion(np.asarray(R, dtype=float)).coeffs())
 
 
+def about_z(angle: float) -> FloatArray:
+    """Returns the (3, 3) rotation by an angle [rad] about z."""
+    return np.asarray(pin.utils.rotate('z', angle))
+
+
 def pose(
     position: Sequence[float] | FloatArray, quaternion_xyzw: Sequence[float] | FloatArray
 ) -> FloatArray:

@@ -27,6 +27,7 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.geometry.robot_shape import find_mesh
 from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.geometry.transforms import about_z
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
@@ -705,7 +706,7 @@ def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> l
 
 def _turned(yaw: float) -> FloatArray:
     pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, :3] = about_z(yaw)
     return pose
 
 
