@@ -20,6 +20,8 @@ from threading import Lock, Thread
 from typing import Any, Generic, TypeVar
 
 Answer = TypeVar('Answer')
+#: what no process has given yet
+_UNDONE = object()
 
 logger = logging.getLogger(__name__)
 
@@ -74,9 +76,9 @@ class Work(Generic[Answer]):
         jobs: Sequence[tuple[Any, ...]],
         helpers: Sequence[_Helper] = (),
     ) -> None:
-        self._function = function
-        self._found: list[Any] = [None] * len(jobs)
-        self._left = deque(enumerate(jobs))
+        self._function, self._jobs = function, jobs
+        self._found: list[Any] = [_UNDONE] * len(jobs)
+        self._left = deque(range(len(jobs)))
         self._feeders = [
             Thread(target=self._feed, args=(helper,), daemon=True)
             for helper in helpers[: len(jobs)]
@@ -89,30 +91,27 @@ class Work(Generic[Answer]):
 
         This process does what is left, and what a helper died of.
         """
-        self._do_left()
-        for feeder in self._feeders:
-            feeder.join()
-        self._do_left()
-        for answer in self._found:
-            if isinstance(answer, Exception):
-                raise answer
-        return self._found
-
-    def _do_left(self) -> None:
         with suppress(IndexError):  # none is left
             while True:
-                number, job = self._left.popleft()
-                self._found[number] = _answer(self._function, *job)
+                self._do(self._left.popleft())
+        for feeder in self._feeders:
+            feeder.join()
+        for number, answer in enumerate(self._found):
+            if answer is _UNDONE:
+                self._do(number)
+            if isinstance(self._found[number], Exception):
+                raise self._found[number]
+        return self._found
+
+    def _do(self, number: int) -> None:
+        self._found[number] = _answer(self._function, self._jobs[number])
 
     def _feed(self, helper: _Helper) -> None:
         with suppress(IndexError), helper.lock:
             while helper.lives:
-                number, job = self._left.popleft()
-                helper.give(self._function, job)
+                number = self._left.popleft()
+                helper.give(self._function, self._jobs[number])
                 self._found[number] = helper.answer()
-                if not helper.lives:
-                    logger.warning('a process that computes motions died; the others go on')
-                    self._left.append((number, job))
 
 
 class _Helper:
@@ -135,15 +134,16 @@ class _Helper:
             self.line.send((function, job))
 
     def answer(self) -> Any:
-        """Waits for what a call gives, or raised; None = it has died."""
+        """Waits for what a call gives, or raised; `_UNDONE` = it has died."""
         try:
             return self.line.recv()
         except (EOFError, OSError):
+            logger.warning('a process that computes motions died; the others go on')
             self.lives = False
-            return None
+            return _UNDONE
 
 
-def _answer(function: Callable[..., Any], *job: Any) -> Any:
+def _answer(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
     try:
         return function(*job)
     except Exception as error:  # whatever it is, the caller is told
@@ -156,7 +156,7 @@ def main() -> None:
     with Connection(int(sys.argv[1])) as line, suppress(EOFError, OSError):
         while True:
             function, job = line.recv()
-            line.send(None if job is None else _answer(function, *job))
+            line.send(None if job is None else _answer(function, job))
 
 
 if __name__ == '__main__':
