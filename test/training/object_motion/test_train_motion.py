@@ -51,6 +51,12 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.fixture
+def short_windows(monkeypatch) -> None:
+    """A training step takes as long as its windows are."""
+    monkeypatch.setattr(windows, 'WINDOW', 8)
+
+
 @pytest.fixture(scope='module')
 def episodes(tmp_path_factory) -> list[Path]:
     """Two episodes with a picture of the first frame alone, and where the objects went."""
@@ -61,6 +67,24 @@ def episodes(tmp_path_factory) -> list[Path]:
     config = CollectConfig(policies=policies, record=RecordConfig(pictures='first'))
     collect('stack_blocks_two', 2, 5, out, config=config, progress=False)
     return sorted(path.parent for path in out.rglob('metadata.yaml'))
+
+
+def busiest(track: ObjectTracks, count: int = 16) -> ObjectTracks:
+    """The steps of an episode in which objects go furthest."""
+    ways = np.linalg.norm(np.diff(track.points, axis=0), axis=-1).max(axis=1)
+    gone = np.concatenate([[0.0], ways.cumsum()])
+    first = int((gone[count:] - gone[:-count]).argmax())
+    rows = slice(first, first + count + 1)
+    return replace(
+        track,
+        tools=track.tools[rows],
+        gaps=track.gaps[rows],
+        recorded_tools=track.recorded_tools[rows],
+        recorded_gaps=track.recorded_gaps[rows],
+        points=track.points[rows],
+        rotations=track.rotations[rows],
+        known=track.known[rows],
+    )
 
 
 def test_tracks_are_the_recorded_poses_from_where_the_masks_have_the_objects(episodes, robot):
@@ -110,15 +134,17 @@ def error_of_one_step(network: ObjectMotionNetwork, tracks: list[ObjectTracks]) 
     return float(torch.stack(errors).nanmean())
 
 
-def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_path):
+def test_training_learns_its_own_episodes_and_writes_them(
+    episodes, robot, tmp_path, short_windows
+):
     read, skipped = read_tracks(episodes, robot, VIEWS, 3)
     # pictures of the first frame only: nowhere else to begin
     assert [len(starts) for starts in read] == [1, 1] and not skipped
-    tracks = [starts[0] for starts in read]
+    tracks = [busiest(starts[0]) for starts in read]
     torch.manual_seed(0)
     untrained = ObjectMotionNetwork(width=24, hidden=8)
     before = error_of_one_step(untrained, tracks)
-    config = MotionTraining(steps=60, batch_size=4, learning_rate=0.01, forced_share=1.0)
+    config = MotionTraining(steps=32, batch_size=16, learning_rate=0.02, forced_share=1.0)
     network = train_motion(tracks, tmp_path / 'b', config, init=untrained)
     assert error_of_one_step(network, tracks) < 0.9 * before
     after, _ = end_errors(network, tracks)
@@ -131,7 +157,9 @@ def test_training_learns_its_own_episodes_and_writes_them(episodes, robot, tmp_p
         train_motion(tracks, tmp_path / 'c', replace(config, width=16), init=loaded)
 
 
-def test_products_in_bfloat16_train_nearly_the_same_and_keep_float32(episodes, robot, tmp_path):
+def test_products_in_bfloat16_train_nearly_the_same_and_keep_float32(
+    episodes, robot, tmp_path, short_windows
+):
     tracks = [starts[0] for starts in read_tracks(episodes, robot, VIEWS)[0]]
     config = MotionTraining(steps=8, batch_size=4, forced_share=1.0, width=24, hidden=8)
     weights = []
@@ -143,7 +171,7 @@ def test_products_in_bfloat16_train_nearly_the_same_and_keep_float32(episodes, r
 
 
 def test_training_goes_on_from_networks_and_replaces_none_unasked(
-    episodes, robot, tmp_path, capsys
+    episodes, robot, tmp_path, short_windows, capsys
 ):
     one, two = tmp_path / 'one', tmp_path / 'two'
     small = ['--steps', '1', '--batch-size', '2', '--threads', '1']
