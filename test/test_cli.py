@@ -97,10 +97,8 @@ def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
 
     episode = share_path('resource', 'demo_episode')
     out = tmp_path / 'imagined'
-    done = run(
-        'replay', str(episode), '--offline', '--out', str(out), '--steps', '1', cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
+    words = ['--offline', '--out', str(out), '--steps', '1', '--threads', '1']
+    assert main(['replay', str(episode), *words]) == 0
     counts: dict[str, int] = {}
     for message in BagReader(out).messages():
         counts[message.topic] = counts.get(message.topic, 0) + 1
@@ -111,11 +109,8 @@ def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
 
 @needs_checkpoint
 def test_evaluates_the_bundled_model(tmp_path: Path) -> None:
-    episode = share_path('resource', 'demo_episode')
-    done = run(
-        'evaluate', 'bundled', str(episode), '--out', 'scores', '--steps', '1', cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
+    words = ['--out', str(tmp_path / 'scores'), '--steps', '1', '--threads', '1']
+    assert main(['evaluate', 'bundled', str(share_path('resource', 'demo_episode')), *words]) == 0
     metrics = json.loads((tmp_path / 'scores' / 'metrics.json').read_text())
     assert metrics['num_episodes'] == 1
     for view in ('low', 'high'):
