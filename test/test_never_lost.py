@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 import json
 import os
 from pathlib import Path
@@ -10,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -118,10 +122,8 @@ def test_a_report_of_several_evaluations_needs_a_place_of_its_own(
     assert 'is not finished' in refused(['report', str(half.parent)], capsys)
 
 
-@pytest.mark.parametrize('kind', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_the_training_and_says_how_to_go_on(kind: int, tmp_path: Path) -> None:
-    out = tmp_path / 'run'
-    words = train_words(out, '--set', 'optimizer.steps=100000', '--save-every', '1000000')
+def stopped_in_a_process(words: list[str], kind: int, log: Path) -> tuple[int, str]:
+    """Status and errors of a command that gets a signal once it has logged something."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'mtv_world_ros.cli', *words],
         env={**os.environ, 'PYTHONPATH': str(ROOT)},
@@ -130,29 +132,59 @@ def test_a_signal_saves_the_training_and_says_how_to_go_on(kind: int, tmp_path: 
         text=True,
     )
     end = time.monotonic() + 240
-    log = out / 'log.jsonl'
     while not (log.is_file() and log.read_text()):
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.1)
     process.send_signal(kind)
-    said = process.communicate(timeout=120)[1].splitlines()[-1]
-    assert process.returncode == 128 + kind
+    said = process.communicate(timeout=120)[1]
+    return process.returncode, said
+
+
+def stopped_here(words: list[str], kind: int, log: Path) -> tuple[int, str]:
+    """The same without a process of its own."""
+    ended, said = threading.Event(), StringIO()
+
+    def stop() -> None:
+        while not ended.wait(0.05):
+            if log.is_file() and log.read_text():
+                os.kill(os.getpid(), kind)
+                return
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    try:
+        with redirect_stderr(said):
+            status = main(words)
+    finally:
+        ended.set()
+        thread.join()
+    return status, said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ('kind', 'stopped'),
+    [(signal.SIGINT, stopped_in_a_process), (signal.SIGTERM, stopped_here)],
+)
+def test_a_signal_saves_the_training_and_says_how_to_go_on(
+    kind: int,
+    stopped: Callable[[list[str], int, Path], tuple[int, str]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / 'run'
+    words = train_words(out, '--set', 'optimizer.steps=100000', '--save-every', '1000000')
+    status, errors = stopped(words, kind, out / 'log.jsonl')
+    said = errors.splitlines()[-1]
+    assert status == 128 + kind, errors
     step = json.loads((out / 'state' / 'state.json').read_text())['step']
     assert step >= 10
     assert said.startswith(f'mtv-world: stopped at step {step} of 100000, which is saved in ')
     again = shlex.split(said.partition('; go on with: ')[2])
     assert again == ['mtv-world', *words]
     # the command that it printed goes on, here for two steps more
-    done = subprocess.run(
-        [sys.executable, '-m', 'mtv_world_ros.cli', *again[1:]]
-        + ['--set', f'optimizer.steps={step + 2}'],
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    assert f'resumed at step {step}' in done.stderr + done.stdout
+    capsys.readouterr()
+    assert main([*again[1:], '--set', f'optimizer.steps={step + 2}']) == 0
+    assert f'resumed at step {step}' in capsys.readouterr().out
     card = json.loads((out / 'checkpoint' / 'world_model.json').read_text())
     assert card['trained_on']['steps'] == step + 2
 
@@ -160,9 +192,6 @@ def test_a_signal_saves_the_training_and_says_how_to_go_on(kind: int, tmp_path: 
 @pytest.fixture(scope='module')
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A training of two steps, and what it printed."""
-    from contextlib import redirect_stdout
-    from io import StringIO
-
     out, said = tmp_path_factory.mktemp('trained') / 'run', StringIO()
     with redirect_stdout(said):
         assert main(train_words(out, '--set', 'optimizer.steps=2')) == 0

@@ -53,6 +53,7 @@ def test_the_search_leaves_what_loses_the_block(robot, response, monkeypatch):
     first = first_settings(robot, response).model_copy(update={'grip_friction': 0.03})
     lost = np.nanmax(recording.errors(robot, response, first)[-1])
     monkeypatch.setattr(contact_fit, '_FACTORS', (30.0,))
+    monkeypatch.setattr(contact_fit, '_FITTED', ('grip_friction', 'tray_kg'))
     lines: list[str] = []
     found = fit_contact(
         [recording], robot_path('yam_bimanual'), response, first, report=lines.append
@@ -80,6 +81,7 @@ def test_the_command_writes_what_a_checkpoint_foresees_with(
     checkpoint, robot, capsys, monkeypatch
 ):
     monkeypatch.setattr(contact_fit, '_FACTORS', (1.3,))
+    monkeypatch.setattr(contact_fit, '_FITTED', ('grip_friction',))
     words = ['fit-contact', str(DEMO), '--checkpoint', str(checkpoint), '--motions', '2']
     assert main(words) == 0
     file = checkpoint / 'object_motion' / CONTACT_FILE
