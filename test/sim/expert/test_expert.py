@@ -16,19 +16,42 @@ def sim(robot, expert):
 
 
 @pytest.mark.parametrize('name', TASKS)
-def test_expert_succeeds_and_its_miss_leaves_the_missed_object_alone(sim, expert, name):
-    task, done, missed = TASKS[name], 0, 0
+def test_expert_succeeds_in_three_of_four_and_carries_things_to_their_goals(sim, expert, name):
+    done = 0
     for seed in range(4):
-        take = _simulate(sim, expert, task, seed, miss=False)
-        if take is not None and take.is_as_wanted():
-            done += 1
-            assert take.ever and take.final
-        miss = _simulate(sim, expert, task, seed, miss=True)
-        if miss is not None and miss.is_as_wanted():
-            missed += 1
-            assert not miss.ever and miss.moved[miss.missed] < 0.02
-            assert miss.missed in {move.subject for move in task.moves}
-    assert done >= 3 and missed >= 2
+        take = _simulate(sim, expert, TASKS[name], seed, miss=False)
+        if take is None or not take.is_as_wanted():
+            continue
+        assert take.ever and take.final
+        check_places(sim.situation(), take)
+        done += 1
+        if done == 3:
+            return
+    pytest.fail(f'{done} of 4')
+
+
+def check_places(situation, take):
+    """What is carried ends near its goal, and containers stay."""
+    for role, centres in situation.positions.items():
+        goal = situation.goals.get(role, centres[0])
+        assert np.linalg.norm((centres[-1] - goal)[:2]) < 0.03, role
+        # nothing sinks into the table or floats over it
+        assert centres[:, 2].min() > 0.005 and take.observations[-1].success
+
+
+@pytest.mark.parametrize('name', TASKS)
+def test_a_miss_leaves_the_missed_object_alone(sim, expert, name):
+    missed = 0
+    for seed in range(4):
+        miss = _simulate(sim, expert, TASKS[name], seed, miss=True)
+        if miss is None or not miss.is_as_wanted():
+            continue
+        assert not miss.ever and miss.moved[miss.missed] < 0.02
+        assert miss.missed in {move.subject for move in TASKS[name].moves}
+        missed += 1
+        if missed == 2:
+            return
+    pytest.fail(f'{missed} of 4')
 
 
 def _simulate(sim, expert, task, seed, *, miss):
@@ -38,22 +61,6 @@ def _simulate(sim, expert, task, seed, *, miss):
     except SimulatorError as error:
         assert 'out of reach' in str(error)
         return None
-
-
-@pytest.mark.parametrize('name', TASKS)
-def test_what_is_carried_ends_near_its_goal_and_containers_stay(sim, expert, name):
-    task = TASKS[name]
-    take = next(
-        take
-        for seed in range(5)
-        if (take := _simulate(sim, expert, task, seed, miss=False)) and take.is_as_wanted()
-    )
-    situation = sim.situation()
-    for role, centres in situation.positions.items():
-        goal = situation.goals.get(role, centres[0])
-        assert np.linalg.norm((centres[-1] - goal)[:2]) < 0.03, role
-        # nothing sinks into the table or floats over it
-        assert centres[:, 2].min() > 0.005 and take.observations[-1].success
 
 
 def test_objects_neither_jitter_nor_sink_before_they_are_touched(sim, expert):
