@@ -104,7 +104,7 @@ class Node:
 
 
 def run_in_process(words):
-    """Runs a command that talks to the node; returns what it said."""
+    """Runs a command that talks to the node from a process of its own; returns what it said."""
     command = [sys.executable, '-m', 'mtv_world_ros.cli', *words[1:], *SMALL.get(words[1], [])]
     done = subprocess.run(command, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, f'{words}: {done.stdout}{done.stderr}'
@@ -115,6 +115,7 @@ def run_in_process(words):
 def at_the_desk(desk, monkeypatch):
     """Commands run there, and find the policy's module."""
     monkeypatch.chdir(desk)
+    monkeypatch.syspath_prepend(desk)
     packages = [str(desk), str(PAGE.parents[1]), os.environ.get('PYTHONPATH', '')]
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(filter(None, packages)))
     monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
@@ -139,7 +140,7 @@ def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
 
 
 @pytest.mark.skipif(find_spec('rclpy') is None, reason='rclpy is not installed')
-def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk):
+def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk, capfd):
     """Goes on from what the test above has trained."""
     if not (at_the_desk / 'runs' / 'mine' / 'checkpoint').is_dir():
         pytest.skip('the first half of the page was not run')
@@ -152,5 +153,7 @@ def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk):
     assert status == 0 and ' done' in said and 'rejected' not in said, said + node.log.read_text()
     assert 'robot crane' in node.log.read_text()
     for words, out in zip(imagine, ('mine_repeated', 'mine_imagined'), strict=True):
-        assert 'max_chunks' in run_in_process(words)
+        status = main([*words[1:], *SMALL['imagine']])
+        said = ''.join(capfd.readouterr())
+        assert status == 0 and 'max_chunks' in said, f'{words}: {said}'
         assert any((at_the_desk / 'out' / out).glob('episode_00000/*.mcap'))
