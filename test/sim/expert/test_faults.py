@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -30,10 +31,15 @@ from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
 SEED, TASK = 4, 'place_block_a2b_left'
 
 
-def plan(expert, name: str) -> np.ndarray:
+@cache
+def trajectory(expert, name: str) -> JointTrajectory:
     policy = scripted_policy(name, TASK, SEED, expert)
     policy.reset(seed=SEED)
-    return policy.plan.positions
+    return policy.plan
+
+
+def plan(expert, name: str) -> np.ndarray:
+    return trajectory(expert, name).positions
 
 
 def test_the_catalogue_is_wide_enough_and_its_splits_are_apart():
@@ -282,12 +288,11 @@ def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
         base_link=robot.base_link,
         mimics=robot.mimics,
     )
-    policy = scripted_policy('expert', TASK, SEED, expert)
-    policy.reset(seed=SEED)
+    given = trajectory(expert, 'expert')
     rng, name = np.random.default_rng(0), f'expert-{kind}-{FAULTS[kind].typical:g}'
-    assert len(with_faults(policy.plan, PolicyVariant(), bare, rng).times) > 0
+    assert len(with_faults(given, PolicyVariant(), bare, rng).times) > 0
     with pytest.raises(PolicyError, match=f"{kind} takes a gripper, robot 'bare' has none"):
-        with_faults(policy.plan, parse_variant(name), bare, rng)
+        with_faults(given, parse_variant(name), bare, rng)
 
 
 def test_it_circles_about_its_object_at_its_height():

@@ -173,12 +173,24 @@ def test_a_wrong_object_needs_another_one_that_can_be_grasped(expert):
 
 def test_success_is_graded_by_the_faults(sim, expert):
     """The expert succeeds, small faults fail sometimes, large ones always."""
-    names = ('expert', 'expert-place-0.02', 'expert-miss-0.5', 'expert-miss-1', 'expert-stop-0')
-    rates = []
-    for name in names:
-        rates.append(np.mean([_succeeds(sim, _policy(name, expert, seed=s), s) for s in range(8)]))
-    assert rates[0] == 1.0 and rates[3] == rates[4] == 0.0
-    assert 0.0 < rates[1] < 1.0 and 0.0 < rates[2] < 1.0
+
+    def outcomes(name: str, wanted: set[bool]) -> set[bool]:
+        """Of eight seeds, or of fewer that had all that is wanted of several."""
+        seen = set()
+        for seed in range(8):
+            seen.add(bool(_succeeds(sim, _policy(name, expert, seed=seed), seed)))
+            if len(wanted) > 1 and seen == wanted:
+                break
+        return seen
+
+    wanted = {
+        'expert': {True},
+        'expert-place-0.02': {True, False},
+        'expert-miss-0.5': {True, False},
+        'expert-miss-1': {False},
+        'expert-stop-0': {False},
+    }
+    assert {name: outcomes(name, seen) for name, seen in wanted.items()} == wanted
 
 
 def test_home_is_where_the_scenario_begins(expert, robot, workcell):
