@@ -23,7 +23,7 @@ from mtv_world_ros.training.training_config import load_training_config, Trainin
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
-_KILLS = 6
+_KILLS = 4
 
 
 def start(out: Path, episodes: Path, preset: Path) -> int:
@@ -82,7 +82,7 @@ if __name__ == '__main__':
     kills = []
     for number in range(_KILLS):
         process = start(folder / 'killed', bags, file)
-        moment = random.random() * 0.15
+        moment = random.random() * 0.1
         told = kill(process, folder / 'killed', saving=number % 2 == 1, after=moment)
         kills += [told] if told else []
     for name in ('killed', 'whole'):
