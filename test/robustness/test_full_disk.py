@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cache, partial
 import os
 from pathlib import Path
 import subprocess
@@ -13,8 +14,10 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.files import share_path
+from mtv_world_ros.inspection import inspect
 from mtv_world_ros.inspection.camera_pose import CameraEstimate
 from mtv_world_ros.inspection.fixed_camera import FixedCamera
+from mtv_world_ros.inspection.motion_residual import ResidualSearch
 
 EPISODE = share_path('resource', 'demo_episode')
 URDF = share_path('config', 'robots', 'yam_bimanual.urdf')
@@ -25,6 +28,7 @@ TINY = (
     'transformer.freq_dim=16 video.num_frames=2 video.width=48 video.height=40 '
     'optimizer.batch_size=1 optimizer.warmup_steps=1 optimizer.steps=2'
 )
+QUICK = ResidualSearch(max_pairs=5, lags_s=(0.0,), rolls_deg=(), zooms=())
 ONE_STEP = ['--steps', '1', '--threads', '1']
 SETTINGS = [word for value in TINY.split() for word in ('--set', value)]
 
@@ -89,6 +93,18 @@ def _as_guessed(camera: FixedCamera, **options: object) -> CameraEstimate:
     return CameraEstimate(camera=camera._camera, std_mm=1.0, std_deg=0.1, evidence='none')
 
 
+@pytest.fixture(scope='module')
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[str]]:
+    """Makes the input of a command of `PREPARED`, once; returns the command."""
+
+    @cache
+    def words(name: str) -> list[str]:
+        make, _ = PREPARED[name]
+        return make(tmp_path_factory.mktemp('input'))
+
+    return words
+
+
 def _dataset(folder: Path) -> list[str]:
     """Makes a LeRobot dataset; the command that imports it."""
     assert main(['export-dataset', str(EPISODE), '--out', str(folder)]) == 0
@@ -125,17 +141,20 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
 ) -> None:
     monkeypatch.chdir(full_disk.parent)
     monkeypatch.setattr(FixedCamera, 'estimate', _as_guessed)
+    monkeypatch.setattr(inspect, 'load_inspector', partial(inspect.load_inspector, search=QUICK))
     check_refused(WRITERS[name](full_disk), full_disk, capfd)
 
 
 @pytest.mark.parametrize('is_full', [True, False], ids=['full', 'fills_up'])
 @pytest.mark.parametrize('name', PREPARED)
 def test_a_disk_that_is_full_or_fills_up_keeps_no_part_of_an_import_or_a_report(
-    name: str, is_full: bool, full_disk: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    name: str,
+    is_full: bool,
+    full_disk: Path,
+    prepared: Callable[[str], list[str]],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    make, out = PREPARED[name]
-    (tmp_path / 'input').mkdir()
-    words = make(tmp_path / 'input')
+    words, (_, out) = prepared(name), PREPARED[name]
     capfd.readouterr()
     if not is_full:
         (full_disk / 'others').unlink()
