@@ -13,6 +13,7 @@ from mtv_world_ros.assembly import checkpoint_path, robot_path
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.predictor import (
     CONTACT_FILE,
     load_predictor,
@@ -81,6 +82,7 @@ def test_the_command_writes_what_a_checkpoint_foresees_with(
     checkpoint, robot, capsys, monkeypatch
 ):
     monkeypatch.setattr(contact_fit, '_FACTORS', (1.3,))
+    assert set(contact_fit._FITTED) <= set(ContactSettings.model_fields)
     monkeypatch.setattr(contact_fit, '_FITTED', ('grip_friction',))
     words = ['fit-contact', str(DEMO), '--checkpoint', str(checkpoint), '--motions', '2']
     assert main(words) == 0
