@@ -156,6 +156,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-droop-0.5',
         'expert-budge-0.01',
         'expert-budge-0.02',
+        'expert-slump-0.06',
+        'expert-slump-0.15',
+        'expert-vise-0.015',
+        'expert-vise-0.025',
+        'expert-roam-2',
+        'expert-roam-3',
     ),
     'calibrate': (
         'expert',
@@ -278,22 +284,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-tug-0.06',
         'expert-warp-0.045',
         'expert-warp-0.055',
-    ),
-    'test': (
-        'expert',
-        'expert-slump-0.06',
-        'expert-slump-0.15',
         'expert-grid-0.05',
         'expert-grid-0.06',
-        'expert-vise-0.015',
-        'expert-vise-0.025',
         'expert-slap-0.03',
         'expert-slap-0.07',
-        'expert-roam-2',
-        'expert-roam-3',
         'expert-wane-0.18',
         'expert-wane-0.22',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -202,7 +202,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'slump': _kind(
         'height',
-        'test',
+        'train',
         0.1,
         0.3,
         'm',
@@ -269,7 +269,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'grid': _kind(
         'lateral',
-        'test',
+        'calibrate',
         0.05,
         0.15,
         'm',
@@ -649,7 +649,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'vise': _kind(
         'collision',
-        'test',
+        'train',
         0.02,
         0.06,
         'm',
@@ -657,7 +657,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'slap': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.05,
         0.12,
         'm',
@@ -665,7 +665,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'roam': _kind(
         'collision',
-        'test',
+        'train',
         2,
         6,
         '',
@@ -922,7 +922,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'wane': _kind(
         'joint',
-        'test',
+        'calibrate',
         0.2,
         0.5,
         '',
