@@ -24,6 +24,8 @@ from mtv_world_ros.sim.world.workcell import Workcell, workcell_of
 _STAYS_S, _LESS = 0.4, 0.05
 #: time in which an arm strikes what another carries, before scaling [s]
 _SLAP_S = 0.3
+#: how long after this arm another one follows it, before scaling [s]
+_TAIL_S = 0.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -430,6 +432,9 @@ class Expert:
             comes.append(self._slap(arm, other, stops, faults.slapped, pace))
         if places := faults.roams(objects):
             comes.append((self._roam(other, places, pace), 0))
+        if faults.tailed:
+            rows = self._tail(arm, other, stops, faults.tailed, pace)
+            comes.append((rows, self._late(_TAIL_S, pace)))
         return stops, comes
 
     def _crowd(
@@ -584,6 +589,28 @@ class Expert:
             return [low[0].moved(rise), *low, low[-1].moved(rise), home]
 
         return self._as_far_as_it_reaches(other, ways, 1.0, pace)[0]
+
+    def _tail(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        share: float,
+        pace: tuple[float, float],
+    ) -> FloatArray:
+        """Rows of another arm that does what this one does, a share of the way to each place.
+
+        Or as much of the way as it reaches, in the same time.
+        """
+        seconds = self._timed(stops, self.workcell.home_tools[arm])
+        same = [replace(s, seconds=time) for s, time in zip(stops, seconds, strict=True)]
+        home = replace(self._rests(other), seconds=seconds[-1])
+
+        def ways(share: float) -> list[WayPoint]:
+            shorts = [(1 - share) * (home.position - s.position) * (1, 1, 0) for s in same[:-1]]
+            return [*(s.moved(way) for s, way in zip(same, shorts, strict=False)), home]
+
+        return self._as_far_as_it_reaches(other, ways, share, pace)[0]
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
         """Rows before something begins, of a time before scaling [s]; none if it is too late."""

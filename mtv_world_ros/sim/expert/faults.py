@@ -208,6 +208,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'm',
         'once, the arms give way under their weight, sink this far, and rise again',
     ),
+    'heave': _kind(
+        'height',
+        'test',
+        0.04,
+        0.1,
+        'm',
+        'both arms go up and down in waves, this far',
+    ),
     # lateral
     'shift': _kind(
         'lateral',
@@ -304,6 +312,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.6,
         'rad',
         'what it holds leans to and fro on its goal, up to this far, before it is let go',
+    ),
+    'list': _kind(
+        'wrist',
+        'test',
+        0.65,
+        0.9,
+        'rad',
+        'how far the wrist leans where its arm reaches out most; less where it reaches less far',
     ),
     # opening
     'loose': _kind(
@@ -439,6 +455,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.2,
         'm',
         'it swings what it holds this far, over its goal, and lets go in full swing',
+    ),
+    'bowl': _kind(
+        'release',
+        'test',
+        0.06,
+        0.15,
+        'm',
+        'what it holds slides this far to its goal, in one stroke, while the fingers open',
     ),
     # collision
     'push': _kind(
@@ -671,6 +695,22 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'number of places near objects that the other arm roams through meanwhile, low and open',
     ),
+    'dribble': _kind(
+        'collision',
+        'test',
+        0.04,
+        0.12,
+        'm',
+        'before the grasp, shut fingers push the object this far, and back from its other side',
+    ),
+    'tail': _kind(
+        'collision',
+        'test',
+        0.8,
+        1.0,
+        '',
+        'share of its way to the same places by which the other arm follows this one',
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -725,6 +765,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.12,
         'm',
         'meanwhile the other arm takes what is next to the goal and moves it this far',
+    ),
+    'rattle': _kind(
+        'object',
+        'test',
+        0.08,
+        0.1,
+        'm',
+        'once done, it closes on what it has put the object on or beside, and shakes it, this far',
     ),
     'place': _kind(
         'place',
@@ -1181,6 +1229,8 @@ _NUM_WAVES = 4
 #: time in which arms that give way sink, lie, and rise again [s]; a step to find out which joint
 #: lowers the tool by how much [rad]; squares of those that are too small to sink by [m2/rad2]
 _SLUMP_S, _STEP_RAD, _LEAST_SLOPE = (0.3, 0.4, 0.6), 1e-4, 1e-3
+#: period of waves on which all tools go up and down [s]
+_HEAVE_S = 2.0
 #: time in which a constant error sets in [s]
 _SET_IN_S = 1.0
 #: how often commands are lost
@@ -1218,6 +1268,7 @@ _OF_TWO_ARMS = (
     'vise',
     'slap',
     'roam',
+    'tail',
 )
 #: kinds of what a gripper does
 _OF_GRIPPERS = (
@@ -1267,6 +1318,10 @@ _OF_GRIPPERS = (
     'tug',
     'vise',
     'slap',
+    'dribble',
+    'bowl',
+    'rattle',
+    'tail',
 )
 #: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
 #: one command to the next, both as shares of its range; how much faster they go back
@@ -1536,6 +1591,10 @@ def _off_course(
     if variant.size('slump'):
         share, depth = _own(rng).uniform(*_BRAKES), variant.size('slump')
         positions = _slump(positions, robot, float(share), depth, period)
+        positions = np.clip(positions, robot.lower, robot.upper)
+    if variant.size('heave'):
+        phase, amplitude = _own(rng).uniform(0.0, 2 * np.pi), variant.size('heave')
+        positions = _heave(positions, robot, amplitude, float(phase), period)
         positions = np.clip(positions, robot.lower, robot.upper)
     positions = _wane(positions, grippers, variant.size('wane'))
     if variant.size('warp'):
@@ -2068,7 +2127,23 @@ def _tow(
 def _slump(
     positions: FloatArray, robot: RobotModel, share: float, depth: float, period: float
 ) -> FloatArray:
-    """(T, J): at a share of the plan, all tools sink, and rise again.
+    """(T, J): at a share of the plan, all tools sink, and rise again."""
+    since = (np.arange(len(positions)) - share * len(positions)) * period
+    sunk = depth * np.interp(since, np.cumsum([0.0, *_SLUMP_S]), [0.0, 1.0, 1.0, 0.0])
+    return _lowered(positions, robot, sunk)
+
+
+def _heave(
+    positions: FloatArray, robot: RobotModel, amplitude: float, phase: float, period: float
+) -> FloatArray:
+    """(T, J): all tools go up and down in waves, once they have set in."""
+    times = np.arange(len(positions)) * period
+    waves = np.minimum(times / _SET_IN_S, 1.0) * np.sin(2 * np.pi * times / _HEAVE_S + phase)
+    return _lowered(positions, robot, amplitude * waves)
+
+
+def _lowered(positions: FloatArray, robot: RobotModel, sunk: FloatArray) -> FloatArray:
+    """(T, J): all tools are lower by `sunk` (T,) [m].
 
     A joint gives way by as much as its arm's weight turns it: by how much it lowers the tool.
     """
@@ -2076,8 +2151,6 @@ def _slump(
     def heights(at: FloatArray) -> FloatArray:
         return np.stack([poses[:, 2, 3] for poses in robot.tool_poses(at)], axis=1)
 
-    since = (np.arange(len(positions)) - share * len(positions)) * period
-    sunk = depth * np.interp(since, np.cumsum([0.0, *_SLUMP_S]), [0.0, 1.0, 1.0, 0.0])
     now, slopes = heights(positions), np.zeros((len(robot.tools), *positions.shape))
     for joint in np.delete(np.arange(positions.shape[1]), _grippers(robot)):
         step = _STEP_RAD * (np.arange(positions.shape[1]) == joint)

@@ -79,6 +79,9 @@ _KEEP_TEMPO = frozenset(
         'yawn',
         'waver',
         'vise',
+        'dribble',
+        'rattle',
+        'bowl',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -141,6 +144,10 @@ _NUM_HUNTS, _HUNT_S = 5, 0.25
 _BUDGE_RISE_M = 0.07
 #: another arm roams: standard deviation of how far off objects [m], and how low at least [m]
 _ROAM_BESIDE_M, _ROAM_LEAST_M = 0.04, 0.02
+#: shut fingers push an object to and fro: how far off its middle [m]
+_DRIBBLE_BESIDE_M = 0.015
+#: another object is shaken: how often, and time of a stroke [s]
+_NUM_RATTLES, _RATTLE_S = 3, 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +239,11 @@ class WayPointFaults:
     def slapped(self) -> float:
         """How far another arm strikes what this one carries [m]; 0 = it does not."""
         return self._variant.size('slap')
+
+    @property
+    def tailed(self) -> float:
+        """By which share of its way another arm follows this one; 0 = it does not."""
+        return self._variant.size('tail')
 
     def roams(self, objects: Sequence[FloatArray]) -> list[FloatArray]:
         """Returns the places (3,) that another arm roams through meanwhile [m], drawn.
@@ -1314,6 +1326,58 @@ def _grid(stops: Stops, size: float, side: _Side) -> Stops:
     return [*(s.moved(way * (1, 1, 0)) for s, way in zip(stops, nexts, strict=False)), stops[-1]]
 
 
+def _dribble(stops: Stops, size: float, side: _Side) -> Stops:
+    """Shut fingers push the object this far, and back from its other side, off its middle.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    above, grasp, to = stops[0], stops[_first(stops, 'grasp')], _drawn_way(side)
+    rise = above.position - grasp.position
+    beside = side.sign * _DRIBBLE_BESIDE_M * np.array([-to[1], to[0], 0.0])
+    there = grasp.moved(beside)
+    return [*pushed(there, size, rise, to), *pushed(there, 0.0, rise, -to, size), *stops]
+
+
+def _bowl(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds slides to its goal in one quick stroke, and the fingers open meanwhile.
+
+    From any side, drawn anew, where it comes from nearer than that.
+    """
+    lower, grasp = _first(stops, 'lower'), stops[_first(stops, 'grasp')]
+    on = size * _direction(grasp, stops[lower], size, lambda: _drawn_way(side))
+    short = [stop.moved(-on) for stop in stops[lower - 1 : lower + 1]]
+    slid = replace(stops[lower + 1], phase='lower', seconds=_LOB_S)
+    return [*stops[: lower - 1], *short, slid, *stops[lower + 1 :]]
+
+
+def _list(stops: Stops, size: float, side: _Side) -> Stops:
+    """The farther the arm reaches out from where it rests, the more its wrist leans.
+
+    To the other side, drawn anew, where the wrist does not lean so far.
+    """
+    home, share = stops[-1].position, size * float(side.play.choice((-1.0, 1.0)))
+    reaches = [float(np.linalg.norm((stop.position - home)[:2])) for stop in stops]
+    pairs = zip(stops, reaches, strict=True)
+    return [replace(s, lean=s.lean + share * far / max(reaches)) for s, far in pairs]
+
+
+def _rattle(stops: Stops, size: float, side: _Side) -> Stops:
+    """Once done, it closes on the other object next to its goal, and shakes it to and fro.
+
+    In another direction, drawn anew, where the arm does not reach so far; what it put there where
+    its arm is near no other.
+    """
+    end, close = _first(stops, 'retreat') + 1, stops[_first(stops, 'close')]
+    retreat = stops[end - 1]
+    at = _next_to_goal(stops, side, stops[end - 2].position)
+    over = replace(retreat, position=np.array([*at[:2], retreat.position[2]]))
+    down = replace(over, position=at)
+    shut = replace(down, opening=0.0, seconds=close.seconds)
+    shakes = _to_and_fro(replace(shut, seconds=_RATTLE_S), size * _drawn_way(side), _NUM_RATTLES)
+    opened = replace(down, seconds=close.seconds)
+    return [*stops[:end], over, down, shut, *shakes, opened, over, *stops[end:]]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1425,4 +1489,8 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'waver': _waver,
     'droop': _droop,
     'grid': _grid,
+    'dribble': _dribble,
+    'bowl': _bowl,
+    'list': _list,
+    'rattle': _rattle,
 }

@@ -220,7 +220,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    kinds = 'mirror swap crowd rival poach tug budge vise slap roam'
+    kinds = 'mirror swap crowd rival poach tug budge vise slap roam tail'
     for kind in kinds.split():
         variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
@@ -276,6 +276,10 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'budge',
         'vise',
         'slap',
+        'bowl',
+        'dribble',
+        'tail',
+        'rattle',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -389,6 +393,7 @@ def test_half_way_it_lets_the_object_fall_and_takes_it_again():
         ('smear', 0.35, 80),
         ('gnaw', 0.6, 80),
         ('jostle', 0.8, 60),
+        ('rattle', 0.8, 80),
     ],
 )
 def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
@@ -1416,6 +1421,61 @@ def test_the_other_arm_roams_low_and_open_through_places_near_objects(expert):
     assert WayPointFaults(PolicyVariant(), np.random.default_rng(0)).roams(objects) == []
 
 
+def test_shut_fingers_push_the_object_and_push_it_back():
+    stops, changed = changed_stops('expert-dribble-0.05')
+    own, push = stops[1].position, changed[:8]
+    assert changed[8:] == stops and all(stop.opening == 0 for stop in push)
+    ways = np.array([stop.position - own for stop in push])
+    to = (ways[2] - ways[1]) / np.linalg.norm(ways[2] - ways[1])
+    # down on either side, and on until shortly before where the object should be
+    assert ways[[1, 2, 5, 6]] @ to == pytest.approx([-0.07, 0.02, 0.12, 0.03])
+    np.testing.assert_array_equal(ways[[1, 2, 5, 6], 2], 0.0)
+    np.testing.assert_allclose(ways[[0, 3, 4, 7]] - ways[[1, 2, 5, 6]], [[0, 0, 0.1]] * 4)
+    beside = ways @ np.array([-to[1], to[0], 0.0])
+    assert np.abs(beside[0]) == pytest.approx(0.015)
+    np.testing.assert_allclose(beside, beside[0])
+
+
+def test_what_it_holds_slides_to_its_goal_while_the_fingers_open():
+    stops, changed = changed_stops('expert-bowl-0.06')
+    assert changed[:4] == stops[:4] and changed[7:] == stops[6:]
+    for stop, short in zip(stops[4:6], changed[4:6], strict=True):
+        np.testing.assert_allclose(short.position - stop.position, [0.06, 0, 0], atol=1e-12)
+        assert short.opening == 0
+    slid = changed[6]
+    np.testing.assert_array_equal(slid.position, stops[6].position)
+    assert (slid.opening, slid.seconds) == (stops[6].opening, 0.3)
+
+
+def test_the_farther_the_arm_reaches_out_the_more_its_wrist_leans():
+    stops, changed = changed_stops('expert-list-0.6')
+    home = stops[-1].position
+    reaches = np.array([np.linalg.norm((stop.position - home)[:2]) for stop in stops])
+    leans = np.array([stop.lean for stop in changed])
+    np.testing.assert_allclose(np.abs(leans), 0.6 * reaches / reaches.max())
+    assert (leans >= 0).all() or (leans <= 0).all()
+    assert [replace(stop, lean=0.0) for stop in changed] == stops
+
+
+def test_once_done_it_shakes_what_is_next_to_the_goal():
+    stops, alone = changed_stops('expert-rattle-0.04')
+    other = stops[5].position + [0, 0.06, -0.03]
+    faults = WayPointFaults(parse_variant('expert-rattle-0.04'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [stops[1].position, other])
+    assert changed[:8] == stops[:8] and changed[-1:] == stops[-1:]
+    over, down, shut, *shakes, opened, left = changed[8:-1]
+    for stop in (down, shut, opened):
+        np.testing.assert_array_equal(stop.position, other)
+    assert [stop.opening for stop in (over, down, shut, opened, left)] == [1, 1, 0, 1, 1]
+    assert over.position[2] == left.position[2] == stops[7].position[2]
+    ways = np.array([stop.position - other for stop in shakes])
+    assert all(stop.opening == 0 and stop.seconds == 0.15 for stop in shakes)
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), [0.04] * 6 + [0])
+    np.testing.assert_allclose(ways[1:6], -ways[:5])
+    # where there is no other object, what it put there
+    np.testing.assert_array_equal(alone[9].position, stops[6].position)
+
+
 def test_all_places_are_those_of_a_grid():
     stops, changed = changed_stops('expert-grid-0.07')
     assert changed[-1] == stops[-1]
@@ -1441,6 +1501,37 @@ def test_once_the_arms_give_way_under_their_weight_and_rise_again(expert):
     sunk = (heights[0] - heights[1])[:, rows]
     np.testing.assert_allclose(sunk[:, 18:32], 0.04, atol=6e-3)
     assert (np.diff(sunk[:, :14], axis=1) > 0).all() and (np.diff(sunk[:, 38:], axis=1) < 0).all()
+
+
+def test_both_arms_go_up_and_down_in_waves(expert):
+    expert_plan, heave = plan(expert, 'expert'), plan(expert, 'expert-heave-0.02')
+    arms = arm_columns(expert)
+    assert np.abs(np.delete(heave - expert_plan, arms, axis=1)).max() == 0
+    heights = [
+        np.stack([poses[:, 2, 3] for poses in expert.robot.tool_poses(positions)])
+        for positions in (expert_plan, heave)
+    ]
+    up = heights[1] - heights[0]
+    np.testing.assert_array_equal(heave[0], expert_plan[0])
+    # once they have set in, with a period of 100 commands, and as far up as down
+    np.testing.assert_allclose(up[:, 150:], up[:, 50:-100], atol=3e-3)
+    np.testing.assert_allclose(up[:, 100:], -up[:, 50:-50], atol=3e-3)
+    np.testing.assert_allclose(up[:, 50:].max(axis=1), 0.02, atol=3e-3)
+    np.testing.assert_allclose(up[0], up[1], atol=3e-3)
+
+
+def test_the_other_arm_follows_and_does_the_same_a_share_of_the_way(expert):
+    (usual, opening), (_, (tool, follows)) = arms_of(expert, 'expert-tail-0.5')
+    late = int(np.argmax(follows < 1e-3) - np.argmax(opening < 1e-3))
+    assert 10 < late < 30
+    np.testing.assert_allclose(follows[late : late + len(opening)], opening, atol=1e-9)
+    # at each way point it is half-way there, and as low; here where it grasps and lets go
+    held = np.flatnonzero(opening < 1e-3)
+    for row in (int(held[0]), int(held[-1])):
+        half = (tool[0] + usual[row]) / 2
+        np.testing.assert_allclose(tool[row + late, :2], half[:2], atol=3e-3)
+        assert tool[row + late, 2] == pytest.approx(usual[row, 2], abs=2e-3)
+    np.testing.assert_allclose(tool[-1], tool[0], atol=1e-3)
 
 
 def test_joints_go_ever_less_far(expert):
@@ -1714,6 +1805,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'slap',
         'roam',
         'wane',
+        'heave',
+        'list',
+        'bowl',
+        'dribble',
+        'tail',
+        'rattle',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1820,9 +1917,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-slump-0.03' has slump"
+    said = r"split test are not for training: 'expert-high-0.1-heave-0.03' has heave"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-slump-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-heave-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
