@@ -108,7 +108,7 @@ class ContactMotions:
         begun = self if self.pose is not None else replace(self, pose=positions[0])
         move = partial(begun._moved, robot, where, rows)
         numbers = [(number,) for number in range(self.settings.num_motions)]
-        work = Work(move, numbers) if helpers is None else helpers.begin(move, numbers)
+        work = (helpers or Helpers(0)).begin(move, numbers)
         return partial(begun._finish, work, arms)
 
     def _finish(self, work: Work[_Moved], arms: ArmState) -> tuple[BodyMotions, ContactMotions]:

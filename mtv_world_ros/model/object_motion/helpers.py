@@ -30,18 +30,13 @@ class Helpers:
     """Started by `start` or the first call; each helps from when it is ready on.
 
     Args:
-        count: processes beside this one.
+        count: processes beside this one; with none it does all itself.
     """
 
     def __init__(self, count: int) -> None:
         self._count, self._lock = count, Lock()
         self._starting: list[_Helper] | None = None
         self._ready: list[_Helper] = []
-
-    @property
-    def num_ready(self) -> int:
-        """How many of them help by now."""
-        return len(self._ready)
 
     def start(self, function: Callable[..., Any]) -> None:
         """Lets the helpers import what a function needs, so that they are ready when jobs come."""
@@ -74,7 +69,7 @@ class Work(Generic[Answer]):
         self,
         function: Callable[..., Answer],
         jobs: Sequence[tuple[Any, ...]],
-        helpers: Sequence[_Helper] = (),
+        helpers: Sequence[_Helper],
     ) -> None:
         self._function, self._jobs = function, jobs
         self._found: list[Any] = [_UNDONE] * len(jobs)

@@ -27,7 +27,7 @@ from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
 from mtv_world_ros.geometry.robot import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.helpers import Answer, Helpers, Work
+from mtv_world_ros.model.object_motion.helpers import Answer, Helpers
 from mtv_world_ros.model.object_motion.network import (
     COMMANDS_A_STEP,
     Memory,
@@ -93,7 +93,7 @@ class ObjectMotionPredictor:
         helpers: Helpers | None = None,
     ) -> None:
         self.members, self.robot, self.contact = tuple(members), robot, contact
-        self.num_disturbed, self.helpers = num_disturbed, helpers
+        self.num_disturbed, self.helpers = num_disturbed, helpers or Helpers(0)
         networks = [member.network.eval() for member in members]
         self.network = networks[0] if len(networks) == 1 else stacked(networks)
         rng = np.random.default_rng(0)
@@ -208,8 +208,7 @@ class ObjectMotionPredictor:
     ) -> list[Answer | None]:
         """What a function gives for the arguments of each row, if any; helpers do their share."""
         jobs = [row for row in rows if row is not None]
-        work = Work(function, jobs) if self.helpers is None else self.helpers.begin(function, jobs)
-        found = iter(work.finish())
+        found = iter(self.helpers.begin(function, jobs).finish())
         return [None if row is None else next(found) for row in rows]
 
     def _find(

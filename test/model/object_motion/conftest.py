@@ -10,7 +10,7 @@ def helpers():
     """One process beside this one, which is ready."""
     found = Helpers(1)
     deadline = time.monotonic() + 60
-    while not found.num_ready:
+    while not found._ready:
         assert time.monotonic() < deadline, 'no helper came'
         time.sleep(0.05)
         found.start(eval)

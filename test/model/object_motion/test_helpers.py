@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from mtv_world_ros.model.object_motion.helpers import Work
+from mtv_world_ros.model.object_motion.helpers import Helpers
 
 #: what a process says of itself after a while, with `eval`
 WHO = '__import__("time").sleep(0.2) or __import__("os").getpid()'
@@ -30,7 +30,7 @@ def test_a_helper_does_jobs_while_this_process_goes_on(helpers):
 
 
 def test_without_helpers_this_process_does_all():
-    assert Work(eval, [(WHO,), ('3',)]).finish() == [os.getpid(), 3]
+    assert done(Helpers(0), eval, [WHO, '3']) == [os.getpid(), 3]
 
 
 @pytest.mark.parametrize('jobs', [(-1, 4), (4, -1)])
@@ -52,7 +52,7 @@ def test_this_process_goes_on_alone_when_the_other_dies(helpers, caplog):
     assert done(helpers, eval, [WHO] * 3) == [os.getpid()] * 3
     assert 'the others go on' in caplog.text
     assert done(helpers, factorial, [3, 4]) == [6, 24]
-    assert not helpers.num_ready
+    assert not helpers._ready
 
 
 def test_what_a_helper_dies_of_is_done_here(helpers):
