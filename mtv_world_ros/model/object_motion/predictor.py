@@ -48,6 +48,8 @@ CONTACT_FILE = 'contact.json'
 _PLACE_ERROR_M, _SIZE_ERROR = 0.003, 0.04
 #: objects with disturbances of their own
 _MAX_OBJECTS = 16
+#: how much motions of rigid bodies count together, where those of networks do one
+_BODIES = 2.0
 #: least height of an object's centre over the table [m]
 _LEAST_HEIGHT_M = 0.004
 _CONFIG, _WEIGHTS, _RESPONSE = 'config.json', 'model.safetensors', 'arm_response.json'
@@ -359,7 +361,7 @@ class TrackedObjects:
                     points=way,
                     rotations=turns,
                     openings=robot.gripper_openings(joints).T,
-                    weight=len(motions) / len(bodies.points),  # together as much as the networks
+                    weight=_BODIES * len(motions) / len(bodies.points),
                 )
                 for way, turns, joints in zip(
                     bodies.points, bodies.rotations, bodies.joints, strict=True

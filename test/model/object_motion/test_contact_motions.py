@@ -424,7 +424,7 @@ def test_a_checkpoint_foresees_by_both(folder, robot, recording):
     assert len(moved) == len(few) + 2 and len(both.sizes) == len(networks.sizes) + 2
     np.testing.assert_array_equal(moved[0].points, few[0].points)
     weights = [motion.weight for motion in moved]
-    assert weights[0] == 1 and sum(weights) == pytest.approx(2 * len(few))
+    assert weights[0] == 1 and sum(weights) == pytest.approx(3 * len(few))
     assert np.isfinite(np.stack([motion.points for motion in moved])).all()
     on, _ = then.advance(recording.positions[50:101])
     np.testing.assert_allclose(on[-1].points[0], moved[-1].points[-1], atol=1e-9)
