@@ -157,7 +157,7 @@ def foreseen_by(plan: Plan, tracked: TrackedObjects) -> list[float]:
     ends = foreseen.ends(plan.task, plan.bound, np.full_like(tracked.reference, np.nan))
     if ends is None:
         return []
-    shown = objects.most_like(ahead, ends.as_most)
+    shown = ahead.medoid(ends.as_most)
     count = 1 + tracked.model.num_disturbed
     alone = [float(np.mean(part)) for part in (ends.done[:count], ends.done[count:]) if len(part)]
     return [ends.share, alone[0], alone[-1], float(ends.done[shown]), float(ends.done[0])]

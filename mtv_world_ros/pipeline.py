@@ -442,8 +442,12 @@ class ImaginedEpisode:
                 objects = self._find_objects(state, start_masks)
             plans = plans[: ceil(_FORESEEN_S / float(plan.times[-1] - plan.times[0]))]
             ahead = objects.foresee(self._commands(plans, objects.tracked))
-            shown = objects.most_like(ahead[-1], self._believed(state, plans[-1], ahead[-1]))
-            ahead = tuple(replace(part, shown=shown) for part in ahead)
+            shown = ahead[-1].medoid(self._believed(state, plans[-1], ahead[-1]))
+            shows = [objects.shown, *[shown] * len(ahead)]
+            ahead = tuple(
+                replace(part, shown=shown, shown_before=before)
+                for part, before in zip(ahead, shows, strict=False)
+            )
         times = plan.times - plan.times[0]
         return ahead[0].pictures(times, state.observation.cameras, poses), ahead
 

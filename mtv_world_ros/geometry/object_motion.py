@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
@@ -18,8 +19,10 @@ from mtv_world_ros.geometry.robot import RobotModel
 
 #: what moved or turned by less is taken to stand still
 _STILL_M, _STILL_RAD = 0.004, 0.08
-#: what is nearer than this looks to be at the same place; what is further away, just elsewhere
-_SAME_M, _ELSEWHERE_M = 0.01, 0.05
+#: what is further away than this is just elsewhere
+_ELSEWHERE_M = 0.05
+#: how long pictures take to pass from one motion to another
+_PASSAGE_S = 1.0
 #: what differs by less in a pose is the same pose
 _SAME_POSE = 1e-4
 #: of two whose widths differ by less than this factor, neither can stand in the other
@@ -63,6 +66,19 @@ class ObjectMotion:
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
         """Returns some of the frames, with the same reference."""
         return self._of([rows[frames] for rows in self._rows])
+
+    def begun_at(self, last: ObjectMotion, steps: int) -> ObjectMotion:
+        """Returns the same, begun at the last row of another and as it is itself after steps."""
+        left = np.clip(1 - np.arange(len(self.points)) / steps, 0.0, 1.0)
+        way = np.nan_to_num(last.ways[-1] - self.ways[0])
+        turns = Rotation.from_matrix(self.rotations[0].swapaxes(-1, -2) @ last.rotations[-1])
+        parts = left[:, None, None] * turns.as_rotvec()
+        turned = Rotation.from_rotvec(parts.reshape(-1, 3)).as_matrix()
+        return replace(
+            self,
+            points=self.points + left[:, None, None] * way,
+            rotations=self.rotations @ turned.reshape(self.rotations.shape),
+        )
 
     @property
     def _rows(self) -> list[FloatArray]:
@@ -162,6 +178,7 @@ class FoundObjects:
         positions: (N, J) joints at their rows [rad or m].
         part_row: row at which the last part of a plan begins.
         shown: which of the motions pictures show.
+        shown_before: which one they showed until the last part.
         is_whole: whether all were seen whole, now or before.
     """
 
@@ -173,6 +190,7 @@ class FoundObjects:
     positions: FloatArray | None = None
     part_row: int = 0
     shown: int = 0
+    shown_before: int = 0
     is_whole: bool = False
 
     @classmethod
@@ -206,39 +224,33 @@ class FoundObjects:
             found.append((found[-1] if found else self)._then(positions))
         return tuple(found)
 
-    def most_like(self, ahead: FoundObjects, among: BoolArray | None = None) -> int:
-        """Returns the motion to show from here on: the one whose end is most like those of all.
-
-        Objects do not jump: only motions that have them now where the one shown so far has them
-        are chosen from.
+    def medoid(self, among: BoolArray | None = None) -> int:
+        """Returns the motion whose end is most like those of all.
 
         Args:
-            ahead: these objects at the end of a plan.
-            among: (K,) of which motions it should be one, if any can be chosen; None = of all.
+            among: (K,) which motions it may be, one or more; None = all.
         """
-        fits = np.ones(len(ahead.motions), np.bool_)
-        if self.motions:
-            fits = _apart(self.motions)[self.shown].max(-1, initial=0.0) <= _SAME_M
-        if among is not None and (fits & among).any():
-            fits &= among
-        if not fits.any():
-            return self.shown
-        weights = [motion.weight for motion in ahead.motions]
-        unlike = _apart(ahead.motions).sum(-1) @ np.array(weights)
-        return int(np.argmin(np.where(fits, unlike, np.inf)))
+        weights = [motion.weight for motion in self.motions]
+        unlike = _apart(self.motions).sum(-1) @ np.array(weights)
+        return int(np.argmin(unlike if among is None else np.where(among, unlike, np.inf)))
 
     def pictures(
         self, times: FloatArray, cameras: Sequence[CameraModel], poses: FloatArray
     ) -> ByteArray:
         """Returns pictures (V, T, H, W, 4) of the objects in the last part of the plan.
 
+        Where the part shows another motion than the one before, objects pass to it gradually.
+
         Args:
             times: (T,) from its row 0 on [s].
             cameras: V cameras at the masks' size.
             poses: (V, T, 4, 4) T_base_camera at these times.
         """
-        motion = self.motions[self.shown]
-        rows = self.part_row + np.rint(times / self.tracked.step_s).astype(int)
+        motion = self.motions[self.shown][self.part_row :]
+        if self.shown != self.shown_before:
+            last = self.motions[self.shown_before][: self.part_row + 1]
+            motion = motion.begun_at(last, round(_PASSAGE_S / self.tracked.step_s))
+        rows = np.rint(times / self.tracked.step_s).astype(int)
         shown = motion[np.minimum(rows, len(motion.points) - 1)]
         return moved_pictures(self.cuts, shown, cameras, self.poses, poses)
 

@@ -14,6 +14,7 @@ from mtv_world_ros.geometry.object_motion import (
     moved_pictures,
     ObjectMotion,
 )
+from mtv_world_ros.geometry.transforms import about_z
 
 FOCAL, SIZE = 100.0, (60, 80)
 POSE = np.eye(4)
@@ -214,18 +215,33 @@ def test_the_motion_that_is_shown_is_most_like_all():
     objects = found(0.0, 0.02, 0.021, 0.022, 0.9)
     ahead = objects.foresee([plan(4), plan(4)])
     assert [len(part.positions) for part in ahead] == [5, 9]
-    assert objects.most_like(ahead[-1]) == 2
-    assert objects.most_like(ahead[-1], np.array([True, False, False, True, True])) == 3
-    assert objects.most_like(ahead[-1], np.zeros(5, bool)) == 2
+    assert ahead[-1].medoid() == 2
+    assert ahead[-1].medoid(np.array([True, False, False, True, True])) == 3
 
 
-def test_objects_do_not_jump_from_one_plan_to_the_next():
-    """What most motions say later is shown only as far as it is where the object is now."""
-    first = found(0.02, 0.0, 0.0, 0.0, 0.0205).foresee([plan(8)])[0]
-    shown = replace(first, shown=0)
-    later = shown.foresee([plan(8)])[-1]
-    assert shown.most_like(later) in (0, 4)
-    assert shown.most_like(later, np.array([False, True, True, True, False])) in (0, 4)
+def test_pictures_pass_gradually_from_one_motion_to_another(camera):
+    """Objects neither jump where another motion is shown, nor stay where it does not have them."""
+    *_, part = found(0.02, 0.0).foresee([plan(8), plan(20)])
+    passing = replace(part, shown=1, shown_before=0)
+    times = np.array([0.0, 0.5, 1.0, 2.0])
+    poses = np.tile(POSE, (1, len(times), 1, 1))
+    pictures = passing.pictures(times, [camera], poses)[0]
+    at = [centre_and_area(picture)[0][0] for picture in pictures]
+    np.testing.assert_allclose(np.array(at) - at[-1], [16, 8, 0, 0], atol=0.1)
+
+
+def test_a_motion_begun_at_another_one_turns_to_what_it_is():
+    points, half = np.zeros((5, 1, 3)), about_z(np.pi / 2)
+    still = ObjectMotion(
+        reference=points[0], points=points, rotations=np.tile(np.eye(3), (5, 1, 1, 1))
+    )
+    turned = replace(still, points=points + 0.1, rotations=np.tile(half, (5, 1, 1, 1)))
+    passing = still.begun_at(turned, 2)
+    np.testing.assert_allclose(passing.points[:, 0, 0], [0.1, 0.05, 0, 0, 0])
+    turns = [about_z(np.pi / 2), about_z(np.pi / 4), *[np.eye(3)] * 3]
+    np.testing.assert_allclose(passing.rotations[:, 0], turns, atol=1e-9)
+    unknown = replace(still, points=np.full_like(points, np.nan))
+    np.testing.assert_array_equal(still.begun_at(unknown, 2).points, points)
 
 
 def test_pictures_are_those_of_the_motion_that_is_shown(camera):
@@ -233,7 +249,9 @@ def test_pictures_are_those_of_the_motion_that_is_shown(camera):
     poses = np.tile(POSE, (1, 2, 1, 1))
     for number, part in enumerate(parts):
         still, moved = (
-            replace(part, shown=k).pictures(np.array([0.0, 0.4]), [camera], poses)[0]
+            replace(part, shown=k, shown_before=k).pictures(np.array([0.0, 0.4]), [camera], poses)[
+                0
+            ]
             for k in (0, 1)
         )
         at, _ = centre_and_area(still[1])
