@@ -19,8 +19,8 @@ from mtv_world_ros.geometry.robot import RobotModel
 
 #: what moved or turned by less is taken to stand still
 _STILL_M, _STILL_RAD = 0.004, 0.08
-#: what is further away than this is just elsewhere
-_ELSEWHERE_M = 0.05
+#: what is further away than this is just elsewhere; where turns are felt, from a centre
+_ELSEWHERE_M, _RADIUS_M = 0.05, 0.02
 #: how long pictures take to pass from one motion to another
 _PASSAGE_S = 1.0
 #: what differs by less in a pose is the same pose
@@ -270,8 +270,10 @@ class FoundObjects:
 
 
 def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
-    """(K, K, O) how far objects are apart at the ends of motions [m]; those not known are not."""
-    ends = np.stack([motion.ways[-1] for motion in motions])
+    """(K, K, O) how far poses are apart at the ends of motions [m]; those not known are not."""
+    turns = np.stack([motion.rotations[-1].reshape(-1, 9) for motion in motions])
+    ways = np.stack([motion.ways[-1] for motion in motions])
+    ends = np.concatenate([ways, _RADIUS_M * turns], axis=-1)
     apart = np.linalg.norm(ends[:, None] - ends[None], axis=-1)
     return np.nan_to_num(np.minimum(apart, _ELSEWHERE_M))
 

@@ -217,6 +217,9 @@ def test_the_motion_that_is_shown_is_most_like_all():
     assert [len(part.positions) for part in ahead] == [5, 9]
     assert ahead[-1].medoid() == 2
     assert ahead[-1].medoid(np.array([True, False, False, True, True])) == 3
+    turned = replace(ahead[-1].motions[2], rotations=np.tile(about_z(1.5), (9, 1, 1, 1)))
+    motions = (*ahead[-1].motions[:2], turned, *ahead[-1].motions[3:])
+    assert replace(ahead[-1], motions=motions).medoid() != 2
 
 
 def test_pictures_pass_gradually_from_one_motion_to_another(camera):
