@@ -6,7 +6,7 @@
 Every episode's plan is foreseen whole from the masks of its first frame, by the networks of a
 checkpoint or of several folders joined by `+`, 13 motions in all, and as rigid bodies where the
 first has `contact.json`. A row of a name judges by the share of the motions that succeed, those of
-networks and of bodies counting as much: half or more is a success; of `networks alone` and `bodies
+bodies counting twice as much as those of networks: half or more is a success; of `networks alone` and `bodies
 alone` only their own motions count. `shown` is the one motion that pictures show, `expected` the
 first one of the networks. Beside them stands the rule that imagines nothing: an object sticks to a
 gripper that closes near it. Differences are to the first row of networks; intervals:
