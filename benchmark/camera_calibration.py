@@ -31,9 +31,9 @@ from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_shape import load_shape
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, moved
 from mtv_world_ros.inspection.clocks import JointTrack

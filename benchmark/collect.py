@@ -18,7 +18,7 @@ import time
 from page import measure, parse_arguments, publish, table
 
 from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.episode_jobs import jobs_of
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named

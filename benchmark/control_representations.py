@@ -47,7 +47,7 @@ from mtv_world_ros.evaluation.report.evaluation_summary import Summary
 from mtv_world_ros.evaluation.report.tables import estimates_json
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import plain, write_json
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.training_config import (
     load_training_config,

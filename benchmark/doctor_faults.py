@@ -27,7 +27,7 @@ from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.robot_shape import moving_links
+from mtv_world_ros.geometry.robot.shape import moving_links
 from mtv_world_ros.inspection.inspect import Inspector, load_inspector
 
 #: (episode, view, sign) -> the same with something wrong

@@ -37,7 +37,7 @@ from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.object_motion import FoundObjects
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.predictor import (
     load_predictor,

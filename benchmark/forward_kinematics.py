@@ -17,8 +17,8 @@ from page import measure, parse_arguments, publish, table
 import pinocchio as pin
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 STEPS = 81
 

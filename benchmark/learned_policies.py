@@ -39,7 +39,7 @@ import yaml
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.ranking.run_jobs import read_results
 from mtv_world_ros.rendering.images import resize_frames

@@ -31,7 +31,7 @@ from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.sim.expert.expert import Expert

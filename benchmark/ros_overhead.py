@@ -34,7 +34,7 @@ from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import save_calibration
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.ros.messages.conversions import to_joint_state, values_of

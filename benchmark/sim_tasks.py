@@ -27,7 +27,7 @@ from page import publish, table
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
 from mtv_world_ros.sim.collect.dataset_readme import commands
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed

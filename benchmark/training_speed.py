@@ -31,7 +31,7 @@ import torch
 from mtv_world_ros.assembly import assemble_segmenter, robot_path
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.clips.batches import Batch, BatchSource

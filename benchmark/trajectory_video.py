@@ -20,8 +20,8 @@ from page import measure, parse_arguments, publish, table
 
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     object_colour,

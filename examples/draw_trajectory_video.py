@@ -15,7 +15,7 @@ import numpy as np
 from mtv_world_ros.evaluation.video import write_video
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,

@@ -17,7 +17,7 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples/episode'))

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML
+from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.parallel import threads_each
 from mtv_world_ros.pipeline import Pipeline, WorldModel

@@ -31,7 +31,7 @@ from mtv_world_ros.geometry.object_motion import (
     TrackedObjects,
 )
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (

@@ -12,8 +12,8 @@ import pytest
 
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 
 

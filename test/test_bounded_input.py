@@ -24,7 +24,7 @@ from mtv_world_ros.errors import CalibrationError, ConfigError, ObservationError
 from mtv_world_ros.files import bundled, share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.success.task import load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 

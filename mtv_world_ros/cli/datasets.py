@@ -110,7 +110,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.files import write_whole
-    from mtv_world_ros.geometry.robot_file import ROBOT_YAML
+    from mtv_world_ros.geometry.robot.file import ROBOT_YAML
     from mtv_world_ros.importing.bags import find_bags, import_bags, with_guessed_views
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
@@ -189,7 +189,7 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
 def _import_dataset(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from mtv_world_ros.geometry.robot_file import ROBOT_YAML
+    from mtv_world_ros.geometry.robot.file import ROBOT_YAML
     from mtv_world_ros.importing.convert import import_dataset
 
     summary = import_dataset(
@@ -276,7 +276,7 @@ def _export(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.files import bundled
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.importing.lerobot_writer import export_dataset, MAPPING
 
     if arguments.fps < 1:

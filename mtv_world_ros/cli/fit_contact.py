@@ -40,7 +40,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.errors import CheckpointError
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
     from mtv_world_ros.model.object_motion.contact_motions import check_robot
     from mtv_world_ros.model.object_motion.predictor import (

@@ -46,7 +46,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _import_weights(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.training.training_config import load_training_config
 
     if not arguments.path.exists():

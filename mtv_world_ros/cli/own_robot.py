@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.data.episode import Episode, JointStates, Track
     from mtv_world_ros.data_types import CameraModel, FloatArray
-    from mtv_world_ros.geometry.robot import RobotModel
+    from mtv_world_ros.geometry.robot.model import RobotModel
     from mtv_world_ros.inspection.camera_pose import CameraEstimate
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.inspect import Inspector
@@ -53,8 +53,8 @@ def _add_robot(commands: argparse._SubParsersAction) -> None:
 
 def _robot(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.geometry.robot_shape import load_shape
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.geometry.robot.shape import load_shape
 
     path = Path(arguments.file)
     if path.suffix in ('.urdf', '.xml'):
@@ -81,7 +81,7 @@ def _write_guess(urdf: Path, out: Path) -> Path:
     import yaml
 
     from mtv_world_ros.files import write_whole
-    from mtv_world_ros.geometry.robot_guess import guess_robot
+    from mtv_world_ros.geometry.robot.guess import guess_robot
 
     if out.exists():
         raise ConfigError(f"'{out}' exists; look at it with: mtv-world robot {out}")
@@ -270,8 +270,8 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
-    from mtv_world_ros.geometry.robot_file import load_robot
-    from mtv_world_ros.geometry.robot_shape import load_shape
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.geometry.robot.shape import load_shape
     from mtv_world_ros.inspection.camera_pose import difference
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.inspect import overlay_picture
@@ -323,7 +323,7 @@ def estimate_camera(
     from dataclasses import replace
 
     from mtv_world_ros.errors import CalibrationError, EpisodeError
-    from mtv_world_ros.geometry.robot_shape import moving_links
+    from mtv_world_ros.geometry.robot.shape import moving_links
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.inspection.wrist_camera import (
         find_mount,
@@ -388,7 +388,7 @@ def _estimate_fixed(
 
     import numpy as np
 
-    from mtv_world_ros.geometry.robot_shape import load_shape
+    from mtv_world_ros.geometry.robot.shape import load_shape
     from mtv_world_ros.geometry.transforms import inverse
     from mtv_world_ros.inspection.fixed_camera import FixedCamera
 

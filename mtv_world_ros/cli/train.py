@@ -150,7 +150,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     check_device(arguments.device)
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
     from mtv_world_ros.training.training_run import train
 
@@ -256,7 +256,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
 
 def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.model.actions import action_names
     from mtv_world_ros.model.runtime import choose_dtype
     from mtv_world_ros.training.dry_run import step_cost

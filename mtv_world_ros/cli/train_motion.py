@@ -91,7 +91,7 @@ def _train(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
     from mtv_world_ros.model.object_motion.predictor import add_members, load_network
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads

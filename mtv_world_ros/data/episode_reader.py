@@ -51,7 +51,7 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTr
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled, with_camera_info
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 

@@ -30,7 +30,7 @@ from mtv_world_ros.errors import DescriptionError, EpisodeError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import cut_off, match_joints, nearest_rows, resample
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.rendering.images import resize_frames, resize_labels
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 

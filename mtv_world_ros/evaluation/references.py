@@ -18,8 +18,8 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
-from mtv_world_ros.geometry.mirror import mirrored
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.mirror import mirrored
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import WorldModel
 
 #: true: the recorded ones; shuffled: another episode's; zero: the joints stay where they are at

@@ -15,7 +15,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse
 
 #: nearest depth that is projected [m]

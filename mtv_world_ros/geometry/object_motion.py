@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: what moved or turned by less is taken to stand still
 _STILL_M, _STILL_RAD = 0.004, 0.08

@@ -9,7 +9,7 @@ import numpy as np
 from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, TrajectoryError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: points nearer to a time than this are at that time [s]
 SAME_S = 1e-6

@@ -25,9 +25,9 @@ from mtv_world_ros.errors import (
 )
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot import check_positions, RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot, ROBOT_YAML, save_robot
-from mtv_world_ros.geometry.robot_guess import guess_robot
+from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML, save_robot
+from mtv_world_ros.geometry.robot.guess import guess_robot
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
 from mtv_world_ros.importing.mapping import digest_of
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage

@@ -16,7 +16,7 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.joint_columns import Unit, UNITS
+from mtv_world_ros.geometry.robot.joint_columns import Unit, UNITS
 from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
 
 #: names that a camera's four numbers go by

@@ -15,9 +15,9 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.joint_columns import to_positions
-from mtv_world_ros.geometry.robot import check_positions, RobotModel
-from mtv_world_ros.geometry.robot_file import save_robot
+from mtv_world_ros.geometry.robot.file import save_robot
+from mtv_world_ros.geometry.robot.joint_columns import to_positions
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.importing.camera_parameters import camera_track
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream

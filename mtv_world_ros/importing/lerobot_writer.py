@@ -26,7 +26,7 @@ from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free, write_json
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import nearest_rows, resample
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.importing.lerobot import pyarrow_modules
 from mtv_world_ros.rendering.images import encode_png, resize_frames
 

@@ -23,9 +23,9 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.joint_columns import JointEntries, JointTable, to_positions
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.joint_columns import JointEntries, JointTable, to_positions
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.importing.camera_parameters import CameraSource
 from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.tool_actions import ToolPoses

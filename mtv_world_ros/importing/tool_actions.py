@@ -16,7 +16,7 @@ from mtv_world_ros.config import expected, ListOf
 from mtv_world_ros.data.tool_targets import ToolTargets
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.geometry.joint_columns import column_number, UNITS
+from mtv_world_ros.geometry.robot.joint_columns import column_number, UNITS
 from mtv_world_ros.geometry.transforms import rotation
 
 Column = Annotated[int | str, expected('a name or a number')]

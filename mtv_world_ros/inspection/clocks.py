@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicious
 
 Stamps = NDArray[np.int64]

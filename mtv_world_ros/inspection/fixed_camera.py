@@ -20,8 +20,8 @@ from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import fill, LinkShape, moving_links, project_part
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.inspection.camera_pose import (
     aligned,

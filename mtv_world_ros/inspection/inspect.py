@@ -15,9 +15,9 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTr
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_shape import (
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import (
     draw_silhouettes,
     LinkShape,
     load_shape,

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import fill, LinkShape, moving_links, project_part
 from mtv_world_ros.inspection.camera_pose import shrunk
 from mtv_world_ros.inspection.clocks import JointTrack
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import load_shape, project_part, RobotShape
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape, project_part, RobotShape
 from mtv_world_ros.geometry.transforms import looking_along
 
 _SIZE, _FOCAL = 480, 520.0

@@ -20,8 +20,8 @@ from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import unproject
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import moving_links
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import moving_links
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.inspection.camera_pose import (
     aligned,

@@ -21,7 +21,7 @@ from mtv_world_ros.errors import CheckpointError, ConfigError, nearest, Training
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
 
-    from mtv_world_ros.geometry.robot import RobotModel
+    from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: how actions may enter the model: the paper's method and its three baselines
 CONTROLS = ('trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens')

@@ -15,7 +15,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.actions import CONTROLS
 
 CARD = 'world_model.json'
-#: the robot that a checkpoint was trained on (see `robot_file.save_robot`), and its cameras
+#: the robot that a checkpoint was trained on (see `robot.file.save_robot`), and its cameras
 ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
 
 

@@ -37,7 +37,7 @@ from mtv_world_ros.model.serving.prepare import decoder_of, prepare
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 
 if TYPE_CHECKING:
-    from mtv_world_ros.geometry.robot import RobotModel
+    from mtv_world_ros.geometry.robot.model import RobotModel
 
 _PLAIN = ServingOptions()
 #: in errors that have no class of their own: of torch on a CPU, of CUDA, cuBLAS and cuDNN

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from mtv_world_ros.config import read_yaml, Schema, validated
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
 from mtv_world_ros.policies.policy import Policy

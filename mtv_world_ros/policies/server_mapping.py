@@ -13,13 +13,13 @@ from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.config import expected, ListOf, Positive, Schema
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.geometry.joint_columns import (
+from mtv_world_ros.geometry.robot.joint_columns import (
     JointColumn,
     JointTable,
     to_columns,
     to_positions,
 )
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 
 def _parts(value: Any) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import block_size, centroids, locate
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.success.relations import FLOOR_M

@@ -16,7 +16,7 @@ from mtv_world_ros.config import expected, ListOf, Positive, read_yaml, Schema, 
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, MtvWorldError, PolicyError, PolicyServerError
 from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
 from mtv_world_ros.policies.policy import Policy

@@ -19,7 +19,7 @@ from mtv_world_ros.data_types import (
     SuccessEstimate,
 )
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot import check_positions, LIMIT_TOLERANCE
+from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.prediction import Prediction

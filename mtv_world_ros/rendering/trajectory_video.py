@@ -25,7 +25,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.rendering.glow import (
     Box,
     FAINTEST,

@@ -17,7 +17,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.geometry.object_motion import FoundObjects
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.success.situation import CannotTell, TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
 

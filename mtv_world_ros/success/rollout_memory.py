@@ -11,7 +11,7 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.mask_geometry import centroids, lean, locate_all
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: frames whose places are kept; the start is kept whatever follows
 MAX_FRAMES = 2000

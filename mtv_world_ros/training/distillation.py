@@ -39,7 +39,7 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import Schema
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.conditioning import Conditioning

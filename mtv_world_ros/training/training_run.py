@@ -36,8 +36,8 @@ from mtv_world_ros.errors import (
 )
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import save_robot
+from mtv_world_ros.geometry.robot.file import save_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.runtime import check_device, choose_dtype
 from mtv_world_ros.training.base import load_base, needs_base

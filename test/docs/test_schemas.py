@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mtv_world_ros.geometry.calibration_file import _View
-from mtv_world_ros.geometry.robot_file import ArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
+from mtv_world_ros.geometry.robot.file import ArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
 from mtv_world_ros.sim.collect.dataset_readme import KEYS
 from mtv_world_ros.sim.collect.siblings import Sibling
 

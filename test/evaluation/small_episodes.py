@@ -15,8 +15,8 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory, WorldModelSpec
 from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig

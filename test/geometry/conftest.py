@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 ROBOTS = Path(__file__).resolve().parents[2] / 'config' / 'robots'
 

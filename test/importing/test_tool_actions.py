@@ -7,7 +7,7 @@ import pytest
 from mtv_world_ros.config import validated
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.transforms import quaternion
 from mtv_world_ros.importing.convert import import_dataset
 from mtv_world_ros.importing.mapping import ActionStream

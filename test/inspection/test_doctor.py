@@ -12,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape, rods
+from mtv_world_ros.geometry.robot.shape import draw_silhouettes, load_shape, rods
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.inspect import Inspector, load_inspector
 from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualSearch
@@ -172,7 +172,7 @@ URDF = """
 
 
 def lamp(folder: Path, geometry: str):
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
 
     (folder / 'lamp.yaml').write_text(ROBOT)
     (folder / 'lamp.urdf').write_text(URDF.replace('GEOMETRY', geometry))

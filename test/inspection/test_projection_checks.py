@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.inspection.inspect import check_visibility, tool_visibility
 
 ROBOT = """

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import (
     ActionEncoding,
     check_control,

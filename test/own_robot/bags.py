@@ -13,7 +13,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse, quaternion
 from mtv_world_ros.rendering.images import encode_jpeg
 

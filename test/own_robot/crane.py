@@ -12,9 +12,9 @@ import numpy as np
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_shape import load_shape, project_part
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape, project_part
 
 START_NS = 1_700_000_000_000_000_000
 WIDTH, HEIGHT, FPS = 320, 240, 10

@@ -12,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape
+from mtv_world_ros.geometry.robot.shape import draw_silhouettes, load_shape
 from mtv_world_ros.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.fixed_camera import FixedCamera

@@ -9,7 +9,7 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.geometry.robot_shape import load_shape, moving_links
+from mtv_world_ros.geometry.robot.shape import load_shape, moving_links
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
 

@@ -13,8 +13,8 @@ from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import cached_recording, cut_clip, load_recording
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_shape import load_shape
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.motion_residual import ResidualSearch

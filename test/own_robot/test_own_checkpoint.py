@@ -11,7 +11,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_shape import load_shape
+from mtv_world_ros.geometry.robot.shape import load_shape
 
 TINY = [
     'transformer.num_attention_heads=2', 'transformer.attention_head_dim=12',

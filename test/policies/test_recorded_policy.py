@@ -10,7 +10,7 @@ from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.recorded_policy import RecordedPolicy
 from mtv_world_ros.ranking.policy_list import load_policy_list

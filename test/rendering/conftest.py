@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.geometry.robot import RobotModel, Tool
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 
 
 def gantry(num_arms: int) -> RobotModel:

@@ -7,7 +7,7 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.robot import RobotModel, Tool
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     object_colour,

@@ -30,7 +30,7 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 

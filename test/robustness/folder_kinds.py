@@ -24,7 +24,7 @@ from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -353,7 +353,7 @@ def make_mesh(folder: Path) -> None:
 
 
 def _read_mesh(folder: Path) -> Any:
-    from mtv_world_ros.geometry.robot_shape import load_shape
+    from mtv_world_ros.geometry.robot.shape import load_shape
 
     return load_shape(load_robot(folder / 'robot.yaml'))
 

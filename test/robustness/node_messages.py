@@ -196,7 +196,7 @@ def _fixed() -> Any:
 
     from mtv_world_ros.files import share_path
     from mtv_world_ros.geometry.calibration_file import load_calibration
-    from mtv_world_ros.geometry.robot_file import load_robot
+    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.ros.parameters import Settings
 
     with tempfile.TemporaryDirectory() as folder:

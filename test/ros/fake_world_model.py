@@ -12,7 +12,7 @@ import numpy as np
 from mtv_world_ros.assembly import asked_describer, robot_path
 from mtv_world_ros.errors import ModelMemoryError, RolloutPreempted
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.ros.world_model.node import main

@@ -7,7 +7,7 @@ import pytest
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotion
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_feature, foreseen_of, ForeseenMotions
 from mtv_world_ros.success.task import match_task

@@ -5,7 +5,7 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of
 from mtv_world_ros.sim.world.workcell import workcell_of

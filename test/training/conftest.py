@@ -9,7 +9,7 @@ from sources import make_source
 
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 TINY = {

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mtv_world_ros.data.recording import Recording
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter

@@ -21,8 +21,8 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.resume import DiskError

@@ -15,7 +15,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.training.clips.fit_actions import fit_actions
 from mtv_world_ros.training.objective import Draws, pooled_weights

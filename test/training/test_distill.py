@@ -13,7 +13,7 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.distillation import (

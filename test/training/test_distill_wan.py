@@ -10,7 +10,7 @@ import torch
 from wan_predictions import imported
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.lora import add_adapter, save_adapter
 from mtv_world_ros.training.distillation import distill, DistillConfig

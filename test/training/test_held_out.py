@@ -11,7 +11,7 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.evaluation.video import decode_video
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.training_run import HeldOut, Judged, train

@@ -12,7 +12,7 @@ import torch
 from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data_types import History, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline

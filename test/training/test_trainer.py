@@ -15,7 +15,7 @@ import torch
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.trainer import learning_rate, Trainer
 from mtv_world_ros.training.training_config import (

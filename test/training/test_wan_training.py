@@ -16,7 +16,7 @@ from wan_base import make_base, tiny_preset
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.errors import CheckpointError, TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.base import load_base

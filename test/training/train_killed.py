@@ -18,7 +18,7 @@ import time
 import torch
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 import torch
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.training.clips.batches import Batch
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun

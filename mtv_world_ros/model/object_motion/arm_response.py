@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
+from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: between commands, after which the inertia is computed again [s]
 PERIOD_S = 0.02

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings

@@ -24,7 +24,7 @@ from mtv_world_ros.files import whole_folder, write_json
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.object_shape import NUM_FEATURES, object_shapes
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 from mtv_world_ros.model.object_motion.helpers import Answer, Helpers

@@ -24,8 +24,8 @@ from scipy.optimize import nnls
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_shape import find_mesh
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import find_mesh
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse

@@ -14,7 +14,7 @@ import torch
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import whole_folder
-from mtv_world_ros.geometry.robot_file import save_robot
+from mtv_world_ros.geometry.robot.file import save_robot
 from mtv_world_ros.model import wan_keys
 from mtv_world_ros.model.card import CheckpointCard, ROBOT_FOLDER
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler

@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from mtv_world_ros.assembly import assemble_policy, checkpoint_robot, PolicyMaker
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of

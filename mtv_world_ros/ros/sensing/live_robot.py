@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 
 from mtv_world_ros.data.transform_tree import Mount
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.extrinsics import Extrinsics

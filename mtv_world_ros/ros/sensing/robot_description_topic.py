@@ -11,8 +11,8 @@ from std_msgs.msg import String
 
 from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_description import described_robot
+from mtv_world_ros.geometry.robot.description import described_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.qos_profiles import LATCHED
 

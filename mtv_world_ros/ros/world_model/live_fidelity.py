@@ -14,7 +14,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages

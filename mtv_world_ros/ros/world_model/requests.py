@@ -9,7 +9,7 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot import check_positions, RobotModel
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.ros.messages.conversions import to_trajectory
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.bounded_input import check_limit
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns

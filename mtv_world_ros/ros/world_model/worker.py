@@ -12,7 +12,7 @@ import traceback
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction

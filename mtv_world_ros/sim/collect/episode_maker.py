@@ -11,7 +11,7 @@ import numpy as np
 
 from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
 from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.dataset_card import GO_ON
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate, Take, write_take

@@ -15,7 +15,7 @@ from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults import PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import ScriptedPolicy

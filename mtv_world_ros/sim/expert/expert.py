@@ -9,8 +9,8 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
-from mtv_world_ros.geometry.arm_solver import ArmSolver
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.expert.way_points import Pull, pushed, WayPoint, WayPointFaults
 from mtv_world_ros.sim.shapes import Grasp, SHAPES

@@ -14,7 +14,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray, JointTrajectory
 from mtv_world_ros.errors import nearest, PolicyError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.expert.glitches import Commands, crossed, with_glitches
 
 EXPERT = 'expert'

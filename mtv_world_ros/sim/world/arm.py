@@ -14,7 +14,7 @@ from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.world import yam
 from mtv_world_ros.sim.world.actuator import Actuator
 from mtv_world_ros.sim.world.cameras import camera_xml

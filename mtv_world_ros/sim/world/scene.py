@@ -10,7 +10,7 @@ import numpy as np
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
 from mtv_world_ros.sim.shapes import shape_named, Size
 from mtv_world_ros.sim.world.arm import actuators_of, bodies_xml

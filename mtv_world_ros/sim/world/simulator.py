@@ -9,7 +9,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
 from mtv_world_ros.sim.world.arm import actuators_of
 from mtv_world_ros.sim.world.opengl import load_mujoco

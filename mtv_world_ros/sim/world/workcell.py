@@ -13,7 +13,7 @@ from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.world.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
 
 Number = int | float

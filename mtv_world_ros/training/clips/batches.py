@@ -23,7 +23,7 @@ from torch import Tensor
 from mtv_world_ros.data.recording import chunk_of, clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.training.clips.past import (

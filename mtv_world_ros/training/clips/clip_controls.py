@@ -11,7 +11,7 @@ from mtv_world_ros.data.recording import Clip
 from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,

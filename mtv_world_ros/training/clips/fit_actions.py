@@ -11,7 +11,7 @@ import numpy as np
 from mtv_world_ros.data.recording import clip_starts, commanded, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import ActionEncoding, STATISTICS, TRAJECTORY_VIDEO
 from mtv_world_ros.training.training_config import TrainingConfig
 

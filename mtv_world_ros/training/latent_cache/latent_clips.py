@@ -21,7 +21,7 @@ from mtv_world_ros.data.recording import commanded, cut_clip, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import content_digest
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.actions import collate, TRAJECTORY_VIDEO
 from mtv_world_ros.model.conditioning import Conditioning, start_slot
 from mtv_world_ros.training.base import Base

@@ -18,8 +18,8 @@ import numpy as np
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.contact_motions import ContactMotions

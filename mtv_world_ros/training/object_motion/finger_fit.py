@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.model.object_motion.contact_motions import driven
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import check_free, write_whole
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import (

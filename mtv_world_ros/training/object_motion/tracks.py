@@ -22,7 +22,7 @@ from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_shape import object_shapes
 from mtv_world_ros.geometry.resample import nearest_rows, resample
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.model.object_motion.network import COMMANDS_A_STEP, STEP_S
 

@@ -12,9 +12,9 @@ import pytest
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.errors import CheckpointError, RobotError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.arm_solver import ArmSolver
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_mechanics import RobotMechanics
+from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion import contact_motions, predictor
 from mtv_world_ros.model.object_motion.contact_motions import (

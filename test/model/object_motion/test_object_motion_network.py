@@ -10,7 +10,7 @@ import torch
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 from mtv_world_ros.model.object_motion.network import (
     _pose,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.ranking.worlds import SimulatedWorld
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate
 from mtv_world_ros.sim.expert.expert import Expert

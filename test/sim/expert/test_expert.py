@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
-from mtv_world_ros.geometry.arm_solver import ArmSolver
-from mtv_world_ros.geometry.robot import check_positions
+from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
+from mtv_world_ros.geometry.robot.model import check_positions
 from mtv_world_ros.sim.collect.record import chunk, expert_generator, RecordConfig, simulate
 from mtv_world_ros.sim.expert.expert import top_down
 from mtv_world_ros.sim.tasks.tasks import TASKS

@@ -6,8 +6,8 @@ import pytest
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot_file import load_robot
-from mtv_world_ros.geometry.robot_shape import draw_silhouettes, load_shape
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.shape import draw_silhouettes, load_shape
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import TASKS
 from mtv_world_ros.sim.world.arm import actuators_of

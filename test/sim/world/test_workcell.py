@@ -8,8 +8,8 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot import check_positions, RobotModel
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate
 from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.tasks.tasks import TASKS

@@ -8,7 +8,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.sim.collect.episode_maker import cameras_of, CollectConfig

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter

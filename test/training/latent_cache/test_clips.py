@@ -14,7 +14,7 @@ from wan_base import make_base, tiny_preset
 
 from mtv_world_ros.data.recording import cut_clip, load_recording
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.conditioning import condition, encode_chunk
 from mtv_world_ros.training.base import Base, load_base
 from mtv_world_ros.training.clips.batches import BatchSource

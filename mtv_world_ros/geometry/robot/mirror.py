@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import RobotModel, Tool
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 
 #: joint axes and tool points that differ by less than this from the mirrored ones agree [m, 1]
 _TOLERANCE = 1e-4

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator, PrivateAttr, Valid
 from mtv_world_ros.config import expected, Pair, Schema
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: factor to rad or m
 UNITS = {'rad': 1.0, 'm': 1.0, 'deg': np.pi / 180, 'cm': 0.01, 'mm': 0.001}

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.errors import ConfigError, RobotError
-from mtv_world_ros.geometry.robot_file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot
 
 PLANAR = """<robot name="two">
   <link name="root"/><link name="upper"/><link name="lower"/><link name="finger"/>

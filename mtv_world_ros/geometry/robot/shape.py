@@ -20,7 +20,7 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: corners of a round shape's rims, and directions in which a mesh's outermost points are kept
 _CORNERS, _DIRECTIONS = 16, 256

@@ -8,8 +8,8 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import RobotModel
-from mtv_world_ros.geometry.robot_file import parse_urdf
+from mtv_world_ros.geometry.robot.file import parse_urdf
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: a calibrated robot differs from its nominal description by less than this [m], [rad]
 _LARGEST_OFFSET = 0.05

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.geometry.robot import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 
 class RobotMechanics:

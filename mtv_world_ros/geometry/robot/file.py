@@ -17,8 +17,8 @@ from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
-from mtv_world_ros.geometry.robot import Mimic, RobotModel, Tool
-from mtv_world_ros.geometry.robot_shape import find_mesh, write_convex_hull
+from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
+from mtv_world_ros.geometry.robot.shape import find_mesh, write_convex_hull
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
 

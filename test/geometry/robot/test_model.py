@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import RobotError, TrajectoryError
-from mtv_world_ros.geometry.robot import check_positions, RobotModel, Tool
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel, Tool
 
 # The maker's figures: position [m] and quaternion wxyz (not normalised) of each link in its
 # parent; every joint turns about its own z.

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import TrajectoryError
-from mtv_world_ros.geometry.robot import RobotModel, Tool
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 
 #: of damped least squares: added to the diagonal of J^T J
 _DAMPING = 1e-5

@@ -14,9 +14,9 @@ import pinocchio as pin
 from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot import Mimic
-from mtv_world_ros.geometry.robot_file import read_urdf
-from mtv_world_ros.geometry.robot_shape import link_shapes
+from mtv_world_ros.geometry.robot.file import read_urdf
+from mtv_world_ros.geometry.robot.model import Mimic
+from mtv_world_ros.geometry.robot.shape import link_shapes
 from mtv_world_ros.geometry.transforms import quaternion
 
 #: a tree with a fork at most this far from its ends is a gripper [joints]

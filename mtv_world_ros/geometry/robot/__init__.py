@@ -1,0 +1,1 @@
+"""Robots: their files and descriptions, kinematics, mechanics and shapes."""
