@@ -162,6 +162,12 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-vise-0.025',
         'expert-roam-2',
         'expert-roam-3',
+        'expert-list-0.6',
+        'expert-list-0.7',
+        'expert-dribble-0.035',
+        'expert-dribble-0.04',
+        'expert-rattle-0.08',
+        'expert-rattle-0.1',
     ),
     'calibrate': (
         'expert',
@@ -290,22 +296,14 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-slap-0.07',
         'expert-wane-0.18',
         'expert-wane-0.22',
-    ),
-    'test': (
-        'expert',
         'expert-heave-0.04',
         'expert-heave-0.05',
-        'expert-list-0.6',
-        'expert-list-0.7',
         'expert-bowl-0.06',
         'expert-bowl-0.12',
-        'expert-dribble-0.035',
-        'expert-dribble-0.04',
         'expert-tail-0.75',
         'expert-tail-0.8',
-        'expert-rattle-0.08',
-        'expert-rattle-0.1',
     ),
+    'test': ('expert',),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

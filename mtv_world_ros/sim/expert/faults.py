@@ -210,7 +210,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'heave': _kind(
         'height',
-        'test',
+        'calibrate',
         0.04,
         0.1,
         'm',
@@ -315,7 +315,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'list': _kind(
         'wrist',
-        'test',
+        'train',
         0.65,
         0.9,
         'rad',
@@ -458,7 +458,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'bowl': _kind(
         'release',
-        'test',
+        'calibrate',
         0.06,
         0.15,
         'm',
@@ -697,7 +697,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'dribble': _kind(
         'collision',
-        'test',
+        'train',
         0.04,
         0.12,
         'm',
@@ -705,7 +705,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'tail': _kind(
         'collision',
-        'test',
+        'calibrate',
         0.8,
         1.0,
         '',
@@ -768,7 +768,7 @@ FAULTS: Mapping[str, FaultKind] = {
     ),
     'rattle': _kind(
         'object',
-        'test',
+        'train',
         0.08,
         0.1,
         'm',
