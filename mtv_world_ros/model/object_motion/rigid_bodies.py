@@ -52,6 +52,8 @@ _LEAST_KG = 0.01
 _PAD_S = 0.02
 #: a pad gives way, or does not
 _FREE, _LOCKED = dart.dynamics.ActuatorType.FORCE, dart.dynamics.ActuatorType.LOCKED
+#: fingers press on what they touch with a normal that is more upright than this, else push it
+_STEEP = 0.5
 #: fingers that are further from their middle and touch the same, hold it between them [m]
 _GRIP_M = 0.002
 #: how exactly friction is solved while fingers touch something: repetitions, relative error
@@ -165,18 +167,21 @@ class RigidBodies:
     def notice_touch(self) -> None:
         """Gives what fingers touch by now the friction of grips, and the rest that of the table.
 
-        So what is gripped holds to fingers and slides on others. Friction of what is held is
-        solved as a cone; else as a pyramid along x and y, which is quicker, and exact where
-        fingers press on what is light. And pads give way, so that both fingers press on what lies
-        below them; but not on the table.
+        So what is gripped holds to fingers and slides on others. Friction of what is held or
+        pushed is solved as a cone; else as a pyramid along x and y, which is quicker, and exact
+        where fingers press on what is light. Its friction is bounded by forces that would do
+        without any, and of those an object that slides ahead of a finger needs none. And pads
+        give way, so that both fingers press on what lies below them; but not on the table.
         """
-        touched = np.array([bool(self._of_fingers.collide(one)) for one in self._of_solids])
+        slopes = [self._slopes(one) for one in self._of_solids]
+        touched = np.array([len(found) > 0 for found in slopes], np.bool_)
         for number in np.flatnonzero(touched != self._touched):
             grip, table = self._settings.grip_friction, self._settings.table_friction
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        solver = self._cone if self._holds(touched) else self._pyramid
+        is_pushed = touched.any() and max(map(max, filter(len, slopes))) < _STEEP
+        solver = self._cone if is_pushed or self._holds(touched) else self._pyramid
         self._world.getConstraintSolver().setBoxedLcpSolver(solver)
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
@@ -185,6 +190,12 @@ class RigidBodies:
                 pad.setPosition(0, 0.0)
                 pad.setVelocity(0, 0.0)
             pad.setActuatorType(_FREE if is_soft else _LOCKED)
+
+    def _slopes(self, solid: Any) -> list[float]:
+        """How upright the normals of contacts of fingers with a solid are, 0 to 1."""
+        found = dart.collision.CollisionResult()
+        self._of_fingers.collide(solid, dart.collision.CollisionOption(), found)
+        return [abs(found.getContact(k).normal[2]) for k in range(found.getNumContacts())]
 
     def _holds(self, touched: BoolArray) -> bool:
         """Whether a tool has one of the touched solids (O,) between its fingers."""

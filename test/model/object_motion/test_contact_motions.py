@@ -207,6 +207,31 @@ def test_both_shut_fingers_bear_on_what_they_press(robot, response, recording):
     assert (np.linalg.norm(moved.points[:, -1] - moved.points[:, 0], axis=-1) < 0.005).all()
 
 
+def test_what_is_pushed_off_its_middle_goes_along_with_the_fingers(robot, response, recording):
+    """It rubs on them as much as what is held, and does not slide off to one side."""
+    lowest = robot.tool_poses(recording.positions)[..., 2, 3]
+    arm, row = np.unravel_index(lowest.argmin(), lowest.shape)
+    tool, joints = robot.tools[arm], recording.positions[row].copy()
+    joints[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
+    pose = robot.tool_poses(joints[None])[arm, 0]
+    solver, ends = ArmSolver(robot, tool), []
+    for way in (np.zeros(2), np.array([0.02, 0.05])):
+        place = pose.copy()
+        place[:3, 3] = *(pose[:2, 3] + way), 0.03
+        ends.append(joints.copy())
+        ends[-1][solver.indices] = solver.solve(place, joints[solver.indices])
+    share = np.clip(np.linspace(-0.5, 1.5, 100), 0, 1)[:, None]
+    positions = ends[0] + share * (ends[1] - ends[0])
+    middle = np.array([pose[0, 3] + 0.012, pose[1, 3] + 0.05, 0.025])
+    block = Solid(centre=middle, size=np.full(3, 0.05))
+    motions = motions_of(response, block, grip_friction=1.6, table_friction=0.8)
+    moved, _ = motions.advance(robot, positions, ROWS)
+    way = moved.points[0, -1, 0] - moved.points[0, 0, 0]
+    # bounded by forces that do without friction, it would go half as far aside, and turn
+    np.testing.assert_allclose(way[:2], [0.0126, 0.0336], atol=0.002)
+    assert moved.rotations[0, -1, 0, 0, 0] > np.cos(np.radians(5))
+
+
 def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
     rest = still(robot, 0.0)[0]
     for tool in robot.tools:
@@ -244,7 +269,7 @@ def test_what_fingers_touch_holds_to_them_and_slides_on_others(robot, response):
     rest = still(robot, 0.0)[0]
     for tool in robot.tools:
         rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
-    between = replace(AWAY, centre=robot.tool_poses(rest[None])[0, 0, :3, 3])
+    between = replace(AWAY, centre=robot.tool_poses(rest[None])[0, 0, :3, 3] - [0, 0, 0.024])
     bodies = RigidBodies(robot, response, (AWAY, between), SETTINGS, STEP_S, rest)
 
     def frictions():
