@@ -26,9 +26,15 @@ _Known = Annotated[float, Field(allow_inf_nan=True)]
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
-    """Returns a feature's value for the logistic: doubts count only if negative; NaN = unknown."""
+    """Returns a feature's value for the logistic; NaN = unknown.
+
+    Doubts count only if negative, and only where no motion is foreseen: what is foreseen to move is
+    moved by something, which may push it with shut fingers.
+    """
     value = features.get(name, nan)
-    return min(value, 0.0) if name in DOUBTS else value
+    if name not in DOUBTS:
+        return value
+    return nan if isfinite(features.get('foreseen', nan)) else min(value, 0.0)
 
 
 class Weights(Schema):

@@ -377,6 +377,10 @@ def test_a_good_grasp_speaks_for_nothing():
     grasped = {'margin': 0.0, 'grasp': 1.0}
     assert calibration.probability(grasped) == calibration.probability({**grasped, 'grasp': 0.0})
     assert calibration.probability({**grasped, 'grasp': -1.0}) < calibration.probability(grasped)
+    # what is foreseen to move was moved by something: it may have been pushed
+    foreseen = {**grasped, 'foreseen': 0.5}
+    doubted = calibration.probability({**foreseen, 'grasp': -1.0})
+    assert doubted == calibration.probability(foreseen)
 
 
 def test_weights_stay_as_stated_where_the_episodes_say_nothing():
