@@ -303,7 +303,21 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-tail-0.75',
         'expert-tail-0.8',
     ),
-    'test': ('expert',),
+    'test': (
+        'expert',
+        'expert-flap-0.7',
+        'expert-flap-0.8',
+        'expert-shed-0.03',
+        'expert-shed-0.035',
+        'expert-hinder-0.85',
+        'expert-hinder-0.9',
+        'expert-yank-0.08',
+        'expert-yank-0.1',
+        'expert-heap-0.015',
+        'expert-heap-0.03',
+        'expert-stick-0.06',
+        'expert-stick-0.07',
+    ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

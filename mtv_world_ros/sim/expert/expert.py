@@ -428,6 +428,20 @@ class Expert:
             comes.append(self._poach(arm, other, stops, faults.poached, pace))
         for pull in faults.pulls(stops, objects):
             comes.append(self._pull(arm, other, stops, pull, pace))
+        comes += self._crossings(arm, other, stops, faults, objects, pace)
+        return stops, comes
+
+    def _crossings(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        faults: WayPointFaults,
+        objects: list[FloatArray],
+        pace: tuple[float, float],
+    ) -> list[tuple[FloatArray, int]]:
+        """What another arm does in this one's way, as `_company` has it."""
+        comes: list[tuple[FloatArray, int]] = []
         if faults.slapped:
             comes.append(self._slap(arm, other, stops, faults.slapped, pace))
         if places := faults.roams(objects):
@@ -435,7 +449,9 @@ class Expert:
         if faults.tailed:
             rows = self._tail(arm, other, stops, faults.tailed, pace)
             comes.append((rows, self._late(_TAIL_S, pace)))
-        return stops, comes
+        if faults.hindered:
+            comes.append(self._hinder(arm, other, stops, faults.hindered, pace))
+        return comes
 
     def _crowd(
         self,
@@ -611,6 +627,39 @@ class Expert:
             return [*(s.moved(way) for s, way in zip(same, shorts, strict=False)), home]
 
         return self._as_far_as_it_reaches(other, ways, share, pace)[0]
+
+    def _hinder(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that stands half-way in this one's way, and how late they begin.
+
+        It goes a share of the way there, or as much of it as it reaches, is there as this one has
+        closed, and stays until that is over its goal.
+        """
+        phases, home = [s.phase for s in stops], self._rests(other)
+        closed = phases.index('close')
+        over = max(phases.index('open') - 2, closed)
+        middle = (stops[closed].position + stops[over].position) / 2
+        times = self._timed(stops, self.workcell.home_tools[arm])
+        stays = max(sum(times[closed + 1 : over + 1]), _STAYS_S)
+
+        def ways(share: float) -> list[WayPoint]:
+            near = replace(
+                home,
+                phase='above',
+                position=home.position + share * (middle - home.position),
+                opening=0.0,
+            )
+            return [near, replace(near, seconds=stays), home]
+
+        rows, done = self._as_far_as_it_reaches(other, ways, share, pace)
+        arrives = sum(times[: closed + 1])
+        return rows, self._late(arrives - self._timed(done, home.position)[0], pace)
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
         """Rows before something begins, of a time before scaling [s]; none if it is too late."""

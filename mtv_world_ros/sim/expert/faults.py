@@ -321,6 +321,14 @@ FAULTS: Mapping[str, FaultKind] = {
         'rad',
         'how far the wrist leans where its arm reaches out most; less where it reaches less far',
     ),
+    'flap': _kind(
+        'wrist',
+        'test',
+        0.7,
+        0.9,
+        'rad',
+        'having let go, the wrist leans to and fro where it is, up to this far',
+    ),
     # opening
     'loose': _kind(
         'opening', 'train', 0.4, 1.0, '', 'share of its range that the gripper stays open'
@@ -463,6 +471,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.15,
         'm',
         'what it holds slides this far to its goal, in one stroke, while the fingers open',
+    ),
+    'shed': _kind(
+        'release',
+        'test',
+        0.03,
+        0.12,
+        'm',
+        'it rises with what it holds, and opens as it shakes it off, this far to either side',
     ),
     # collision
     'push': _kind(
@@ -711,6 +727,14 @@ FAULTS: Mapping[str, FaultKind] = {
         '',
         'share of its way to the same places by which the other arm follows this one',
     ),
+    'hinder': _kind(
+        'collision',
+        'test',
+        0.85,
+        1.0,
+        '',
+        "share of its way to half-way of this arm's by which the other arm stands in its way",
+    ),
     # object and place
     'wrong': _kind(
         'object', 'train', 1, 1.0, '', 'probability that another object is taken', contact=False
@@ -773,6 +797,22 @@ FAULTS: Mapping[str, FaultKind] = {
         0.1,
         'm',
         'once done, it closes on what it has put the object on or beside, and shakes it, this far',
+    ),
+    'yank': _kind(
+        'object',
+        'test',
+        0.1,
+        0.15,
+        'm',
+        'once done, it closes on what it has put the object on or beside, and yanks it this far',
+    ),
+    'heap': _kind(
+        'object',
+        'test',
+        0.02,
+        0.06,
+        'm',
+        'it first puts the other object next to its own on top of that, this far off its middle',
     ),
     'place': _kind(
         'place',
@@ -975,6 +1015,14 @@ FAULTS: Mapping[str, FaultKind] = {
         0.5,
         '',
         'share that all arm joints lack of their travel at the end; at first they lack none',
+    ),
+    'stick': _kind(
+        'joint',
+        'test',
+        0.06,
+        0.4,
+        'rad',
+        'every arm joint stands until its command is this far off, and jumps there',
     ),
     # regrasp
     'retry': _kind(
@@ -1269,6 +1317,7 @@ _OF_TWO_ARMS = (
     'slap',
     'roam',
     'tail',
+    'hinder',
 )
 #: kinds of what a gripper does
 _OF_GRIPPERS = (
@@ -1322,6 +1371,11 @@ _OF_GRIPPERS = (
     'bowl',
     'rattle',
     'tail',
+    'flap',
+    'shed',
+    'yank',
+    'heap',
+    'hinder',
 )
 #: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
 #: one command to the next, both as shares of its range; how much faster they go back
@@ -1486,6 +1540,7 @@ def _controller_faults(
         positions = _coarse(positions, grippers, variant.size('coarse'), period)
         positions = np.clip(positions, robot.lower, robot.upper)
     positions = _lash(positions, grippers, variant.size('lash') / 2)
+    positions = _stick(positions, grippers, variant.size('stick'), period)
     positions = _one_joint(positions, variant, robot, grippers, period, rng)
     positions = _smooth(positions, grippers, round(variant.size('smooth') / period))
     positions = _sluggish(positions, grippers, variant.size('sluggish'))
@@ -1832,6 +1887,19 @@ def _lash(positions: FloatArray, grippers: list[int], slack: float) -> FloatArra
     whole = positions.copy()
     for row in range(1, len(whole)):
         whole[row] = np.clip(whole[row - 1], positions[row] - slack, positions[row] + slack)
+    whole[:, grippers] = positions[:, grippers]
+    return whole
+
+
+def _stick(positions: FloatArray, grippers: list[int], most: float, period: float) -> FloatArray:
+    """(T, J): an arm joint stands until its command is more than `most` off, and jumps there."""
+    if not most:
+        return positions
+    whole = positions.copy()
+    for row in range(1, len(whole)):
+        stays = np.abs(positions[row] - whole[row - 1]) <= most
+        whole[row] = np.where(stays, whole[row - 1], positions[row])
+    whole = _smooth(whole, [], round(_JUMP_S / period))
     whole[:, grippers] = positions[:, grippers]
     return whole
 

@@ -82,6 +82,10 @@ _KEEP_TEMPO = frozenset(
         'dribble',
         'rattle',
         'bowl',
+        'shed',
+        'yank',
+        'flap',
+        'heap',
     )
 )
 #: phases in which another arm comes where this one is, and the kind of fault that it is
@@ -148,6 +152,12 @@ _ROAM_BESIDE_M, _ROAM_LEAST_M = 0.04, 0.02
 _DRIBBLE_BESIDE_M = 0.015
 #: another object is shaken: how often, and time of a stroke [s]
 _NUM_RATTLES, _RATTLE_S = 3, 0.15
+#: what does not come off is shaken off: how high [m], how often, time of a stroke [s]
+_SHED_RISE_M, _NUM_SHEDS, _SHED_S = 0.03, 2, 0.15
+#: time in which another object is pulled away [s]
+_YANK_S = 0.2
+#: another object is put on its own: from how high above it falls, how far it rises there [m]
+_HEAP_GAP_M, _HEAP_RISE_M = 0.005, 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +254,11 @@ class WayPointFaults:
     def tailed(self) -> float:
         """By which share of its way another arm follows this one; 0 = it does not."""
         return self._variant.size('tail')
+
+    @property
+    def hindered(self) -> float:
+        """By which share of its way another arm stands in this one's way; 0 = it does not."""
+        return self._variant.size('hinder')
 
     def roams(self, objects: Sequence[FloatArray]) -> list[FloatArray]:
         """Returns the places (3,) that another arm roams through meanwhile [m], drawn.
@@ -977,14 +992,7 @@ def _decoy(stops: Stops, size: float, side: _Side) -> Stops:
     its arm is near no other.
     """
     above, grasp, close = stops[: _first(stops, 'close') + 1][-3:]
-    own, home = close.position[:2], stops[-1].position[:2]
-    others = [
-        place
-        for place in side.objects
-        if np.linalg.norm(place[:2] - own) > _VISIT_TO_M[1]
-        and np.linalg.norm(place[:2] - home) < _DECOY_ARM_M
-    ]
-    at = min(others, key=lambda p: np.linalg.norm(p[:2] - own), default=grasp.position)
+    at = _next_to_own(stops, side)
     down = replace(grasp, phase='above', position=at, opening=1.0)
     shut = replace(down, opening=0.0, seconds=close.seconds)
     moved = replace(shut, seconds=None).moved(size * _drawn_way(side))
@@ -992,6 +1000,19 @@ def _decoy(stops: Stops, size: float, side: _Side) -> Stops:
     rise = above.position - grasp.position
     left = replace(let_go, seconds=None).moved(rise)
     return [down.moved(rise), down, shut, moved, let_go, left, *stops]
+
+
+def _next_to_own(stops: Stops, side: _Side) -> FloatArray:
+    """Centre (3,) of the other object next to its own; where it grasps if its arm is near none."""
+    grasp, close = stops[: _first(stops, 'close') + 1][-2:]
+    own, home = close.position[:2], stops[-1].position[:2]
+    others = [
+        place
+        for place in side.objects
+        if np.linalg.norm(place[:2] - own) > _VISIT_TO_M[1]
+        and np.linalg.norm(place[:2] - home) < _DECOY_ARM_M
+    ]
+    return min(others, key=lambda p: np.linalg.norm(p[:2] - own), default=grasp.position)
 
 
 def _omit(stops: Stops, size: float, side: _Side) -> Stops:
@@ -1378,6 +1399,71 @@ def _rattle(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:end], over, down, shut, *shakes, opened, over, *stops[end:]]
 
 
+def _flap(stops: Stops, size: float, side: _Side) -> Stops:
+    """Having let go, it leans to and fro where it is before it rises.
+
+    To either side by an angle up to this, drawn anew where the wrist does not lean so far.
+    """
+    end = _first(stops, 'open') + 1
+    nods = _nods(replace(stops[end - 1], phase='retreat'), size, side)
+    return [*stops[:end], *nods, *stops[end:]]
+
+
+def _shed(stops: Stops, size: float, side: _Side) -> Stops:
+    """What it holds does not come off: it rises with it, and opens as it shakes it off.
+
+    In another direction, drawn anew, where the arm does not reach so far.
+    """
+    at, rise = _first(stops, 'open'), _up(_SHED_RISE_M)
+    raised = replace(stops[at - 1], seconds=None).moved(rise)
+    opened = replace(stops[at], seconds=_SHED_S).moved(rise)
+    shakes = _to_and_fro(opened, size * _drawn_way(side), _NUM_SHEDS)
+    shares = np.arange(1, len(shakes) + 1) / len(shakes)
+    pairs = zip(shakes, shares, strict=True)
+    opens = [replace(s, opening=float(share) * s.opening) for s, share in pairs]
+    return [*stops[:at], raised, *opens, *stops[at + 1 :]]
+
+
+def _yank(stops: Stops, size: float, side: _Side) -> Stops:
+    """Once done, it closes on the other object next to its goal, and pulls it away in one stroke.
+
+    In another direction, drawn anew, where the arm does not reach so far; what it put there where
+    its arm is near no other.
+    """
+    end, close = _first(stops, 'retreat') + 1, stops[_first(stops, 'close')]
+    retreat = stops[end - 1]
+    at = _next_to_goal(stops, side, stops[end - 2].position)
+    over = replace(retreat, position=np.array([*at[:2], retreat.position[2]]))
+    down = replace(over, position=at)
+    shut = replace(down, opening=0.0, seconds=close.seconds)
+    way = size * _drawn_way(side)
+    pulled = replace(shut, seconds=_YANK_S).moved(way)
+    opened = replace(pulled, opening=1.0, seconds=close.seconds)
+    return [*stops[:end], over, down, shut, pulled, opened, over.moved(way), *stops[end:]]
+
+
+def _heap(stops: Stops, size: float, side: _Side) -> Stops:
+    """It first puts the other object next to its own on top of that, off its middle.
+
+    To another side, drawn anew, where the arm does not reach so far; its own object where its arm
+    is near no other.
+    """
+    above, grasp, close = stops[: _first(stops, 'close') + 1][-3:]
+    at = _next_to_own(stops, side)
+    own = min(side.objects, key=lambda p: np.linalg.norm((p - grasp.position)[:2]))
+    down = replace(grasp, phase='above', position=at, opening=1.0)
+    shut = replace(down, opening=0.0, seconds=close.seconds)
+    # what lies on the table is twice as high as its centre
+    top = own * (1, 1, 2) + _up(at[2] + _HEAP_GAP_M) + size * _drawn_way(side)
+    rise = _up(_HEAP_RISE_M)
+    put = replace(shut, position=top, seconds=None)
+    raised = replace(put, position=np.array([*at[:2], top[2]])).moved(rise)
+    let_go = replace(put, opening=1.0, seconds=close.seconds)
+    left = replace(let_go, seconds=None).moved(rise)
+    down_from = down.moved(above.position - grasp.position)
+    return [down_from, down, shut, raised, put.moved(rise), put, let_go, left, *stops]
+
+
 def _to_and_fro(stop: WayPoint, way: FloatArray, num: int) -> Stops:
     """From a way point to either side of it, `num` times, and back to it."""
     return [*(stop.moved(to * way) for to in (1, -1) * num), stop]
@@ -1493,4 +1579,8 @@ _EDITS: dict[str, Callable[[Stops, float, _Side], Stops]] = {
     'bowl': _bowl,
     'list': _list,
     'rattle': _rattle,
+    'flap': _flap,
+    'shed': _shed,
+    'yank': _yank,
+    'heap': _heap,
 }

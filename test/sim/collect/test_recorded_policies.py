@@ -13,7 +13,7 @@ from mtv_world_ros.sim.collect.recorded_policies import recorded_kinds
 @pytest.fixture
 def dataset(tmp_path):
     """Episodes without frames, one a policy; the last two are not scripted."""
-    policies = ('expert', 'expert-late-0.6', 'expert-high-0.02-heave-0.03', 'pi0', '')
+    policies = ('expert', 'expert-late-0.6', 'expert-high-0.02-shed-0.03', 'pi0', '')
     for number, policy in enumerate(policies):
         metadata = {'policy': policy} if policy else {}
         with EpisodeWriter(
@@ -29,7 +29,7 @@ def test_kinds_are_those_of_the_recorded_policy(dataset):
     assert recorded_kinds(sorted(dataset.iterdir())) == {
         dataset / 'stack_00000': (),
         dataset / 'stack_00001': ('late',),
-        dataset / 'stack_00002': ('high', 'heave'),
+        dataset / 'stack_00002': ('high', 'shed'),
     }
 
 
@@ -40,7 +40,7 @@ def test_episodes_that_are_called_alike_have_kinds_of_their_own(dataset):
     for job in make_jobs(paths, {}, seed=0):
         wanted = recorded_kinds([job.path]).get(job.path)
         assert kinds.get(job.name) == wanted
-    assert sorted(kinds.values()) == [(), ('high', 'heave'), ('late',), ('late',)]
+    assert sorted(kinds.values()) == [(), ('high', 'shed'), ('late',), ('late',)]
 
 
 @pytest.mark.parametrize(
@@ -58,5 +58,5 @@ def test_a_test_kind_in_a_training_or_calibration_set_is_refused(
     assert main([word.format(set=dataset, out=out) for word in command]) == 1
     said = capsys.readouterr().err
     assert f'fault kinds of the split test are not for {what}' in said
-    assert "'expert-high-0.02-heave-0.03' has heave; choose kinds of train, calibrate" in said
+    assert "'expert-high-0.02-shed-0.03' has shed; choose kinds of train, calibrate" in said
     assert not out.exists()

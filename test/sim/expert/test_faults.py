@@ -220,7 +220,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         times=np.arange(len(given)) * 0.02,
         positions=np.zeros((len(given), len(franka.joint_names))),
     )
-    kinds = 'mirror swap crowd rival poach tug budge vise slap roam tail'
+    kinds = 'mirror swap crowd rival poach tug budge vise slap roam tail hinder'
     for kind in kinds.split():
         variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
@@ -280,6 +280,11 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
         'dribble',
         'tail',
         'rattle',
+        'flap',
+        'shed',
+        'hinder',
+        'yank',
+        'heap',
     ],
 )
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
@@ -1476,6 +1481,99 @@ def test_once_done_it_shakes_what_is_next_to_the_goal():
     np.testing.assert_array_equal(alone[9].position, stops[6].position)
 
 
+def test_once_done_it_yanks_what_is_next_to_the_goal():
+    stops, alone = changed_stops('expert-yank-0.1')
+    other = stops[5].position + [0, 0.06, -0.03]
+    faults = WayPointFaults(parse_variant('expert-yank-0.1'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [stops[1].position, other])
+    assert changed[:8] == stops[:8] and changed[-1:] == stops[-1:]
+    over, down, shut, pulled, opened, left = changed[8:-1]
+    for stop in (down, shut):
+        np.testing.assert_array_equal(stop.position, other)
+    assert [stop.opening for stop in changed[8:-1]] == [1, 1, 0, 0, 1, 1]
+    assert over.position[2] == left.position[2] == stops[7].position[2]
+    way = pulled.position - other
+    assert np.linalg.norm(way) == pytest.approx(0.1) and way[2] == 0 and pulled.seconds == 0.2
+    np.testing.assert_array_equal(opened.position, pulled.position)
+    np.testing.assert_allclose(left.position, over.position + way)
+    # where there is no other object, what it put there
+    np.testing.assert_array_equal(alone[9].position, stops[6].position)
+
+
+def test_having_let_go_it_leans_to_and_fro_where_it_is():
+    stops, changed = changed_stops('expert-flap-0.7')
+    assert changed[:7] == stops[:7] and changed[14:] == stops[7:]
+    leans = np.array([stop.lean for stop in changed[7:14]])
+    assert leans[-1] == 0 and (leans[0:6:2] > 0).all() and (leans[1:6:2] < 0).all()
+    assert (np.abs(leans[:6]) >= 0.42).all() and np.abs(leans).max() <= 0.7
+    for stop in changed[7:14]:
+        np.testing.assert_array_equal(stop.position, stops[6].position)
+        assert (stop.opening, stop.seconds) == (stops[6].opening, 0.2)
+
+
+def test_it_rises_with_what_it_holds_and_shakes_it_off_as_it_opens():
+    stops, changed = changed_stops('expert-shed-0.03')
+    assert changed[:6] == stops[:6] and changed[12:] == stops[7:]
+    raised, *shakes = changed[6:12]
+    np.testing.assert_allclose(raised.position - stops[5].position, [0, 0, 0.03])
+    assert raised.opening == 0 and all(stop.phase == 'open' for stop in shakes)
+    ways = np.array([stop.position - raised.position for stop in shakes])
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), [0.03] * 4 + [0], atol=1e-12)
+    np.testing.assert_allclose(ways[1:4], -ways[:3], atol=1e-12)
+    shares = [stop.opening / stops[6].opening for stop in shakes]
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+
+
+def test_it_first_puts_the_object_next_to_its_own_on_top_of_that():
+    stops, alone = changed_stops('expert-heap-0.02')
+    own, other = stops[1].position, stops[-1].position + [0.02, 0.05, -0.2]
+    faults = WayPointFaults(parse_variant('expert-heap-0.02'), np.random.default_rng(0))
+    changed = faults.applied(stops, 0.0, [own, other])
+    assert changed[8:] == stops
+    over, down, shut, raised, above, put, let_go, left = changed[:8]
+    assert [stop.opening for stop in changed[:8]] == [1, 1, 0, 0, 0, 0, 1, 1]
+    for stop in (down, shut):
+        np.testing.assert_array_equal(stop.position, other)
+    np.testing.assert_array_equal(raised.position[:2], other[:2])
+    assert over.position[2] > other[2]
+    way = put.position - own
+    assert np.linalg.norm(way[:2]) == pytest.approx(0.02)
+    # its underside half a centimetre over the own one's top; it comes from and leaves to above
+    assert put.position[2] == pytest.approx(2 * own[2] + other[2] + 0.005)
+    np.testing.assert_array_equal(let_go.position, put.position)
+    for stop in (above, left):
+        np.testing.assert_allclose(stop.position - put.position, [0, 0, 0.03], atol=1e-12)
+    assert raised.position[2] == above.position[2]
+    # where there is no other object, its own one
+    np.testing.assert_array_equal(alone[1].position, own)
+
+
+def test_the_other_arm_stands_half_way_with_shut_fingers(expert):
+    (usual, opening), (_, (tool, stands)) = arms_of(expert, 'expert-hinder-0.5')
+    shut = np.flatnonzero(opening < 1e-3)
+    there = np.flatnonzero(stands < 1e-3)
+    # it is there as this arm has closed, and leaves before that lets go
+    assert abs(int(there[0]) - int(shut[0])) < 5 and there[-1] < shut[-1]
+    assert np.ptp(tool[there], axis=0).max() < 1e-3
+    carried = usual[shut]
+    sides = carried[0] - tool[0], carried[-1] - tool[0]
+    middle = (sides[0] + sides[1])[:2] / 2
+    np.testing.assert_allclose((tool[there[0]] - tool[0])[:2], middle / 2, atol=5e-3)
+    np.testing.assert_allclose(tool[-1], tool[0], atol=1e-3)
+
+
+def test_joints_stick_until_their_command_is_far_off_and_jump_there(expert):
+    expert_plan, stick = plan(expert, 'expert'), plan(expert, 'expert-stick-0.1')
+    arms = arm_columns(expert)
+    assert np.abs(np.delete(stick - expert_plan, arms, axis=1)).max() == 0
+    away = np.abs(stick - expert_plan)[:, arms]
+    assert 0.08 < away.max() < 0.12
+    # most of the time they stand, and they go far in the end
+    steps = np.abs(np.diff(stick[:, arms], axis=0))
+    assert (steps < 1e-9).mean() > 0.6 and np.ptp(stick[:, arms], axis=0).max() > 0.3
+    np.testing.assert_allclose(stick[0], expert_plan[0], atol=1e-12)
+
+
 def test_all_places_are_those_of_a_grid():
     stops, changed = changed_stops('expert-grid-0.07')
     assert changed[-1] == stops[-1]
@@ -1811,6 +1909,12 @@ def test_coarse_joints_are_at_multiples_of_their_step(expert):
         'dribble',
         'tail',
         'rattle',
+        'flap',
+        'shed',
+        'hinder',
+        'yank',
+        'heap',
+        'stick',
     ],
 )
 def test_sizes_out_of_range_are_refused(kind):
@@ -1917,9 +2021,9 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 def test_test_kinds_are_refused_by_name():
     refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
-    said = r"split test are not for training: 'expert-high-0.1-heave-0.03' has heave"
+    said = r"split test are not for training: 'expert-high-0.1-shed-0.03' has shed"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-heave-0.03'], 'test', 'training')
+        refuse_kinds(['expert', 'expert-high-0.1-shed-0.03'], 'test', 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():
