@@ -28,8 +28,8 @@ _Known = Annotated[float, Field(allow_inf_nan=True)]
 def weighed(features: Mapping[str, float], name: str) -> float:
     """Returns a feature's value for the logistic; NaN = unknown.
 
-    Doubts count only if negative, and only where no motion is foreseen: what is foreseen to move is
-    moved by something, which may push it with shut fingers.
+    Doubts count only if negative, and only where no motion is foreseen: what is foreseen to move
+    is moved by something, which may push it with shut fingers.
     """
     value = features.get(name, nan)
     if name not in DOUBTS:
