@@ -305,8 +305,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
     ),
     'test': (
         'expert',
-        'expert-flap-0.7',
-        'expert-flap-0.8',
+        'expert-flap-0.75',
+        'expert-flap-0.9',
         'expert-shed-0.03',
         'expert-shed-0.035',
         'expert-hinder-0.85',
@@ -315,8 +315,8 @@ POLICY_SETS: dict[str, tuple[str, ...]] = {
         'expert-yank-0.1',
         'expert-heap-0.015',
         'expert-heap-0.03',
+        'expert-stick-0.055',
         'expert-stick-0.06',
-        'expert-stick-0.07',
     ),
 }
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves

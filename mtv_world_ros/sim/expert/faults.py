@@ -324,10 +324,10 @@ FAULTS: Mapping[str, FaultKind] = {
     'flap': _kind(
         'wrist',
         'test',
-        0.7,
+        0.8,
         0.9,
         'rad',
-        'having let go, the wrist leans to and fro where it is, up to this far',
+        'having let go, the wrist leans to and fro where it is, four times, up to this far',
     ),
     # opening
     'loose': _kind(

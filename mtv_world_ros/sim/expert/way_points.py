@@ -154,6 +154,8 @@ _DRIBBLE_BESIDE_M = 0.015
 _NUM_RATTLES, _RATTLE_S = 3, 0.15
 #: what does not come off is shaken off: how high [m], how often, time of a stroke [s]
 _SHED_RISE_M, _NUM_SHEDS, _SHED_S = 0.03, 2, 0.15
+#: having let go, it leans to and fro: how often, and how far at least, as a share
+_NUM_FLAPS, _LEAST_FLAP = 4, 0.3
 #: time in which another object is pulled away [s]
 _YANK_S = 0.2
 #: another object is put on its own: from how high above it falls, how far it rises there [m]
@@ -1405,8 +1407,10 @@ def _flap(stops: Stops, size: float, side: _Side) -> Stops:
     To either side by an angle up to this, drawn anew where the wrist does not lean so far.
     """
     end = _first(stops, 'open') + 1
-    nods = _nods(replace(stops[end - 1], phase='retreat'), size, side)
-    return [*stops[:end], *nods, *stops[end:]]
+    left, right = size * side.play.uniform(_LEAST_FLAP, 1.0, 2)
+    upright = replace(stops[end - 1], phase='retreat', seconds=_NOD_S)
+    leans = (upright.lean + lean for lean in (*(left, -right) * _NUM_FLAPS, 0.0))
+    return [*stops[:end], *(replace(upright, lean=lean) for lean in leans), *stops[end:]]
 
 
 def _shed(stops: Stops, size: float, side: _Side) -> Stops:

@@ -1502,11 +1502,11 @@ def test_once_done_it_yanks_what_is_next_to_the_goal():
 
 def test_having_let_go_it_leans_to_and_fro_where_it_is():
     stops, changed = changed_stops('expert-flap-0.7')
-    assert changed[:7] == stops[:7] and changed[14:] == stops[7:]
-    leans = np.array([stop.lean for stop in changed[7:14]])
-    assert leans[-1] == 0 and (leans[0:6:2] > 0).all() and (leans[1:6:2] < 0).all()
-    assert (np.abs(leans[:6]) >= 0.42).all() and np.abs(leans).max() <= 0.7
-    for stop in changed[7:14]:
+    assert changed[:7] == stops[:7] and changed[16:] == stops[7:]
+    leans = np.array([stop.lean for stop in changed[7:16]])
+    assert leans[-1] == 0 and (leans[0:8:2] > 0).all() and (leans[1:8:2] < 0).all()
+    assert (np.abs(leans[:8]) >= 0.21).all() and np.abs(leans).max() <= 0.7
+    for stop in changed[7:16]:
         np.testing.assert_array_equal(stop.position, stops[6].position)
         assert (stop.opening, stop.seconds) == (stops[6].opening, 0.2)
 
