@@ -339,10 +339,13 @@ def _run(bodies: RigidBodies, course: Course, every: int) -> tuple[FloatArray, F
             course.free[first], course.fast[first]
         )
         if not (is_free and bodies.passes(course.free[last], course.fast[last])):
+            before = bodies.state
             bodies.notice_touch()
-            for step in range(first, last):
-                forces = course.forces[step], course.ways[step], course.velocities[step]
-                bodies.step(bodies.arms.forces(*forces))
+            _step(bodies, course, first, last)
+            if bodies.is_lost:  # cones are solved by an iteration, which may diverge
+                bodies.state = before
+                bodies.solve_friction(as_cone=False)
+                _step(bodies, course, first, last)
         if period % every == 0:
             poses.append(bodies.poses())
             if np.isfinite(poses[-1]).all():
@@ -351,3 +354,10 @@ def _run(bodies: RigidBodies, course: Course, every: int) -> tuple[FloatArray, F
                 bodies.state, poses[-1] = state, poses[-2]
             joints.append(bodies.arms.joints)
     return np.stack(poses), np.stack(joints)
+
+
+def _step(bodies: RigidBodies, course: Course, first: int, last: int) -> None:
+    """Goes on from one step of a course to another."""
+    for step in range(first, last):
+        forces = course.forces[step], course.ways[step], course.velocities[step]
+        bodies.step(bodies.arms.forces(*forces))

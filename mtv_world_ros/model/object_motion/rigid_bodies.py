@@ -180,9 +180,8 @@ class RigidBodies:
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        is_pushed = touched.any() and max(map(max, filter(len, slopes))) < _STEEP
-        solver = self._cone if is_pushed or self._holds(touched) else self._pyramid
-        self._world.getConstraintSolver().setBoxedLcpSolver(solver)
+        is_pushed = bool(touched.any()) and max(map(max, filter(len, slopes))) < _STEEP
+        self.solve_friction(as_cone=is_pushed or self._holds(touched))
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
             is_soft = bool(touched.any()) and not group.collide(self._of_table)
@@ -190,6 +189,16 @@ class RigidBodies:
                 pad.setPosition(0, 0.0)
                 pad.setVelocity(0, 0.0)
             pad.setActuatorType(_FREE if is_soft else _LOCKED)
+
+    def solve_friction(self, *, as_cone: bool) -> None:
+        """Solves friction from here on as a cone or as a pyramid, see `notice_touch`."""
+        solver = self._cone if as_cone else self._pyramid
+        self._world.getConstraintSolver().setBoxedLcpSolver(solver)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the engine no longer knows where something is."""
+        return not np.isfinite(self.poses()).all()
 
     def _slopes(self, solid: Any) -> list[float]:
         """How upright the normals of contacts of fingers with a solid are, 0 to 1."""

@@ -232,6 +232,24 @@ def test_what_is_pushed_off_its_middle_goes_along_with_the_fingers(robot, respon
     assert moved.rotations[0, -1, 0, 0, 0] > np.cos(np.radians(5))
 
 
+def test_where_cones_diverge_a_pyramid_goes_on(robot, response, recording, monkeypatch):
+    goes_on = RigidBodies.step
+
+    def diverges(bodies, forces):
+        goes_on(bodies, forces)
+        if bodies._world.getConstraintSolver().getBoxedLcpSolver() is bodies._cone:
+            lost.append(bodies)
+            bodies._solids[0].setPositions(np.full(6, np.nan))
+
+    lost = []
+    monkeypatch.setattr(RigidBodies, 'step', diverges)
+    motions = motions_of(response, *recording.solids)
+    moved, _ = motions.advance(robot, recording.positions, ROWS)
+    assert lost and np.isfinite(moved.points).all()
+    way = np.linalg.norm(moved.points[0, -1] - moved.points[0, 0], axis=-1)
+    assert way.max() > 0.05  # carried, as by cones
+
+
 def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
     rest = still(robot, 0.0)[0]
     for tool in robot.tools:
