@@ -180,7 +180,7 @@ class RigidBodies:
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        is_pushed = bool(touched.any()) and max(map(max, filter(len, slopes))) < _STEEP
+        is_pushed = max(chain.from_iterable(slopes), default=1.0) < _STEEP
         self.solve_friction(as_cone=is_pushed or self._holds(touched))
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):

@@ -1390,14 +1390,9 @@ def _rattle(stops: Stops, size: float, side: _Side) -> Stops:
     In another direction, drawn anew, where the arm does not reach so far; what it put there where
     its arm is near no other.
     """
-    end, close = _first(stops, 'retreat') + 1, stops[_first(stops, 'close')]
-    retreat = stops[end - 1]
-    at = _next_to_goal(stops, side, stops[end - 2].position)
-    over = replace(retreat, position=np.array([*at[:2], retreat.position[2]]))
-    down = replace(over, position=at)
-    shut = replace(down, opening=0.0, seconds=close.seconds)
+    end, over, down, shut = _closed_next_to_goal(stops, side)
     shakes = _to_and_fro(replace(shut, seconds=_RATTLE_S), size * _drawn_way(side), _NUM_RATTLES)
-    opened = replace(down, seconds=close.seconds)
+    opened = replace(down, seconds=shut.seconds)
     return [*stops[:end], over, down, shut, *shakes, opened, over, *stops[end:]]
 
 
@@ -1434,16 +1429,21 @@ def _yank(stops: Stops, size: float, side: _Side) -> Stops:
     In another direction, drawn anew, where the arm does not reach so far; what it put there where
     its arm is near no other.
     """
+    end, over, down, shut = _closed_next_to_goal(stops, side)
+    way = size * _drawn_way(side)
+    pulled = replace(shut, seconds=_YANK_S).moved(way)
+    opened = replace(pulled, opening=1.0, seconds=shut.seconds)
+    return [*stops[:end], over, down, shut, pulled, opened, over.moved(way), *stops[end:]]
+
+
+def _closed_next_to_goal(stops: Stops, side: _Side) -> tuple[int, WayPoint, WayPoint, WayPoint]:
+    """How many way points are done by then, and those over, at and closed on `_next_to_goal`."""
     end, close = _first(stops, 'retreat') + 1, stops[_first(stops, 'close')]
     retreat = stops[end - 1]
     at = _next_to_goal(stops, side, stops[end - 2].position)
     over = replace(retreat, position=np.array([*at[:2], retreat.position[2]]))
     down = replace(over, position=at)
-    shut = replace(down, opening=0.0, seconds=close.seconds)
-    way = size * _drawn_way(side)
-    pulled = replace(shut, seconds=_YANK_S).moved(way)
-    opened = replace(pulled, opening=1.0, seconds=close.seconds)
-    return [*stops[:end], over, down, shut, pulled, opened, over.moved(way), *stops[end:]]
+    return end, over, down, replace(down, opening=0.0, seconds=close.seconds)
 
 
 def _heap(stops: Stops, size: float, side: _Side) -> Stops:
