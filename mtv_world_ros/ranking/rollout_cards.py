@@ -17,7 +17,7 @@ from mtv_world_ros.ranking.optimism import name_of
 from mtv_world_ros.ranking.rollout_jobs import Course, Judged, Result
 from mtv_world_ros.ranking.run_jobs import FOLDER
 
-_VERDICTS = ('false success', 'false failure', 'right', 'abstains')
+_VERDICTS = ('false success', 'false failure', 'right', 'no verdict')
 _PARTS = ('commands', 'objects', 'nothing')
 #: of the curves [px]
 _WIDTH, _HEIGHT = 320, 64
@@ -106,7 +106,7 @@ def verdict(result: Result) -> str:
     """Returns what the imagined verdict is: right, a false success or failure, or none."""
     said = result.imagined.success
     if not isfinite(said):
-        return 'abstains'
+        return 'no verdict'
     return 'right' if said == result.final else f'false {_word(bool(said))}'
 
 

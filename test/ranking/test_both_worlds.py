@@ -11,7 +11,7 @@ from mtv_world_ros.evaluation.video import decode_video
 from mtv_world_ros.ranking.both_worlds import command_gaps, first_apart, object_overlaps
 from mtv_world_ros.ranking.ranking_report import write_ranking
 from mtv_world_ros.ranking.ranking_summary import Summary
-from mtv_world_ros.ranking.rollout_cards import curves, when_they_part, worst_first
+from mtv_world_ros.ranking.rollout_cards import curves, verdict, when_they_part, worst_first
 from mtv_world_ros.ranking.rollout_jobs import Course, make_jobs, Result
 from mtv_world_ros.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.ranking.run_jobs import Checkpoint, read_results, run_jobs
@@ -160,6 +160,12 @@ def test_a_course_survives_its_file_and_old_results_have_none(make_result):
     np.testing.assert_equal(back, course)
     assert Result.from_json({k: v for k, v in values.items() if k != 'course'}).course is None
     assert 'they part at 0.4 s' in curves(course)
+
+
+def test_an_open_verdict_is_none_though_the_estimate_says_something(make_result):
+    for said in (0.6, NAN):
+        assert verdict(make_result('a', 0, True, said)) == 'no verdict'
+    assert verdict(make_result('a', 0, False, 0.8)) == 'false success'
 
 
 def test_the_page_plays_and_filters_rollouts_in_a_browser(ranked, tmp_path):

@@ -29,7 +29,7 @@ _PICKED_BUDGET = 6_000_000
 _PICKED_TILE, _TILE = 320, 192
 _BINS = ('0 to .2', '.2 to .4', '.4 to .6', '.6 to .8', '.8 to 1')
 _UNKNOWN = 'not scored'
-_ESTIMATES = ('right', 'wrong', 'abstains')
+_ESTIMATES = ('right', 'wrong', 'no verdict')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,7 +142,7 @@ def _estimate(result: EpisodeResult) -> str:
     """Whether the success estimate is right; empty where the outcome is not known."""
     said = verdict(result.probability)
     if not isfinite(said):
-        return 'abstains'
+        return 'no verdict'
     if result.outcome not in ('success', 'failure'):
         return ''
     return 'right' if said == (result.outcome == 'success') else 'wrong'

@@ -437,6 +437,8 @@ def save_network(
 ) -> None:
     """Writes a network into a folder; one that was there stays until the new one is complete.
 
+    Settings of rigid bodies, which no network is trained with, stay.
+
     Args:
         network: trained.
         folder: of it.
@@ -448,6 +450,8 @@ def save_network(
         write_json(partial / _CONFIG, network.config)
         if response is not None:
             write_json(partial / _RESPONSE, response.as_json())
+        if (folder / CONTACT_FILE).exists():
+            shutil.copyfile(folder / CONTACT_FILE, partial / CONTACT_FILE)
 
 
 def load_network(folder: Path) -> ObjectMotionNetwork:

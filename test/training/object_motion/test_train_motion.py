@@ -23,7 +23,13 @@ from mtv_world_ros.model.object_motion.network import (
     ObjectMotionNetwork,
     Truth,
 )
-from mtv_world_ros.model.object_motion.predictor import load_network, load_predictor, save_network
+from mtv_world_ros.model.object_motion.predictor import (
+    load_contact,
+    load_network,
+    load_predictor,
+    save_contact,
+    save_network,
+)
 from mtv_world_ros.sim.collect.collect_dataset import collect
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import RecordConfig
@@ -184,7 +190,11 @@ def test_training_goes_on_from_networks_and_replaces_none_unasked(
     assert len(load_predictor(two / 'object_motion', robot).members) == 2
     assert main(again) == 1
     assert "two/object_motion' exists; give another --out" in capsys.readouterr().err
+    contact = load_contact(share_path('resource', 'checkpoint', 'object_motion'))
+    assert contact is not None
+    save_contact(contact, two / 'object_motion')
     assert main([*again, '--overwrite']) == 0
+    assert load_contact(two / 'object_motion') == contact
     assert main([*train, '--out', str(tmp_path / 'new'), '--device', 'gpu']) == 1
     assert "device 'gpu' is not known" in capsys.readouterr().err
     assert main([*train, '--out', str(tmp_path / 'new'), '--init', str(tmp_path)]) == 1
