@@ -12,7 +12,8 @@ from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
-from mtv_world_ros.sim.expert.way_points import Pull, pushed, WayPoint, WayPointFaults
+from mtv_world_ros.sim.expert.faulty_way_points import pushed, WayPointFaults
+from mtv_world_ros.sim.expert.way_points import Pull, WayPoint
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.sim.world.placement import side_of
@@ -466,15 +467,9 @@ class Expert:
 
         It goes a share of the way, or as much of it as it reaches, and is there just then.
         """
-        met, home = [s.phase for s in stops].index(phase), self.workcell.home_tools[other]
-
-        def ways(share: float) -> list[WayPoint]:
-            near = WayPoint('above', home + share * (stops[met].position - home), 0.0, 1.0)
-            return [near, replace(near, seconds=_STAYS_S), self._rests(other)]
-
-        rows, done = self._as_far_as_it_reaches(other, ways, share, pace)
+        met = [s.phase for s in stops].index(phase)
         arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
-        return rows, self._late(arrives - self._timed(done, home)[0], pace)
+        return self._visit(other, stops[met].position, share, pace, arrives=arrives)
 
     def _poach(
         self,
@@ -641,24 +636,39 @@ class Expert:
         It goes a share of the way there, or as much of it as it reaches, is there as this one has
         closed, and stays until that is over its goal.
         """
-        phases, home = [s.phase for s in stops], self._rests(other)
+        phases = [s.phase for s in stops]
         closed = phases.index('close')
         over = max(phases.index('open') - 2, closed)
         middle = (stops[closed].position + stops[over].position) / 2
         times = self._timed(stops, self.workcell.home_tools[arm])
         stays = max(sum(times[closed + 1 : over + 1]), _STAYS_S)
+        arrives = sum(times[: closed + 1])
+        return self._visit(other, middle, share, pace, arrives=arrives, stays=stays, opening=0.0)
+
+    def _visit(
+        self,
+        arm: str,
+        place: FloatArray,
+        share: float,
+        pace: tuple[float, float],
+        *,
+        arrives: float,
+        stays: float = _STAYS_S,
+        opening: float = 1.0,
+    ) -> tuple[FloatArray, int]:
+        """Rows of an arm that goes to a place (3,) and back, and how late they begin.
+
+        It goes a share of the way, or as much of it as it reaches, arrives at a time before
+        scaling [s], and stays there so long [s].
+        """
+        home = self._rests(arm)
 
         def ways(share: float) -> list[WayPoint]:
-            near = replace(
-                home,
-                phase='above',
-                position=home.position + share * (middle - home.position),
-                opening=0.0,
-            )
+            there = home.position + share * (place - home.position)
+            near = replace(home, phase='above', position=there, opening=opening)
             return [near, replace(near, seconds=stays), home]
 
-        rows, done = self._as_far_as_it_reaches(other, ways, share, pace)
-        arrives = sum(times[: closed + 1])
+        rows, done = self._as_far_as_it_reaches(arm, ways, share, pace)
         return rows, self._late(arrives - self._timed(done, home.position)[0], pace)
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:

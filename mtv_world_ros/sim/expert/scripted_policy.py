@@ -11,8 +11,9 @@ from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import parse_variant, PolicyVariant, with_faults
-from mtv_world_ros.sim.expert.way_points import WayPointFaults
+from mtv_world_ros.sim.expert.faults import parse_variant, PolicyVariant
+from mtv_world_ros.sim.expert.faulty_commands import with_faults
+from mtv_world_ros.sim.expert.faulty_way_points import WayPointFaults
 from mtv_world_ros.sim.shapes import SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, START, Task, task_named
 from mtv_world_ros.sim.world.placement import goals_of

@@ -23,10 +23,11 @@ from mtv_world_ros.sim.expert.faults import (
     PolicyVariant,
     refuse_kinds,
     SPLITS,
-    with_faults,
 )
+from mtv_world_ros.sim.expert.faulty_commands import with_faults
+from mtv_world_ros.sim.expert.faulty_way_points import WayPointFaults
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
-from mtv_world_ros.sim.expert.way_points import WayPoint, WayPointFaults
+from mtv_world_ros.sim.expert.way_points import WayPoint
 
 SEED, TASK = 4, 'place_block_a2b_left'
 
