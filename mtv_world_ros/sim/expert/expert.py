@@ -528,9 +528,8 @@ class Expert:
             left = replace(opened, seconds=None).moved(rise)
             return [down.moved(rise), down, shut, pulled, opened, left, self._rests(other)]
 
-        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
-        return rows, self._late(arrives - sum(self._timed(done[:3], home)), pace)
+        return self._in_time(other, ways, 1.0, pace, arrives, 3)
 
     def _squeeze(
         self,
@@ -583,9 +582,8 @@ class Expert:
             _, back, hit, _ = pushed(replace(at, seconds=None), size, _rise(0.0), to)
             return [back, replace(hit, seconds=_SLAP_S), home]
 
-        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
         arrives = sum(self._timed(stops[: over + 1], self._rests(arm).position))
-        return rows, self._late(arrives - self._timed(done, home.position)[0], pace)
+        return self._in_time(other, ways, 1.0, pace, arrives)
 
     def _roam(self, other: str, places: list[FloatArray], pace: tuple[float, float]) -> FloatArray:
         """Rows of another arm that roams through places, low and open, as far as it reaches."""
@@ -668,8 +666,24 @@ class Expert:
             near = replace(home, phase='above', position=there, opening=opening)
             return [near, replace(near, seconds=stays), home]
 
+        return self._in_time(arm, ways, share, pace, arrives)
+
+    def _in_time(
+        self,
+        arm: str,
+        ways: Callable[[float], list[WayPoint]],
+        share: float,
+        pace: tuple[float, float],
+        arrives: float,
+        num: int = 1,
+    ) -> tuple[FloatArray, int]:
+        """Rows of `_as_far_as_it_reaches`, and how late they begin.
+
+        So late that the first `num` of its way points are done at a time before scaling [s].
+        """
         rows, done = self._as_far_as_it_reaches(arm, ways, share, pace)
-        return rows, self._late(arrives - self._timed(done, home.position)[0], pace)
+        takes = sum(self._timed(done[:num], self.workcell.home_tools[arm]))
+        return rows, self._late(arrives - takes, pace)
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
         """Rows before something begins, of a time before scaling [s]; none if it is too late."""

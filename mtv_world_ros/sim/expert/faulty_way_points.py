@@ -1168,10 +1168,12 @@ def _nod(stops: Stops, size: float, side: _Side) -> Stops:
     return [*stops[:first], *_nods(grasp, size, side), *stops[first:]]
 
 
-def _nods(stop: WayPoint, size: float, side: _Side) -> Stops:
+def _nods(
+    stop: WayPoint, size: float, side: _Side, num: int = _NUM_NODS, least: float = _LEAST_NOD
+) -> Stops:
     """Leaning to either side of a way point, by angles up to this, drawn, and back to it."""
-    left, right = size * side.play.uniform(_LEAST_NOD, 1.0, 2)
-    leans = (stop.lean + lean for lean in (*(left, -right) * _NUM_NODS, 0.0))
+    left, right = size * side.play.uniform(least, 1.0, 2)
+    leans = (stop.lean + lean for lean in (*(left, -right) * num, 0.0))
     return [replace(stop, lean=lean, seconds=_NOD_S) for lean in leans]
 
 
@@ -1358,10 +1360,9 @@ def _flap(stops: Stops, size: float, side: _Side) -> Stops:
     To either side by an angle up to this, drawn anew where the wrist does not lean so far.
     """
     end = _first(stops, 'open') + 1
-    left, right = size * side.play.uniform(_LEAST_FLAP, 1.0, 2)
-    upright = replace(stops[end - 1], phase='retreat', seconds=_NOD_S)
-    leans = (upright.lean + lean for lean in (*(left, -right) * _NUM_FLAPS, 0.0))
-    return [*stops[:end], *(replace(upright, lean=lean) for lean in leans), *stops[end:]]
+    upright = replace(stops[end - 1], phase='retreat')
+    leans = _nods(upright, size, side, _NUM_FLAPS, _LEAST_FLAP)
+    return [*stops[:end], *leans, *stops[end:]]
 
 
 def _shed(stops: Stops, size: float, side: _Side) -> Stops:
