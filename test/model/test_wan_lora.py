@@ -1,4 +1,4 @@
-"""LoRA adapters: trained, saved with what goes beside them, merged, exchanged, foreign ones."""
+"""LoRA adapters: trained, saved with what goes beside them, merged, exchanged."""
 
 from __future__ import annotations
 
@@ -8,41 +8,13 @@ import pytest
 from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
-from wan_files import CLIP_DIM, DIM, FFN, TEXT_DIM, TRANSFORMER
+from wan_files import DIM
+from wan_lora import build, RANK, run
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.lora import ADAPTER, Adapters, add_adapter, save_adapter
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.training_config import load_training_config
-
-RANK = 4
-
-
-def build(seed: int = 0, **changes: object) -> MultiViewWanTransformer:
-    torch.manual_seed(seed)
-    model = MultiViewWanTransformer(**{**TRANSFORMER, **changes}).eval()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-    return model
-
-
-def run(model: MultiViewWanTransformer) -> Tensor:
-    generator = torch.Generator().manual_seed(1)
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(shape, generator=generator).to(model.dtype)
-
-    with torch.inference_mode():
-        return model(
-            random(1, 2, 16, 2, 4, 4),
-            torch.tensor([500.0]),
-            control=random(1, 2, 16, 2, 4, 4),
-            start=random(1, 2, 16, 2, 4, 4),
-            reference=random(1, 2, 16, 4, 4),
-            encoder_hidden_states=random(1, 512, TEXT_DIM),
-            encoder_hidden_states_image=random(1, 2 * 257, CLIP_DIM),
-        )
 
 
 def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:
@@ -153,82 +125,6 @@ def test_the_number_format_of_the_model_stays(tmp_path: Path) -> None:
     Adapters(model).use(tmp_path / 'a')
     assert {parameter.dtype for parameter in model.parameters()} == {torch.bfloat16}
     assert torch.isfinite(run(model)).all()
-
-
-#: module names: in Wan's files, in diffusers' class, inputs, outputs
-MODULES = (
-    ('blocks.0.self_attn.q', 'blocks.0.attn1.to_q', DIM, DIM),
-    ('blocks.1.cross_attn.o', 'blocks.1.attn2.to_out.0', DIM, DIM),
-    ('blocks.1.cross_attn.k_img', 'blocks.1.attn2.add_k_proj', DIM, DIM),
-    ('blocks.0.ffn.0', 'blocks.0.ffn.net.0.proj', DIM, FFN),
-    ('blocks.1.ffn.2', 'blocks.1.ffn.net.2', FFN, DIM),
-    ('head.head', 'proj_out', DIM, 64),
-)
-
-
-def factors(scale: float = 1.0) -> dict[str, tuple[Tensor, Tensor]]:
-    generator = torch.Generator().manual_seed(7)
-
-    def random(*shape: int) -> Tensor:
-        return scale * torch.randn(shape, generator=generator)
-
-    return {name: (random(RANK, i), random(o, RANK)) for name, _, i, o in MODULES}
-
-
-def diffsynth(pairs: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    keys = {}
-    for name, (a, b) in pairs.items():
-        keys |= {f'{name}.lora_A.default.weight': a, f'{name}.lora_B.default.weight': b}
-    return keys
-
-
-def videox(pairs: dict[str, tuple[Tensor, Tensor]], alpha: float) -> dict[str, Tensor]:
-    keys = {}
-    for name, (a, b) in pairs.items():
-        flat = f'lora_unet__{name.replace(".", "_")}'
-        keys |= {f'{flat}.lora_down.weight': a, f'{flat}.lora_up.weight': b}
-        keys[f'{flat}.alpha'] = torch.tensor(alpha)
-    return keys
-
-
-@pytest.mark.parametrize('layout', ['diffsynth', 'prefixed', 'videox'])
-def test_loras_of_others_add_their_product_to_the_weights(tmp_path: Path, layout: str) -> None:
-    pairs = factors(0.2)
-    keys = {
-        'diffsynth': diffsynth(pairs),
-        'prefixed': {f'diffusion_model.{k}': v for k, v in diffsynth(pairs).items()},
-        'videox': videox(pairs, alpha=2.0),
-    }[layout]
-    save_file(keys, tmp_path / 'lora.safetensors')
-    expected = build()
-    scale = 2.0 / RANK if layout == 'videox' else 1.0
-    with torch.no_grad():
-        for name, ours, *_ in MODULES:
-            a, b = pairs[name]
-            expected.get_parameter(f'{ours}.weight').add_(scale * b @ a)
-    model = build()
-    before = run(model)
-    Adapters(model).use(tmp_path / 'lora.safetensors')
-    torch.testing.assert_close(run(model), run(expected), rtol=0, atol=1e-4)
-    assert not torch.allclose(run(model), before, atol=1e-2)
-
-
-@pytest.mark.parametrize(
-    ('key', 'value', 'message'),
-    [
-        ('blocks.7.self_attn.q.lora_A.weight', torch.zeros(4, DIM), r"'blocks\.7\..* is no layer"),
-        ('blocks.0.self_attn.k.lora_A.weight', torch.zeros(4, DIM), 'one of its two factors'),
-        ('blocks.0.self_attn.q.lora_B.default.weight', torch.zeros(99, 4), 'for another size'),
-        ('lora_te_encoder.lora_down.bias', torch.zeros(4), 'it is for a text encoder'),
-        ('blocks.0.self_attn.q.diff_b', torch.zeros(DIM), 'whole differences'),
-    ],
-)
-def test_a_lora_of_another_model_is_refused(
-    tmp_path: Path, key: str, value: Tensor, message: str
-) -> None:
-    save_file({**diffsynth(factors()), key: value}, tmp_path / 'lora.safetensors')
-    with pytest.raises(CheckpointError, match=message):
-        Adapters(build()).use(tmp_path / 'lora.safetensors')
 
 
 def test_adapters_of_another_transformer_and_pickles_are_refused(tmp_path: Path) -> None:

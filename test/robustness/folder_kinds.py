@@ -242,7 +242,7 @@ def make_lora(folder: Path) -> None:
 
 
 def _read_lora(folder: Path) -> Any:
-    from mtv_world_ros.model.lora import read_lora
+    from mtv_world_ros.model.lora_file import read_lora
 
     return read_lora(folder / 'adapter.safetensors', _layers())
 

@@ -1,0 +1,252 @@
+"""A LoRA file, in the layouts that people share, read as factors of a transformer's layers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from math import isfinite, sqrt
+from pathlib import Path
+import re
+from typing import Any, NamedTuple
+
+from pydantic import Field
+from safetensors import safe_open, SafetensorError
+from torch import nn, Tensor
+
+from mtv_world_ros.bounded_input import parse_json, read_json
+from mtv_world_ros.config import Count, Schema, validated
+from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
+from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
+from mtv_world_ros.model.wan_keys import transformer_keys
+
+#: diffusers' key for peft's configuration in a file; peft's own file for it, and its prefix
+METADATA = 'lora_adapter_metadata'
+PEFT_CONFIG = 'adapter_config.json'
+_PEFT_PREFIX = 'base_model.model.'
+#: what files put before module names: peft, DiffSynth-Studio, ComfyUI, diffusers, Kohya (with
+#: another `_`: VideoX-Fun), LyCORIS, OneTrainer
+_PREFIX = re.compile(
+    r'(base_model\.model\.)?'
+    r'(pipe\.dit\.|(model\.)?diffusion_model\.|transformer\.|lora_unet__?|lycoris_'
+    r'|lora_transformer_)?'
+)
+_KEY = re.compile(r'(.+?)[._](lora_A|lora_B|lora[._]down|lora[._]up|alpha)(\.default)?(\.weight)?')
+_PART = {'lora_A': 'A', 'lora_down': 'A', 'lora_B': 'B', 'lora_up': 'B', 'alpha': 'alpha'}
+#: tensors that are not read, and why
+_REFUSED = {
+    r'(lora_te|text_encoder).*': 'it is for a text encoder',
+    r'transformer_2\..*': "it is for Wan 2.2's second transformer",
+    r'.*\.(lora_magnitude_vector|dora_scale)\b.*': 'DoRA scales whole weights, which is not read',
+    r'.*\.(hada|lokr|oft|lora_mid)_?.*': 'LoHa, LoKr, OFT and convolutions are not read',
+    r'.*\.(diff|diff_b|diff_m|set_weight)': 'whole differences (.diff, .diff_b) are not read: '
+    'bake them into the weights',
+    r'.*\.bias': 'changes of biases are not read',
+}
+#: peft's settings that change nothing once an adapter is trained
+_WITHOUT_EFFECT = {
+    'auto_mapping', 'base_model_name_or_path', 'corda_config', 'ensure_weight_tying', 'eva_config',
+    'exclude_modules', 'fan_in_fan_out', 'inference_mode', 'layers_pattern', 'layers_to_transform',
+    'loftq_config', 'lora_dropout', 'megatron_core', 'peft_version', 'qalora_group_size',
+    'revision', 'runtime_config', 'target_modules', 'task_type',
+}  # fmt: skip
+#: and those with a value that changes nothing
+_PLAIN = {
+    'peft_type': ('LORA',),
+    'bias': ('none',),
+    'init_lora_weights': (True, 'gaussian', 'orthogonal', 'eva'),
+}
+
+
+class Factors(NamedTuple):
+    """What a module's weight changes by: `scale * B @ A`; A (r, in), B (out, r)."""
+
+    A: Tensor
+    B: Tensor
+    scale: float
+
+
+class LoraSettings(Schema):
+    """How strongly the factors count, in peft's words.
+
+    Attributes:
+        r: rank where `rank_pattern` says no other.
+        lora_alpha: alpha where `alpha_pattern` says no other; None = the tensors say it.
+        rank_pattern: ranks by a regular expression for the end of a module's name.
+        alpha_pattern: alphas, likewise.
+        use_rslora: the product counts alpha / sqrt(r) in place of alpha / r.
+    """
+
+    r: Count
+    lora_alpha: float | None = None
+    rank_pattern: dict[str, Count] = Field(default_factory=dict)
+    alpha_pattern: dict[str, float] = Field(default_factory=dict)
+    use_rslora: bool = False
+
+    def scale(self, module: str, rank: int) -> float:
+        """Returns what the product of a module's factors is multiplied by.
+
+        Args:
+            module: its name in the file.
+            rank: of its factors.
+
+        Raises:
+            ConfigError: another rank than the settings say, or no alpha.
+        """
+        stated = _matching(self.rank_pattern, module, self.r)
+        if stated != rank:
+            raise ConfigError(f"'{module}' has rank {rank}, the settings say {stated}")
+        alpha = _matching(self.alpha_pattern, module, self.lora_alpha)
+        if alpha is None:
+            raise ConfigError(f"the settings have no lora_alpha for '{module}'")
+        return alpha / (sqrt(rank) if self.use_rslora else rank)
+
+
+def _matching(pattern: Mapping[str, Any], module: str, default: Any) -> Any:
+    """The value of the first pattern that fits, as peft takes it."""
+    try:
+        found = (v for key, v in pattern.items() if re.match(rf'(.*\.)?({key})$', module))
+        return next(found, default)
+    except re.error as error:
+        raise ConfigError(f'a pattern is no regular expression: {error}') from error
+
+
+def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
+    """Returns the factors by the name of the transformer's module.
+
+    Raises:
+        CheckpointError: a pickle, damaged, for another model, or with settings that are not read:
+            every tensor must find its place, and every setting count.
+    """
+    tensors, settings = _read(file)
+    modules = linear_modules(transformer)
+    names = _names(modules)
+    found: dict[str, Factors] = {}
+    for module, parts in _by_module(file, tensors).items():
+        if module not in names:
+            raise CheckpointError(
+                f"'{file}': '{module}' is no layer of this transformer{nearest(module, names)}; "
+                'the LoRA is for another model'
+            )
+        if names[module] in found:
+            raise CheckpointError(f"'{file}': layer '{module}' is there under two names")
+        found[names[module]] = _factors(file, module, parts, modules[names[module]], settings)
+    if not found:
+        raise CheckpointError(f"'{file}' has no tensors; expected the factors of a LoRA")
+    return found
+
+
+def linear_modules(transformer: nn.Module) -> dict[str, Any]:
+    """Returns the layers that a LoRA may change, by name, also where one is loaded already."""
+    found = {}
+    for name, module in transformer.named_modules():
+        layer = getattr(module, 'base_layer', module)
+        inside = '.base_layer' in name or '.lora_' in name
+        if isinstance(layer, nn.Linear) and not inside:
+            found[name] = layer
+    return found
+
+
+def _read(file: Path) -> tuple[dict[str, Tensor], LoraSettings | None]:
+    if file.suffix in PICKLES:
+        raise pickle_error([file])
+    try:
+        with safe_open(file, framework='pt') as handle:
+            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+            text = (handle.metadata() or {}).get(METADATA)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"LoRA '{file}' cannot be loaded: {error}") from error
+    where, config = f"'{file}': {METADATA}", None
+    try:
+        if text is not None:
+            config = parse_json(text, METADATA)
+        elif any(name.startswith(_PEFT_PREFIX) for name in tensors):
+            where = f"'{file.with_name(PEFT_CONFIG)}'"
+            config = read_json(file.with_name(PEFT_CONFIG))
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"'{file}' was saved by peft, without its {PEFT_CONFIG} beside it: how strongly it "
+            'counts stands there'
+        ) from error
+    except (OSError, ValueError, ConfigError) as error:
+        raise CheckpointError(f'{where} cannot be used: {error}') from error
+    return tensors, None if config is None else _settings(config, where)
+
+
+def _settings(config: Any, where: str) -> LoraSettings:
+    if not isinstance(config, dict):
+        raise CheckpointError(f'{where} must be a map of settings, got {config!r}')
+    bare = {str(key).removeprefix('transformer.'): value for key, value in config.items()}
+    for name, value in bare.items():
+        ignored = name in _WITHOUT_EFFECT or name in LoraSettings.model_fields
+        if value and not ignored and value not in _PLAIN.get(name, ()):
+            raise CheckpointError(
+                f'{where}: {name}={value!r} is not supported; merge the adapter with peft and '
+                'import the merged weights'
+            )
+    read = {k: v for k, v in bare.items() if k in LoraSettings.model_fields and v is not None}
+    return validated(LoraSettings, read, where, error=CheckpointError)
+
+
+def _by_module(file: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """The parts `A`, `B` and `alpha` of every module, by its name in the file without prefix."""
+    found: dict[str, dict[str, Tensor]] = defaultdict(dict)
+    for key, value in tensors.items():
+        why = next((f'; {why}' for mark, why in _REFUSED.items() if re.fullmatch(mark, key)), '')
+        match = _KEY.fullmatch(key)
+        if why or not match:
+            raise CheckpointError(f"'{file}': tensor '{key}' is no factor of a LoRA{why}")
+        part = _PART[match[2].replace('.', '_')]
+        module = _PREFIX.sub('', match[1], count=1)
+        if part in found[module]:
+            raise CheckpointError(f"'{file}': '{key}' is there under two names")
+        found[module][part] = value
+    return found
+
+
+def _names(modules: Mapping[str, Any]) -> dict[str, str]:
+    """Every name that files have for a module, flattened ones with `_` too, to ours."""
+    attention = [f'{kind}_attn.{n}' for kind in ('self', 'cross') for n in 'qkvo']
+    inner = [*attention, 'cross_attn.k_img', 'cross_attn.v_img', 'ffn.0', 'ffn.2']
+    numbers = {name.split('.')[1] for name in modules if name.startswith('blocks.')}
+    wan = [f'blocks.{number}.{name}' for number in numbers for name in inner]
+    wan += ['text_embedding.0', 'text_embedding.2', 'time_embedding.0', 'time_embedding.2']
+    wan += ['time_projection.1', 'img_emb.proj.1', 'img_emb.proj.3', 'head.head']
+    names = {name: name for name in modules}
+    for ours, take in transformer_keys([f'{name}.weight' for name in wan]).takes.items():
+        if ours.removesuffix('.weight') in modules:
+            names[take.source.removesuffix('.weight')] = ours.removesuffix('.weight')
+    return names | {name.replace('.', '_'): ours for name, ours in names.items()}
+
+
+def _factors(
+    file: Path,
+    module: str,
+    parts: Mapping[str, Tensor],
+    layer: nn.Linear,
+    settings: LoraSettings | None,
+) -> Factors:
+    if not {'A', 'B'} <= set(parts):
+        raise CheckpointError(f"'{file}': layer '{module}' has one of its two factors only")
+    a, b = parts['A'], parts['B']
+    if a.shape[1:] != (layer.in_features,) or b.shape != (layer.out_features, a.shape[0]):
+        raise CheckpointError(
+            f"'{file}': the factors of '{module}' are {list(b.shape)} x {list(a.shape)}, the "
+            f'layer is {layer.out_features} x {layer.in_features}: the LoRA is for another size'
+        )
+    if not (a.is_floating_point() and b.is_floating_point()):
+        raise CheckpointError(f"'{file}': the factors of '{module}' are {a.dtype}, not floats")
+    try:
+        return Factors(a, b, _scale(module, a.shape[0], parts.get('alpha'), settings))
+    except ConfigError as error:
+        raise CheckpointError(f"'{file}': {error}") from error
+
+
+def _scale(module: str, rank: int, alpha: Tensor | None, settings: LoraSettings | None) -> float:
+    """Alpha / rank; 1 where neither tensors nor settings say an alpha, as files of others mean."""
+    if alpha is None:
+        return 1.0 if settings is None else settings.scale(module, rank)
+    if settings is not None and settings.lora_alpha is not None:
+        raise ConfigError(f"'{module}' has an alpha of its own, and one in the settings")
+    if alpha.numel() != 1 or not isfinite(alpha.item()):
+        raise ConfigError(f"alpha of '{module}' must be one number, got {alpha.tolist()}")
+    return alpha.item() / rank
