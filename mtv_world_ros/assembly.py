@@ -270,8 +270,9 @@ def checkpoint_cameras(checkpoint: str | Path) -> Path:
         return share_path('config', 'cameras', f'{robot}.yaml')
     except ConfigError as error:
         raise CalibrationError(
-            f"checkpoint '{checkpoint}' has no default calibration: set 'calibration_file' to the "
-            f'calibration of the cameras ({error})'
+            f"checkpoint '{checkpoint}' has no default calibration (its episodes were recorded "
+            "with different ones): set 'calibration_file' (on commands, --calibration) to that of "
+            f"the cameras as they stand now, e.g. an episode's calibration.yaml ({error})"
         ) from error
 
 

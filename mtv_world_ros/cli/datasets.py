@@ -111,7 +111,13 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.files import write_whole
     from mtv_world_ros.geometry.robot.file import ROBOT_YAML
-    from mtv_world_ros.importing.bags import find_bags, import_bags, with_guessed_views
+    from mtv_world_ros.importing.bags import (
+        episode_name,
+        find_bags,
+        import_bags,
+        summary_line,
+        with_guessed_views,
+    )
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
     if arguments.action:
@@ -134,6 +140,9 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
     for view, row in mapping.views.items():
         print(f'view {view}: {mapping.topic(row.image)}')
+    for bag in summary.made:
+        place = arguments.out / episode_name(bag)
+        print(summary_line(place, objects=bool(arguments.segmenter)))
     for bag, lines in summary.warnings.items():
         for line in lines:
             print(f'{bag}: {line}', file=sys.stderr)

@@ -26,6 +26,8 @@ TF = '/tf'
 METADATA_NAME = 'mtv_world'
 #: key of the metadata that names the segmenter of the masks, where they are not the simulator's
 MASKS_BY = 'masks_by'
+#: key of the metadata that names the views whose camera's pose was not known at the import
+UNKNOWN_CAMERAS = 'unknown_cameras'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
 
@@ -198,6 +200,8 @@ class Episode:
         masks: object masks of the views that have them; None where there are none.
         instructions: (stamp [ns], text), by stamp.
         object_poses: None if not recorded.
+        unknown: what is not known of the cameras of some views (`pose`, or `pose and
+            intrinsics`), by view; `cameras` has a placeholder.
         camera_tracks: (N, 4, 4) T_mount_camera [m] at the images of each view whose camera moves
             against the robot's links; `cameras` has the first one.
         truncated: the recording is cut off.
@@ -214,6 +218,7 @@ class Episode:
     masks: Mapping[str, Track] | None
     instructions: list[tuple[int, str]]
     object_poses: ObjectPoses | None = None
+    unknown: Mapping[str, str] = field(default_factory=dict)
     camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     truncated: bool = False
     warnings: tuple[str, ...] = ()

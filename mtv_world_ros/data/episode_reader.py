@@ -50,7 +50,7 @@ from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, Tran
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.camera import scaled, with_camera_info
+from mtv_world_ros.geometry.camera import scaled, unknown_camera, with_camera_info
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
@@ -58,6 +58,8 @@ __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 Stamped = list[tuple[int, Any]]
 #: joints that a warning names at most
 _MOST_NAMES = 8
+#: intrinsics that differ by less of the focal length are the same
+_SAME_K = 0.005
 #: keys of a topic map that are not views, and the topics they stand for
 STREAMS = {
     'joint_states': JOINT_STATES,
@@ -99,8 +101,9 @@ def read_episode(
             `{'low': '/camera_low/color/image_raw'}`.
         mapping: what the topics of a robot's own bag are; `topics` goes before it.
         robot: its links may carry cameras whose poses are from TF; None = any frame may.
-        unknown_mount: link that carries cameras of which nothing but a CameraInfo is known, with
-            no pose in it; empty = they are an error.
+        unknown_mount: link that carries cameras whose pose is not known; they get a placeholder
+            (without a CameraInfo, for the intrinsics too) and are named in `Episode.unknown`;
+            empty = they are an error.
 
     Raises:
         EpisodeError: no bag, a view is missing, or none of its images can be used.
@@ -152,7 +155,9 @@ class _EpisodeReader:
     ) -> None:
         self.path, self.robot = path, robot
         self.mapping = mapping or BagMapping()
-        named = {**(mapping.streams() if mapping else {}), **named}
+        streams = mapping.streams() if mapping else {}
+        asked = {k: t for k, t in streams.items() if views is None or k in (*STREAMS, *views)}
+        named = {**asked, **named}
         self.bag = BagReader(path)
         self.warnings: list[str] = []
         found = self.bag.topics()
@@ -167,6 +172,7 @@ class _EpisodeReader:
         self.received: dict[str, Stamped] = {}
         self.refused: dict[str, list[str]] = {}
         self.tracks: dict[str, FloatArray] = {}
+        self.unknown: dict[str, str] = {}
         self.seen_ns = 0  # all views have an image from here on
 
     def read(
@@ -191,6 +197,7 @@ class _EpisodeReader:
             masks={view: track for view, track in masks.items() if track} or None,
             instructions=instructions,
             object_poses=self._object_poses(len(episode_info.objects)),
+            unknown=self.unknown,
             camera_tracks=self.tracks,
             truncated=bool(self.bag.truncated),
             warnings=self._all_warnings(),
@@ -399,20 +406,24 @@ class _EpisodeReader:
                 raise CalibrationError(
                     f"'{file}' is not there: an episode needs the cameras' poses; put a "
                     f'{CALIBRATION_FILE} into its folder or name one in `calibration` (the bag '
-                    'has no /tf_static either)'
+                    f'has no /tf_static either); {_estimate(self.path, next(iter(images)))}'
                 )
         known = load_calibration(file) if tree is None else {}
         cameras = {}
         for view, names in self.topics.views.items():
             if tree is not None:
                 known[view] = self._from_tree(tree, view, names, unknown_mount, images[view])
-            if view not in known:
+            elif view not in known and unknown_mount:
+                known[view] = self._placeholder(view, names, unknown_mount, images[view])
+            elif view not in known:
                 raise CalibrationError(
-                    f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}"
+                    f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}; "
+                    f'{_estimate(self.path, view)}'
                 )
-            elif tree is None and not calibration:
+            elif not calibration:
                 known[view] = self._moving(known[view], images[view])
-            camera = self._with_intrinsics(known[view], view, names)
+            is_given = tree is None and view not in self.unknown
+            camera = self._with_intrinsics(known[view], view, names, is_given=is_given)
             height, width = images[view].frames[0].shape[:2]
             cameras[view] = scaled(camera, width, height)
         return cameras
@@ -445,10 +456,12 @@ class _EpisodeReader:
         """The camera's pose by TF; its intrinsics come from CameraInfo."""
         topic = self._camera_info(view, names)
         infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
+        if not infos and unknown_mount:
+            return self._placeholder(view, names, unknown_mount, images)
         if not infos:
             raise CalibrationError(
                 f"'{self.path}', view '{view}': '{topic}' has no CameraInfo, which intrinsics "
-                'come from where there is no calibration file'
+                f'come from where there is no calibration file; {_estimate(self.path, view)}'
             )
         of_images = self.received[names.image][0][1][1].header.frame_id
         of_info = infos[0].header.frame_id
@@ -462,6 +475,7 @@ class _EpisodeReader:
         links = () if self.robot is None else self.robot.posed_links
         if unknown_mount and tree.name(frame) not in tree.frames:
             mount = Mount(unknown_mount, np.eye(4), None)
+            self.unknown[view] = 'pose'
         elif tree.is_moving(frame, links):
             found = pose_track(self._tf(), frame, links, images.stamps_ns, self.mapping.tf_prefix)
             mount = Mount(found.link, found.T_link_frame[0], None)
@@ -481,12 +495,22 @@ class _EpisodeReader:
             T_mount_camera=mount.T_link_frame,
         )
 
+    def _placeholder(self, view: str, names: ViewTopics, mount: str, images: Track) -> CameraModel:
+        """A camera of which nothing is known but, perhaps, a CameraInfo."""
+        informed = bool(self._take(self._camera_info(view, names), messages.CAMERA_INFO))
+        self.unknown[view] = 'pose' if informed else 'pose and intrinsics'
+        height, width = images.frames[0].shape[:2]
+        return unknown_camera(view, width, height, mount)
+
     def _camera_info(self, view: str, names: ViewTopics) -> str:
         row = self.mapping.views.get(view)
         given = row.camera_info if row else ''
         return self.mapping.topic(given) if given else names.camera_info
 
-    def _with_intrinsics(self, camera: CameraModel, view: str, names: ViewTopics) -> CameraModel:
+    def _with_intrinsics(
+        self, camera: CameraModel, view: str, names: ViewTopics, *, is_given: bool
+    ) -> CameraModel:
+        """The camera with the intrinsics of CameraInfo, where a file has not given others."""
         topic = self._camera_info(view, names)
         infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
         if not infos:
@@ -501,7 +525,7 @@ class _EpisodeReader:
                     f'{_intrinsics(info)}; cut the episode there'
                 )
         width, height, k, model, distortion = first
-        return with_camera_info(
+        informed = with_camera_info(
             camera,
             width=width,
             height=height,
@@ -509,6 +533,15 @@ class _EpisodeReader:
             distortion_model=model,
             distortion=distortion,
         )
+        given = scaled(camera, width, height)
+        apart = np.abs(given.K - informed.K)[:2] / informed.K[0, 0]
+        if not is_given or apart.max() < _SAME_K:
+            return informed
+        self._warn_once(
+            f"view '{view}': the calibration file has fx, fy, cx, cy = {_four(given.K)} px, "
+            f"CameraInfo {_four(informed.K)} px; the file's are used"
+        )
+        return given
 
     def _refuse(self, topic: str, error: MtvWorldError) -> None:
         self.refused.setdefault(topic, []).append(str(error))
@@ -529,6 +562,18 @@ class _EpisodeReader:
 def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInfo:
     values = {**bag.custom_data, **bag.metadata.get(METADATA_NAME, {})}
     return parse_info(bag.path, values, default_instruction=next((t for _, t in instructions), ''))
+
+
+def _estimate(path: Path, view: str) -> str:
+    """What to do about a camera of unknown pose."""
+    return (
+        f'estimate it from the recording: mtv-world calibrate-camera {path} --view {view} '
+        '--no-guess'
+    )
+
+
+def _four(K: FloatArray) -> str:
+    return ', '.join(f'{v:.1f}' for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
 def _intrinsics(info: Any) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...]]:

@@ -14,7 +14,7 @@ import yaml
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
-from mtv_world_ros.data.episode import Episode, MASKS_BY
+from mtv_world_ros.data.episode import Episode, MASKS_BY, Track, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
@@ -159,11 +159,45 @@ def import_bags(
     def convert(bag: Path, path: Path) -> tuple[str, ...]:
         return convert_bag(bag, path, mapping, robot, calibration, key, stage)
 
-    return import_each(progress(bags), key, lambda bag: out / _name(bag), convert)
+    return import_each(progress(bags), key, lambda bag: out / episode_name(bag), convert)
 
 
-def _name(bag: Path) -> str:
+def episode_name(bag: Path) -> str:
+    """Name of the folder that a bag's episode gets."""
     return bag.name.split('.')[0] if bag.is_file() else bag.name
+
+
+def summary_line(path: Path, objects: bool = False) -> str:
+    """What an imported episode holds, in one line.
+
+    Args:
+        path: its folder.
+        objects: whether masks were looked for.
+    """
+    episode = read_episode(path, with_cameras=False)
+    states = episode.joint_states
+    assert states is not None
+    seconds = (states.stamps_ns[-1] - states.stamps_ns[0]) * 1e-9
+    counts = ', '.join(f'{view} {len(episode.images[view].stamps_ns)}' for view in episode.views)
+    parts = [f'{seconds:.1f} s', f'frames: {counts}', f"'{episode.info.instruction}'"]
+    if episode.info.objects or objects:
+        parts.append(f'objects: {", ".join(episode.info.objects) or "none named"}')
+    if episode.masks:
+        shares = [
+            _object_shares(track, len(episode.info.objects)) for track in episode.masks.values()
+        ]
+        found = zip(episode.info.objects, np.max(shares, axis=0), strict=True)
+        parts.append('seen: ' + ', '.join(f'{name} {share:.0%}' for name, share in found))
+    unknown = episode.info.metadata.get(UNKNOWN_CAMERAS, '')
+    if unknown:
+        parts.append(f'cameras not known: {unknown}')
+    return f'{path.name}: {"; ".join(parts)}'
+
+
+def _object_shares(track: Track, count: int) -> FloatArray:
+    """(O,) share of the frames in which each object has a mask."""
+    ids = np.asarray(track.frames)
+    return np.array([(ids == n).any(axis=(1, 2)).mean() for n in range(1, count + 1)])
 
 
 def convert_bag(
@@ -184,13 +218,23 @@ def convert_bag(
         MtvWorldError: the bag cannot be converted; nothing is left behind.
     """
     episode = read_episode(
-        bag, views=list(mapping.views), calibration=calibration, mapping=mapping, robot=robot
+        bag,
+        views=list(mapping.views),
+        calibration=calibration,
+        mapping=mapping,
+        robot=robot,
+        unknown_mount=robot.base_link,
     )
     for camera in episode.cameras.values():  # names a mount_link that is not there
         camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
     warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
+    warnings += [
+        f"view '{view}': {what} not known: mtv-world calibrate-camera {out} --view {view} "
+        '--no-guess'
+        for view, what in episode.unknown.items()
+    ]
     told = mapping.instruction or episode.info.instruction
     names = stage.names(
         told,
@@ -206,7 +250,7 @@ def convert_bag(
         task=mapping.task or episode.info.task,
         instruction=told,
         robot=robot.name,
-        cameras=[episode.cameras[view] for view in episode.views],
+        cameras=[episode.cameras[v] for v in episode.views if v not in episode.unknown],
         objects=names,
         metadata=_metadata(episode, bag, key),
         jpeg_quality=mapping.jpeg_quality,
@@ -290,7 +334,7 @@ def _in_order(
     frames = [(v, s, i) for v in episode.views for i, s in enumerate(episode.images[v].stamps_ns)]
     for view, stamp_ns, index in frames:
         stamp = int(stamp_ns)
-        add(stamp, 3, writer.write_camera_info, view, stamp, episode.cameras[view])
+        add(stamp, 3, _write_camera_info, writer, episode, view, stamp)
         if view in episode.camera_tracks:
             camera = episode.camera(view, index)
             mount, T = camera.mount_link, camera.T_mount_camera
@@ -312,8 +356,14 @@ def _told(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[in
 def _metadata(episode: Episode, bag: Path, key: str) -> dict[str, str]:
     """Where the episode is from, and who made its masks."""
     values = {'source': bag.name, MAPPING_KEY: key}
+    values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
     by = episode.info.metadata.get(MASKS_BY, '')
     return {**values, MASKS_BY: by} if episode.masks and by else values
+
+
+def _write_camera_info(writer: EpisodeWriter, episode: Episode, view: str, stamp_ns: int) -> None:
+    if episode.unknown.get(view, 'pose') == 'pose':  # the intrinsics are known
+        writer.write_camera_info(view, stamp_ns, episode.cameras[view])
 
 
 def _write_frame(

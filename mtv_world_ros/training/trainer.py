@@ -84,7 +84,7 @@ class StepReport:
 
 def learning_rate(step: int, config: OptimizerConfig) -> float:
     """Rate of a step (from 0): warm-up, constant, then linear to zero over the last share."""
-    warm = min(1.0, (step + 1) / max(config.warmup_steps, 1))
+    warm = min(1.0, (step + 1) / max(config.warmup, 1))
     decay_steps = max(1, round(config.decay_share * config.steps))
     left = (config.steps - step) / decay_steps
     return config.learning_rate * min(warm, max(0.0, min(1.0, left)))

@@ -188,7 +188,9 @@ class OptimizerConfig(Schema):
 
     learning_rate: float = Field(default=6e-4, description='after the warm-up')
     weight_decay: float = 0.01
-    warmup_steps: int = 200
+    warmup_steps: int = Field(
+        default=200, description='of the learning rate; at most a fifth of the steps'
+    )
     decay_share: float = Field(
         default=0.35, description='share of the steps in which the rate decays'
     )
@@ -208,6 +210,11 @@ class OptimizerConfig(Schema):
     epochs: Annotated[float | None, expected('positive, or null')] = Field(
         default=None, gt=0, description='instead of `steps`: a multiple of the number of clips'
     )
+
+    @property
+    def warmup(self) -> int:
+        """Steps of the warm-up, shorter than `warmup_steps` in a short training."""
+        return min(self.warmup_steps, self.steps // 5)
 
     @model_validator(mode='after')
     def _parts_have_clips(self) -> Self:

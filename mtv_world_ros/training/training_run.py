@@ -49,7 +49,7 @@ from mtv_world_ros.training.latent_cache.latent_clips import cached, CachedSourc
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
-from mtv_world_ros.training.training_config import TrainingRun
+from mtv_world_ros.training.training_config import OptimizerConfig, TrainingRun
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -238,8 +238,9 @@ def train(
             f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
             f'{processes.count} processes'
         )
-        for line in counted(skipped):
-            tqdm.write(f'left out: {line}')
+        left_out = [f'left out: {line}' for line in counted(skipped)]
+        for line in [*left_out, *notes(trainer.config.optimizer, recordings)]:
+            tqdm.write(line)
     ideal = None
     if run.peak_tflops is not None and processes.is_main:
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
@@ -263,6 +264,24 @@ def _save_robot(
         cameras = common_cameras(recordings)
         if cameras is not None:
             save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
+
+
+def notes(optimizer: OptimizerConfig, recordings: Sequence[Recording]) -> list[str]:
+    """What a user should know of a training before it runs."""
+    found = []
+    if optimizer.warmup < optimizer.warmup_steps:
+        found.append(
+            f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '
+            f'instead of optimizer.warmup_steps = {optimizer.warmup_steps}'
+        )
+    if common_cameras(recordings) is None:
+        kinds = len({tuple(_camera_key(camera) for camera in r.cameras) for r in recordings})
+        found.append(
+            f'the episodes have {kinds} different calibrations, none of them that of more than '
+            'half: the checkpoint gets no default calibration, and the node needs '
+            "'calibration_file'"
+        )
+    return found
 
 
 def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:

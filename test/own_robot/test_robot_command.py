@@ -4,6 +4,7 @@ from crane import load, URDF, write_robot
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import RobotError
@@ -48,6 +49,58 @@ def test_the_guess_for_two_arms_agrees_with_the_bundled_file():
         assert np.abs(guess['position'] - tool.T_link_tool[:3, 3]).max() < 0.02
         aligned = np.abs(np.dot(guess['quaternion_xyzw'], [0, 0, -(0.5**0.5), 0.5**0.5]))
         assert aligned > 0.999
+
+
+def _link(name, *shapes):
+    visuals = ''.join(f'<visual><origin xyz="{xyz}"/><geometry>{shape}</geometry></visual>'
+                      for xyz, shape in shapes)  # fmt: skip
+    return f'<link name="{name}">{visuals}</link>'
+
+
+def _four_bar_gripper(urdf):
+    """The crane with a gripper as four-bar linkages have it: outer and inner knuckles and tips.
+
+    Fingers turn about -y at (+-30.6, 0, 54.9) mm; tips stay parallel and end 150 mm ahead of the
+    hand's link. One tip's shape has more points than the other's.
+    """
+    head = urdf.partition('<link name="left">')[0]
+    joints = urdf[urdf.index('<joint name="stand"') : urdf.index('<joint name="jaw_left"')]
+    box = ('0 0 0.02', '<box size="0.012 0.02 0.05"/>')
+    knob = ('0.008 0.004 0.02', '<sphere radius="0.004"/>')
+    parts = []
+    for side, sign in (('left', 1), ('right', -1)):
+        parts += [
+            _link(f'{side}_knuckle', (f'{0.03 * sign} 0 0', '<box size="0.06 0.02 0.01"/>')),
+            _link(f'{side}_inner', (f'{0.02 * sign} 0 0.02', '<box size="0.01 0.02 0.04"/>')),
+            _link(f'{side}_tip', box, *([knob] if sign < 0 else [])),
+        ]
+        rows = [('knuckle', 'hand', f'{0.0306 * sign} 0 0.0549', sign),
+                ('inner', 'hand', f'{0.0127 * sign} 0 0.0614', sign),
+                ('tip', f'{side}_knuckle', f'{0.0372 * sign} 0 0.0501', -sign)]  # fmt: skip
+        for name, parent, xyz, turns in rows:
+            follows = f'<mimic joint="left_knuckle_joint" multiplier="{turns}"/>'
+            limit = f'lower="{min(0, 0.8 * turns)}" upper="{max(0, 0.8 * turns)}"'
+            parts.append(
+                f'<joint name="{side}_{name}_joint" type="revolute"><parent link="{parent}"/>'
+                f'<child link="{side}_{name}"/><origin xyz="{xyz}"/><axis xyz="0 -1 0"/>'
+                f'<limit {limit} effort="1" velocity="1"/>'
+                f'{"" if (side, name) == ("left", "knuckle") else follows}</joint>'
+            )
+    return head + joints + ''.join(parts) + '</robot>'
+
+
+def test_the_tool_of_fingers_that_turn_is_on_the_axis_between_their_tips(crane):
+    urdf = crane.with_name('crane.urdf')
+    urdf.write_text(_four_bar_gripper(URDF))
+    (tool,) = guess_robot(urdf).values['tools']
+    assert (tool['link'], tool['gripper_joint']) == ('hand', 'left_knuckle_joint')
+    assert (tool['gripper_open'], tool['gripper_closed']) == (0.0, 0.8)
+    x, y, z = tool['position']
+    assert abs(x) < 0.003 and abs(y) < 0.003  # 13 mm before, on one that is sold
+    assert 0.12 < z < 0.16
+    turned = Rotation.from_quat(tool['quaternion_xyzw']).as_matrix()
+    assert turned[2, 2] > np.cos(np.radians(2))  # 17 degrees before
+    assert abs(turned[0, 1]) > 0.999  # along the way of the fingers
 
 
 def test_joints_that_follow_in_a_chain_are_resolved_and_circles_named(crane):

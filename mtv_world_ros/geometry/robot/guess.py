@@ -23,6 +23,8 @@ from mtv_world_ros.geometry.transforms import quaternion
 _FINGER_JOINTS = 6
 #: the tool point is this far inside the finger tips [m]
 _TIP_M = 0.0085
+#: finger links that end this far behind the others have no tip [m]
+_BESIDE_TIP_M = 0.015
 #: joints an arm has at least
 _ARM_JOINTS = 3
 #: names of tool frames, the best first
@@ -224,22 +226,61 @@ class _Hand:
 
     def tool_pose(self) -> FloatArray:
         """A frame near the finger tips: z away from the arm, y the way of a finger."""
-        shut, opened = self._fingers(self.closed), self._fingers(self.open)
+        shut, opened = self._tips()
         T = np.eye(4)
         middle = np.mean([points.mean(axis=0) for points in shut], axis=0)
         T[:3, 3] = middle
-        y = opened[0].mean(axis=0) - shut[0].mean(axis=0)
-        if np.linalg.norm(y) < 1e-6:
+        axes = self._turned_axes(opened, middle) or _slid_axes(shut, opened, middle)
+        if axes is None:
             return T
-        y /= np.linalg.norm(y)
-        z = middle - (middle @ y) * y
-        if np.linalg.norm(z) < 1e-3:
-            return T
-        z /= np.linalg.norm(z)
-        T[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
-        tip = max(float((points @ z).max()) for points in shut)
-        T[:3, 3] += max(tip - _TIP_M - float(middle @ z), 0.0) * z
+        T[:3, :3] = np.stack(axes, axis=1)
+        ends = np.array([[(p @ T[:3, :3]).min(axis=0), (p @ T[:3, :3]).max(axis=0)] for p in shut])
+        place = ends.mean(axis=(0, 1))  # of the extents: meshes have more points on one side
+        place[2] = max(place[2], float(ends[..., 2].max()) - _TIP_M)
+        T[:3, 3] = T[:3, :3] @ place
         return T
+
+    def _tips(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Points of the finger links that reach farthest, shut and open."""
+        shut, opened = self._fingers(self.closed), self._fingers(self.open)
+        ahead = np.mean([points.mean(axis=0) for points in opened], axis=0)
+        ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+        reach = np.array([float((points @ ahead).max()) for points in opened])
+        chosen = np.flatnonzero(reach > reach.max() - _BESIDE_TIP_M)
+        if len(chosen) < 2:  # a thumb
+            return shut, opened
+        return [shut[n] for n in chosen], [opened[n] for n in chosen]
+
+    def _turned_axes(
+        self, opened: Sequence[FloatArray], middle: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """x, y, z of fingers that turn about an axis; None where they slide.
+
+        The way of a tip that turns is an arc: what is between the tips is taken in its place.
+        """
+        if _slides(self._model, self.joint) or len(opened) != 2:
+            return None
+        x = self._axis()
+        y = opened[0].mean(axis=0) - opened[1].mean(axis=0)
+        y -= (y @ x) * x
+        if np.linalg.norm(y) < 1e-3:
+            return None
+        y /= np.linalg.norm(y)
+        z = np.asarray(np.cross(x, y), np.float64)
+        if abs(float(z @ middle)) < 1e-3:
+            return None
+        x, z = (x, z) if z @ middle > 0 else (-x, -z)
+        return x, y, z
+
+    def _axis(self) -> FloatArray:
+        """(3,) the axis that the gripper's joint turns about, in the arm's last joint."""
+        model, data = self._model, self._model.createData()
+        configuration = pin.neutral(model)
+        pin.computeJointJacobians(model, data, configuration)
+        turns = pin.getJointJacobian(model, data, self.joint, pin.ReferenceFrame.WORLD)
+        axis = np.asarray(turns[3:, model.joints[self.joint].idx_v], np.float64)
+        last = np.asarray(data.oMi[self._arm.chain[-1]].rotation, np.float64)
+        return last.T @ axis
 
     def _span(self, value: float) -> float:
         centres = np.array([points.mean(axis=0) for points in self._fingers(value)])
@@ -268,6 +309,21 @@ class _Hand:
         if len(found) == 1:  # the other jaw does not move
             found.append(np.zeros((1, 3)))
         return found
+
+
+def _slid_axes(
+    shut: Sequence[FloatArray], opened: Sequence[FloatArray], middle: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """x, y, z of fingers that slide; None where they do not move."""
+    y = opened[0].mean(axis=0) - shut[0].mean(axis=0)
+    if np.linalg.norm(y) < 1e-6:
+        return None
+    y /= np.linalg.norm(y)
+    z = middle - (middle @ y) * y
+    if np.linalg.norm(z) < 1e-3:
+        return None
+    z /= np.linalg.norm(z)
+    return np.asarray(np.cross(y, z), np.float64), y, z
 
 
 def _finger_points(model: pin.Model, urdf: Path, arm: _Arm) -> dict[int, FloatArray]:

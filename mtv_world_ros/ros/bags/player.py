@@ -37,6 +37,8 @@ _STATES = ('instruction', 'tf_static', 'robot_description')
 _CLOCK_PERIOD_NS = 10_000_000
 #: connections that do not change for this long are complete [s]
 _SETTLED_S = 0.5
+#: after this long it says what it waits for
+_SILENT_S = 2.0
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 
 
@@ -134,7 +136,14 @@ class Player(Node):
             if publisher.msg_type is message_class(TRAJECTORY)
         ]
         end_s = time.monotonic() + self._options.wait_timeout
+        say_s = time.monotonic() + _SILENT_S
         while lonely := self._lonely(needed):
+            if time.monotonic() > say_s:
+                say_s = end_s + 1
+                self.get_logger().info(
+                    f'waiting up to {self._options.wait_timeout:g} s for a subscriber of '
+                    f'{lonely}: start the node (world_model); --no-wait plays anyway'
+                )
             if time.monotonic() > end_s:
                 raise ConfigError(
                     f'nobody subscribes to {lonely} after {self._options.wait_timeout:g} s; is '
@@ -304,7 +313,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add('--duration', type=float, default=float('inf'), help='play this much [s]')
     add('--topics', nargs='+', default=[], metavar='TOPIC', help='play only these')
     add('--wait-for', nargs='+', default=[], metavar='TOPIC', help='default: the trajectory')
-    add('--wait-timeout', type=float, default=60.0, help='wait for a subscriber this long [s]')
+    add('--wait-timeout', type=float, default=30.0, help='wait for a subscriber this long [s]')
     add('--no-wait', action='store_true', help='play whether or not anybody listens')
     add('--lock-step', action='store_true', help='after each trajectory wait for the answer')
     add('--answer-timeout', type=float, default=120.0, help='wait for an answer this long [s]')

@@ -15,6 +15,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.errors import CalibrationError, EpisodeError
+from mtv_world_ros.geometry.calibration_file import load_calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -277,8 +278,11 @@ def test_camera_info_that_changes_within_an_episode_is_refused(foreign_bag, make
     ]
     path = foreign_bag(('/low/image_raw', IMAGE, 1, image(1)), *entries)
     calibration = make_episode('other') / 'calibration.yaml'
-    low = read_episode(path, calibration=calibration).cameras['low']
-    assert (low.K[0, 0], low.width, low.height) == (50.0, 3, 2)
+    found = read_episode(path, calibration=calibration)
+    low, given = found.cameras['low'], load_calibration(calibration)['low']
+    assert (low.width, low.height) == (3, 2)
+    assert low.K[0, 0] == pytest.approx(given.K[0, 0] * 3 / given.width)  # the file's, and said
+    assert any('CameraInfo 50.0' in line for line in found.warnings)
     changed = ('/low/camera_info', kind, 9, camera_info(9, 60.0))
     path = foreign_bag(('/low/image_raw', IMAGE, 1, image(1)), *entries, changed, name='changed')
     with pytest.raises(CalibrationError, match='/low/camera_info.*changes at message 2'):
