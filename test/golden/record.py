@@ -1,0 +1,309 @@
+"""Digests of what must not change while code moves: plans, bags, results, weights, interfaces.
+
+    python test/golden/record.py [--only plans,help] [--check]
+
+writes `test/golden/SECTION.json`, or with `--check` prints the differences from what is there and
+exits with 1 where there are any. It uses the commands and looks modules up by their last name,
+so that a moved module is found. One thread; seeds are fixed. What comes of floating-point numbers
+is equal on the same machine with the same packages; plans are rounded to a microradian.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from collections.abc import Callable
+import contextlib
+import difflib
+from functools import cache
+from hashlib import sha256
+from importlib import import_module
+import json
+import os
+from pathlib import Path
+import pkgutil
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from types import ModuleType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+HERE, PACKAGE = Path(__file__).resolve().parent, 'mtv_world_ros'
+os.environ |= {
+    'PYTHONPATH': str(ROOT),
+    'OMP_NUM_THREADS': '1',
+    'COLUMNS': '100',
+    'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+}
+sys.path.insert(0, str(ROOT))
+
+#: seeds of plans; a robot of one arm, which has no faults of two
+SEEDS, ONE_ARM = (0, 1), 'franka'
+TASKS = 'place_bread_plate,shake_bottle'
+#: keys of results that differ from run to run, and texts with a path or a time in them
+_RUN_KEYS = re.compile(
+    r'(^|_)(seconds|s|date|time|times|created|path|version|machine|host|commit)$|memory|per_second'
+)
+_RUN_TEXT = re.compile(r'\S*/golden_\S*')
+
+
+def digest(data: bytes | str) -> str:
+    """Returns the SHA-256 of bytes or text."""
+    return sha256(data.encode() if isinstance(data, str) else data).hexdigest()
+
+
+@cache
+def modules() -> dict[str, str]:
+    """Returns the full names of the package's modules by their last part."""
+    package = import_module(PACKAGE)
+    found = pkgutil.walk_packages(package.__path__, f'{PACKAGE}.', onerror=lambda _: None)
+    names = [name for _, name, is_package in found if not is_package]
+    return {name.rpartition('.')[2]: name for name in names if '__main__' not in name}
+
+
+def module(*names: str) -> ModuleType:
+    """Returns the module whose last name is one of these."""
+    return import_module(next(modules()[name] for name in names if name in modules()))
+
+
+def command(*words: object) -> str:
+    """Runs `mtv-world`; returns what it printed, and fails as it does."""
+    code = f'import sys; from {PACKAGE}.cli import main; sys.exit(main())'
+    line = [sys.executable, '-c', code, *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT)
+    if done.returncode:
+        raise SystemExit(f'mtv-world {" ".join(map(str, words))}:\n{done.stderr[-3000:]}')
+    return done.stdout
+
+
+@cache
+def folder() -> Path:
+    """Returns a folder for what the commands write; gone at the end."""
+    kept = tempfile.TemporaryDirectory(prefix='golden_')
+    folder.kept = kept  # type: ignore[attr-defined]
+    return Path(kept.name)
+
+
+@cache
+def episodes() -> Path:
+    """Returns a folder of eight episodes, successes and failures, of two tasks."""
+    out, policies = folder() / 'episodes', 'expert,expert-high-0.06'
+    command('collect', '--task', TASKS, '--episodes', 4, '--policies', policies, '--seed', 3,
+            '--workers', 1, '--out', out)  # fmt: skip
+    return out
+
+
+def lasting(value: Any) -> Any:
+    """Returns a result without seconds, dates and paths; numbers to nine digits."""
+    if isinstance(value, dict):
+        return {k: lasting(v) for k, v in value.items() if not _RUN_KEYS.search(k)}
+    if isinstance(value, list):
+        return [lasting(item) for item in value]
+    if isinstance(value, float):
+        return f'{value:.9g}'
+    return _RUN_TEXT.sub('PATH', value) if isinstance(value, str) else value
+
+
+def results(out: Path) -> dict[str, str]:
+    """Returns digests of all JSON files under a folder, without what differs from run to run."""
+    texts = {
+        str(path.relative_to(out)): json.dumps(lasting(json.loads(path.read_text())))
+        for path in sorted(out.rglob('*.json'))
+    }
+    return {name: digest(text) for name, text in texts.items()}
+
+
+def weights(out: Path) -> dict[str, str]:
+    """Returns digests of all tensor files of a checkpoint."""
+    paths = sorted(out.rglob('*.safetensors'))
+    return {
+        str(p.relative_to(out)): digest(p.read_bytes()) for p in paths if 'state' not in str(p)
+    }
+
+
+def plans() -> dict[str, Any]:
+    """Every fault kind in its typical size, in all tasks; what is refused, by text."""
+    robots, make = module('assembly'), module('scripted_policy').scripted_policy
+    expert, load = module('expert').Expert, import_module(modules()['file']).load_robot
+    tasks = sorted(path.stem for path in (ROOT / 'config' / 'tasks').glob('*.yaml'))
+    two, one = (expert(load(robots.robot_path(name))) for name in ('yam_bimanual', ONE_ARM))
+    found: dict[str, Any] = {}
+    for name in _policies():
+        whole = sha256()
+        for task in tasks:
+            for seed in SEEDS:
+                whole.update(_plan(make, name, task, seed, two))
+        alone = _plan(make, name, 'place_bread_plate', SEEDS[0], one)
+        found[name] = {
+            'two_arms': whole.hexdigest(),
+            'one_arm': alone.decode() if alone.startswith(b'refused') else digest(alone),
+        }
+    return found
+
+
+def _plan(make: Callable[..., Any], name: str, task: str, seed: int, expert: Any) -> bytes:
+    import numpy as np
+
+    try:
+        policy = make(name, task, seed, expert)
+        policy.reset(seed=seed)
+    except import_module(f'{PACKAGE}.errors').MtvWorldError as error:
+        return f'refused: {error}'.encode()
+    return np.rint(policy.plan.positions * 1e6).astype('<i8').tobytes()
+
+
+def _policies() -> list[str]:
+    """The policies of the recorded plans; where there are none, of every kind."""
+    recorded = HERE / 'plans.json'
+    if recorded.exists():
+        return list(json.loads(recorded.read_text()))
+    faults = module('faults', 'catalogue').FAULTS
+    return ['expert', *(f'expert-{kind}-{fault.typical:g}' for kind, fault in faults.items())]
+
+
+def helps() -> dict[str, list[str]]:
+    """The help of every command."""
+    whole = command('--help')
+    names = re.findall(r'^ {4}([a-z-]+)(?: |$)', whole, re.MULTILINE)
+    shown = {'': whole} | {name: command(name, '--help') for name in names}
+    return {name: text.split('\n') for name, text in shown.items()}
+
+
+def schemas() -> dict[str, Any]:
+    """The JSON schema of every schema, by its class's name."""
+    for name in modules().values():
+        with contextlib.suppress(Exception):  # an optional package is not installed
+            import_module(name)
+    found, todo = {}, [import_module(f'{PACKAGE}.config').Schema]
+    while todo:
+        kind = todo.pop()
+        todo += kind.__subclasses__()
+        with contextlib.suppress(Exception):  # types that JSON does not know
+            found[f'{kind.__name__}'] = digest(json.dumps(kind.model_json_schema()))
+    return dict(sorted(found.items()))
+
+
+def node() -> dict[str, Any]:
+    """Parameters, topics with their QoS, and services of the node."""
+    from rcl_interfaces.srv import GetParameters, ListParameters
+    import rclpy
+    from rclpy.parameter import parameter_value_to_python
+
+    line = [sys.executable, '-c', f'from {PACKAGE}.ros import run_world_model as r; r()']
+    running = subprocess.Popen(line, cwd=ROOT)
+    rclpy.init()
+    asking = rclpy.create_node('asking')
+
+    def answer(kind: Any, name: str, request: Any) -> Any:
+        client = asking.create_client(kind, name)
+        assert client.wait_for_service(300.0), f'the node does not offer {name}'
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(asking, future, timeout_sec=300.0)
+        return future.result()
+
+    try:
+        listed = ListParameters.Request()
+        names = answer(ListParameters, '/world_model/list_parameters', listed).result.names
+        asked = GetParameters.Request(names=names)
+        values = answer(GetParameters, '/world_model/get_parameters', asked).values
+        time.sleep(20.0)  # it configures and activates itself
+        by_node, qos = {}, {}
+        for what in ('publisher', 'subscriber', 'service'):
+            get = getattr(asking, f'get_{what}_names_and_types_by_node')
+            by_node[what] = dict(sorted(get('world_model', '/')))
+        for topic in by_node['publisher']:
+            infos = asking.get_publishers_info_by_topic(topic)
+            profiles = [i.qos_profile for i in infos if i.node_name == 'world_model']
+            qos[topic] = [[p.reliability.name, p.durability.name] for p in profiles]
+        parameters = dict(zip(names, map(parameter_value_to_python, values), strict=True))
+        return {'parameters': parameters, **by_node, 'qos': qos}
+    finally:
+        asking.destroy_node()
+        rclpy.shutdown()
+        running.terminate()
+        running.wait(30)
+
+
+def replay() -> dict[str, str]:
+    """All messages of the demo episode's offline replay, by topic, without seconds."""
+    from mcap.reader import make_reader
+
+    out, by_topic = folder() / 'replay', defaultdict(sha256)
+    demo = ROOT / 'resource' / 'demo_episode'
+    command('replay', '--offline', demo, '--out', out, '--threads', 1)
+    with next(out.rglob('*.mcap')).open('rb') as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            data = message.data
+            if channel.topic.endswith('/report'):
+                texts = re.findall(rb'[ -~]{3,}', data)
+                pairs = zip([b'', *texts], texts, strict=False)
+                data = b'\n'.join(t for key, t in pairs if not key.startswith(b'stage_s'))
+            by_topic[channel.topic].update(data)
+    return {topic: whole.hexdigest() for topic, whole in sorted(by_topic.items())}
+
+
+def collect() -> dict[str, str]:
+    """Recordings of simulated episodes."""
+    paths = sorted(episodes().rglob('*.mcap'))
+    return {p.name: digest(p.read_bytes()) for p in paths}
+
+
+def evaluate() -> dict[str, str]:
+    """Scores of the bundled model on two episodes, and its calibration on all."""
+    fixed = ('--workers', 1, '--threads', 1, '--steps', 1, '--split', 'all', '--out')
+    more = {'evaluate': ('--no-report', '--episodes', 2), 'calibrate': ('--no-store',)}
+    for name, options in more.items():
+        out = folder() / 'results' / name
+        command(name, 'bundled', episodes(), *options, *fixed, out)
+    return results(folder() / 'results')
+
+
+def rank() -> dict[str, str]:
+    """A ranking of three policies in two tasks."""
+    out, policies = folder() / 'ranking', 'expert,expert-high-0.06,expert-stop-0.3'
+    command('rank', '--policies', policies, '--tasks', TASKS, '--episodes', 2, '--out', out,
+            '--workers', 1, '--threads', 1, '--steps', 1, '--no-clips')  # fmt: skip
+    return results(out)
+
+
+def train() -> dict[str, str]:
+    """Weights after twenty steps of `train` and of `train-motion`."""
+    out = folder() / 'trained'
+    command('train', episodes(), '--out', out / 'world', '--preset', 'small', '--threads', 1,
+            '--split', 'all', '--set', 'optimizer.steps=20')  # fmt: skip
+    command('train-motion', episodes(), '--out', out / 'motion', '--steps', 20, '--threads', 1,
+            '--dtype', 'float32')  # fmt: skip
+    return weights(out)
+
+
+SECTIONS: dict[str, Callable[[], dict[str, Any]]] = {
+    'help': helps, 'schemas': schemas, 'node': node, 'replay': replay, 'collect': collect,
+    'evaluate': evaluate, 'rank': rank, 'train': train, 'plans': plans,
+}  # fmt: skip
+
+
+def main() -> int:
+    """Records the sections, or prints how they differ from what is recorded."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser.add_argument('--only', default=','.join(SECTIONS), metavar='SECTIONS')
+    parser.add_argument('--check', action='store_true', help='print differences; write nothing')
+    arguments, differs = parser.parse_args(), False
+    for name in arguments.only.split(','):
+        path, found = HERE / f'{name}.json', SECTIONS[name]()
+        text = json.dumps(found, indent=1, ensure_ascii=False) + '\n'
+        if not arguments.check:
+            path.write_text(text)
+            continue
+        before = path.read_text().split('\n')
+        lines = list(difflib.unified_diff(before, text.split('\n'), 'recorded', 'now', n=1))
+        differs |= bool(lines)
+        print(f'{name}: {"differs" if lines else "equal"}', *lines, sep='\n')
+    return int(differs)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
