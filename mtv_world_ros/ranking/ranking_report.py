@@ -62,6 +62,7 @@ def remarks(summary: Summary) -> list[str]:
     found = [
         _MEANING,
         _CEILING.format(seen=JUDGES['seen'].capitalize()),
+        _truth_remark(summary),
         _agreement_remark(summary),
         _unknown_remark(summary),
         _INTERVALS,
@@ -81,6 +82,11 @@ def remarks(summary: Summary) -> list[str]:
             f'{first.name}: {reason}'
         )
     return [remark for remark in found if remark]
+
+
+def _truth_remark(summary: Summary) -> str:
+    truth = summary.provenance.get('physics', '')
+    return f'Truth of the simulator: {truth}.' if truth else ''
 
 
 def _agreement_remark(summary: Summary) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
@@ -46,6 +47,7 @@ class RolloutConfig:
             number of answers in a row; 0 = then it goes on.
         clips: keep each rollout as a video, a contact sheet and frames; takes as long as
             imagining it.
+        physics: name in the catalogue of what is true in the simulator.
         make_policy: makes a policy for an episode.
     """
 
@@ -53,6 +55,7 @@ class RolloutConfig:
     max_chunks: int = 8
     hold: int = 0
     clips: bool = True
+    physics: str = NOMINAL
     make_policy: MakePolicy = scripted_policy
 
     def __post_init__(self) -> None:
@@ -75,8 +78,8 @@ class RolloutRunner:
 
     def __init__(self, pipeline: Pipeline, config: RolloutConfig) -> None:
         self.pipeline, self.config = pipeline, config
-        self._expert = Expert(pipeline.robot)
-        self._sim = SimEpisode(pipeline.robot, self._expert.home)
+        self._expert = Expert(pipeline.robot, physics=config.physics)
+        self._sim = SimEpisode(pipeline.robot, self._expert.home, physics=config.physics)
 
     def score(self, job: Job) -> Result:
         """Returns what a policy reached.
