@@ -123,7 +123,7 @@ def load_pipeline(
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
         describer: YAML file of what names the objects of the first real frame; empty = the
             words of the instruction.
-        serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
+        serving: what makes the model faster or smaller, e.g. `compile=true`; see
             `ServingOptions`.
         calibrated: use the checkpoint's calibration of the success estimate, where it has one.
         adapter: LoRA adapter to use in place of the checkpoint's own.

@@ -40,7 +40,7 @@ def add_serving(parser: argparse.ArgumentParser) -> None:
         '--serving',
         default='',
         metavar='"NAME=VALUE ..."',
-        help='options that make the model faster or smaller, e.g. "context_parallel=2"',
+        help='options that make the model faster or smaller, e.g. "compile=true"',
     )
     parser.add_argument(
         '--adapter', type=Path, help="LoRA folder or file, instead of the checkpoint's own"
