@@ -166,9 +166,9 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     from mtv_world_ros.inspection.inspect import load_inspector
     from mtv_world_ros.inspection.inspection_report import to_text
 
-    file, source = _robot_file(arguments, path)
+    file, source = robot_file(arguments, path)
     inspector = load_inspector(file)
-    episode = _read(path, arguments.views, source, inspector.robot)
+    episode = read_for_checks(path, arguments.views, source, inspector.robot)
     inspection = inspector.inspect(episode)
     out = arguments.out or Path('out/doctor') / name
     _write_inspection(inspector, episode, inspection, out)
@@ -177,8 +177,8 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     return _STATUS[inspection.verdict]
 
 
-def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
-    """The robot's YAML (`--robot`, that of the mapping, that of the episode), and the source."""
+def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
+    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
     from mtv_world_ros.assembly import recorded_robot, robot_path
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_info
@@ -188,13 +188,14 @@ def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, Episod
     return robot_path(name) if name else recorded_robot(path, read_info(path).robot), source
 
 
-def _read(
+def read_for_checks(
     path: Path,
     views: Sequence[str] | None,
     source: EpisodeSource,
     robot: RobotModel,
     unknown_mount: str = '',
 ) -> Episode:
+    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
     from mtv_world_ros.data.episode_reader import read_episode
 
     return read_episode(
@@ -228,10 +229,31 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
         help='estimate where a camera is, fixed or on the arm, from a recording in which the arm '
         'moves',
         epilog='Intrinsics come from the recording; the pose there is the guess to start from. '
+        'Of several recordings, moved cameras are told apart, and the focal length is estimated '
+        'where it is not known. '
         'This is the calibration of a camera: that of the success estimate is `calibrate`.',
     )
-    parser.add_argument('episode', type=Path)
+    parser.add_argument(
+        'episodes', type=Path, nargs='+', metavar='EPISODE', help='recordings, or folders of them'
+    )
     parser.add_argument('--view', required=True)
+    parser.add_argument(
+        '--points',
+        type=Path,
+        metavar='FILE',
+        help='where the tool point is seen, to start from: '
+        '{VIEW: {EPISODE: [[seconds, x, y], ...]}} in YAML [s, px], four points or more',
+    )
+    parser.add_argument(
+        '--focal',
+        choices=('known', 'estimate'),
+        help='whether the focal length is right; default: estimate where nothing gives one',
+    )
+    parser.add_argument(
+        '--apply',
+        action='store_true',
+        help="write the poses into the recordings' calibration.yaml, where they have none",
+    )
     parser.add_argument(
         '--no-guess',
         dest='guess',
@@ -267,6 +289,15 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.cli.shared_camera import calibrate_shared, is_shared
+
+    if is_shared(arguments):
+        return calibrate_shared(arguments)
+    arguments.episode = arguments.episodes[0]
+    return _calibrate_one(arguments)
+
+
+def _calibrate_one(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
@@ -281,9 +312,9 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
     known = load_calibration(out) if out.is_file() else {}
     if arguments.view in known and arguments.out is not None:
         raise ConfigError(f"'{out}' has view '{arguments.view}' already; name another --out")
-    file, source = _robot_file(arguments, arguments.episode)
+    file, source = robot_file(arguments, arguments.episode)
     robot = load_robot(file)
-    episode = _read(
+    episode = read_for_checks(
         arguments.episode,
         [arguments.view],
         source,
