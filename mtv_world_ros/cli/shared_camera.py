@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.data_types import CameraModel
     from mtv_world_ros.geometry.robot.model import RobotModel
-    from mtv_world_ros.inspection.shared_camera import SharedEstimate
+    from mtv_world_ros.lab.inspection.shared_camera import SharedEstimate
 
 
 def is_shared(arguments: argparse.Namespace) -> bool:
@@ -45,7 +45,7 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
     """Runs the command on all recordings."""
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.geometry.robot.shape import load_shape
-    from mtv_world_ros.inspection.shared_camera import estimate_shared, load_points
+    from mtv_world_ros.lab.inspection.shared_camera import estimate_shared, load_points
 
     if arguments.mount_link or arguments.between:
         raise ConfigError('--mount-link and --between are for one recording')
@@ -82,8 +82,8 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
 
 
 def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
-    from mtv_world_ros.cli.own_robot import read_for_checks, robot_file
     from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.cli.own_robot import read_for_checks, robot_file
 
     paths = recordings(arguments.episodes)
     file, source = robot_file(arguments, paths[0])
@@ -127,8 +127,8 @@ def _write(
 
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
     from mtv_world_ros.geometry.robot.shape import load_shape
-    from mtv_world_ros.inspection.clocks import JointTrack
-    from mtv_world_ros.inspection.inspect import overlay_picture
+    from mtv_world_ros.lab.inspection.clocks import JointTrack
+    from mtv_world_ros.lab.inspection.inspect import overlay_picture
     from mtv_world_ros.rendering.images import write_png
 
     view = arguments.view
