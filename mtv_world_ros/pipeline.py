@@ -30,8 +30,9 @@ from mtv_world_ros.geometry.object_motion import (
     ObjectMotionModel,
     TrackedObjects,
 )
+from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
@@ -337,7 +338,7 @@ class ImaginedEpisode:
         """The trajectory on the model's clock, cut into chunks."""
         robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
         trajectory = match_joints(trajectory, robot, start.positions)
-        check_positions(robot, trajectory.positions, tolerance=self.limit_tolerance)
+        check_plan(robot, trajectory, start.positions, tolerance=self.limit_tolerance)
         total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
         num_chunks = ceil(total / spec.num_frames)
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
