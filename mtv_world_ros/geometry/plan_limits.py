@@ -29,7 +29,7 @@ def speed_limits(robot: RobotModel) -> FloatArray:
     given = np.asarray(robot.velocity_limits)
     free = np.where(robot.slides, DEFAULT_SLIDE, DEFAULT_TURN)
     limits = SPEED_RATIO * np.where((given > 0) & np.isfinite(given), given, free)
-    grippers = [tool.gripper_joint for tool in robot.tools]
+    grippers = [tool.gripper_joint or '' for tool in robot.tools]
     return np.where(np.isin(robot.joint_names, grippers), np.inf, limits)
 
 

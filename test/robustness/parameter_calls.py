@@ -106,7 +106,7 @@ def damaged(_: list[Any], rng: np.random.Generator) -> Any:
     node = _node(kind)
     names = [*node._parameters, *STRANGE_NAMES]
     rows = []
-    for _ in range(int(rng.choice([1, 1, 1, 2, 5]))):
+    for _row in range(int(rng.choice([1, 1, 1, 2, 5]))):
         name = names[rng.integers(len(names))]
         value = _value(rng)
         _fitting(rng, node, name, value)
