@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.foresight.library import mujoco
 from mtv_world_ros.foresight.robot_parts import load_parts, Part, with_inertias
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.object_motion.arm_response import ArmResponse

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mujoco
-from mujoco.rollout import Rollout
 import numpy as np
 from scipy.linalg import expm
 
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import Scene, STEP_S
 from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings

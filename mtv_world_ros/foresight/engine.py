@@ -11,8 +11,6 @@ import logging
 import time
 from typing import Any
 
-import mujoco
-from mujoco.rollout import Rollout
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
@@ -26,6 +24,7 @@ from mtv_world_ros.foresight.course import (
     SUBSTEPS,
 )
 from mtv_world_ros.foresight.futures import Future
+from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import kind_of, Scene, STEP_S
 from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
 
@@ -80,6 +79,18 @@ class BatchMotion:
     steps: int
 
 
+def _log_once(message: str) -> None:
+    """Takes the engine's warnings, which would fill a file and the terminal; each is told once."""
+    kind = message.split(' Time =')[0]
+    if kind not in _told:
+        _told.add(kind)
+        logger.warning('MuJoCo, of a foreseen future: %s', kind)
+
+
+#: warnings that were told
+_told: set[str] = set()
+
+
 class Engine:
     """Computes futures of a robot and solids; holds compiled scenes and threads.
 
@@ -91,6 +102,7 @@ class Engine:
     def __init__(self, arms: Arms, threads: int = 1) -> None:
         self.arms, self._threads = arms, max(threads, 1)
         self._scenes: dict[tuple[str, ...], tuple[Scene, list[Any]]] = {}
+        mujoco.set_mju_user_warning(_log_once)
         self._rollout = Rollout(nthread=0 if threads < 2 else threads)
 
     def scene_of(self, kinds: Sequence[str]) -> tuple[Scene, list[Any]]:

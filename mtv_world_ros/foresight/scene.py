@@ -10,12 +10,12 @@ from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arms import Arms, PATCH_M, set_drives, SOLIDS
+from mtv_world_ros.foresight.library import mujoco
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
