@@ -149,15 +149,9 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
-<<<<<<< HEAD
     motion = None
-    if loaded.object_motion is not None:
-        motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
-=======
-    motion = None  # its helpers start while the world model is loaded
     if foresight and loaded.object_motion is not None:
-        motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
->>>>>>> e616973ccc5af8694deea05b612afad4dc7f1cc2^
+        motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
