@@ -16,7 +16,7 @@ MARKER = f'resource/{PACKAGE}'
 #: modules of commands on each floor
 GROUND_COMMANDS = ('imagine', 'view')
 LAB_COMMANDS = (
-    'calibrate', 'datasets', 'demo', 'distill', 'evaluate', 'fit_contact', 'import_weights',
+    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'import_weights',
     'own_robot', 'train', 'train_motion',
 )  # fmt: skip
 BENCH_COMMANDS = ('collect', 'rank')
