@@ -57,6 +57,7 @@ def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidato
 #: a YAML list
 ListOf = Annotated[tuple[Item, ...], Strict(False)]
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[float, float], Strict(False), expected('a list of 2 numbers')]
 #: [m]; what is further away is a mistake of the unit, or worse

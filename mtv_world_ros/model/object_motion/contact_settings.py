@@ -12,6 +12,24 @@ Friction = Annotated[float, Field(ge=0.01, le=10)]
 Thickness = Annotated[float, Field(ge=1e-4, le=0.1)]
 
 
+class ContactSpread(Schema):
+    """How exactly what futures begin with is known: standard deviations."""
+
+    place_m: float = Field(default=0.001, ge=0, le=1, description='of where objects are [m]')
+    turn_rad: float = Field(default=0.02, ge=0, le=4, description='of how they are turned [rad]')
+    size: float = Field(default=0.015, ge=0, le=1, description='of their sizes, relative')
+    friction: float = Field(default=0.2, ge=0, le=3, description='of what rubs, relative')
+    weight: float = Field(default=0.3, ge=0, le=3, description='of densities, relative')
+    grip: float = Field(
+        default=0.2, ge=0, le=3, description='of the friction of fingers, relative'
+    )
+    force: float = Field(default=0.2, ge=0, le=3, description='of the force of fingers, relative')
+    zero_rad: float = Field(default=0.002, ge=0, le=1, description='of the zeros of joints [rad]')
+    delay_s: float = Field(
+        default=0.005, ge=0, le=1, description='of how late commands take effect [s]'
+    )
+
+
 class ContactSettings(Schema):
     """Numbers of contact, found in recorded episodes (`training/object_motion/contact_fit.py`)."""
 
@@ -32,4 +50,7 @@ class ContactSettings(Schema):
     rim_m: Thickness = Field(default=0.01, description='thickness of the rim of plates and bowls')
     wall_m: Thickness = Field(default=0.005, description='of the walls of cups and of boxes')
     table_m: Metres = Field(default=0.0, description='its height in the base frame [m]')
+    spread: ContactSpread = Field(
+        default=ContactSpread(), description='how exactly all this is known'
+    )
     num_motions: int = Field(default=4, ge=1, le=64, description='the last ones disturbed')
