@@ -13,6 +13,13 @@ from setuptools import find_packages, setup
 PACKAGE = 'mtv_world_ros'
 SHARE = f'share/{PACKAGE}'
 MARKER = f'resource/{PACKAGE}'
+#: modules of commands on each floor
+GROUND_COMMANDS = ('imagine', 'view')
+LAB_COMMANDS = (
+    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'import_weights',
+    'own_robot', 'train', 'train_motion',
+)  # fmt: skip
+BENCH_COMMANDS = ('collect', 'rank')
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:
@@ -50,6 +57,7 @@ setup(
         'lz4>=4.3',
         'mcap>=1.6',
         'mcap-ros2-support>=0.6',
+        'mujoco>=4.0,<5',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pin>=4.1,<5',
@@ -81,8 +89,8 @@ setup(
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
         # `mtv-world rank --ray`: rollouts on a Ray cluster; pulls no torch.
         'rank': ['ray>=2.60,<3'],
-        # The simulator; it also needs an OpenGL library, see docs/installation.md.
-        'sim': ['mujoco>=4.0,<5'],
+        # The simulator needs nothing more but an OpenGL library, see docs/installation.md.
+        'sim': [],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
         'ros': [
             f'{name}; sys_platform == "linux" and platform_machine == "x86_64"'
@@ -102,6 +110,19 @@ setup(
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
             'world_model = mtv_world_ros.ros:run_world_model',
+        ],
+        # A module of commands adds them to the parser: `add(subparsers)`.
+        'mtv_world.commands': [
+            *(f'{name} = {PACKAGE}.cli.{name}' for name in GROUND_COMMANDS),
+            *(f'{name} = {PACKAGE}.lab.cli.{name}' for name in LAB_COMMANDS),
+            *(f'{name} = {PACKAGE}.bench.cli.{name}' for name in BENCH_COMMANDS),
+        ],
+        # Policy kinds that the simulator makes.
+        'mtv_world.policies': [f'scripted = {PACKAGE}.bench.expert.policy_kind'],
+        # Folders whose rollouts `mtv-world view` shows.
+        'mtv_world.rollouts': [
+            f'ranking = {PACKAGE}.bench.ranking.shown_rollouts',
+            f'evaluation = {PACKAGE}.lab.evaluation.shown_rollouts',
         ],
     },
     zip_safe=True,

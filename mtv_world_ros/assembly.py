@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.entry_points import policy_kind
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
@@ -134,8 +135,8 @@ def load_pipeline(
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
     """
+    from mtv_world_ros.foresight.loading import load_foresight
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import load_predictor
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -148,9 +149,9 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
-    motion = None  # its helpers start while the world model is loaded
+    motion = None
     if foresight and loaded.object_motion is not None:
-        motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
+        motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
@@ -292,7 +293,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     """
     config = policy_settings(name, robot)
     if isinstance(config, ScriptedPolicySettings):
-        return _scripted(config, robot)
+        return policy_kind(config.kind).policy_maker(config, robot)
     if isinstance(config, RecordedPolicySettings):
         return partial(_recorded, config, robot)
     made = config.make()
@@ -305,34 +306,13 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
-    from mtv_world_ros.bench.expert.faults import parse_variant
-
     if str(name).startswith('expert'):
         config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
     else:
         config = load_policy_config(bundled('policies', name, 'policy'), robot)
     if isinstance(config, ScriptedPolicySettings):
-        parse_variant(config.variant)
+        policy_kind(config.kind).check(config)
     return config
-
-
-def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
-    from mtv_world_ros.bench.expert.expert import Expert
-    from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
-
-    variant = settings.variant
-    expert = Expert(robot)
-
-    def make(origin: EpisodeOrigin) -> Policy:
-        task, scene_seed = origin.task, origin.scene_seed
-        if not task or scene_seed < 0:
-            raise PolicyError(
-                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
-                "'scene_seed' to those of the recorded episode"
-            )
-        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
-
-    return make
 
 
 def _recorded(

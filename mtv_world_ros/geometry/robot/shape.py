@@ -153,7 +153,7 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     missing: list[str] = []
     for kind in ('visual', 'collision'):
         try:
-            shapes = list(_shapes(link, kind, urdf))
+            shapes = list(shapes_of(link, kind, urdf))
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
@@ -162,7 +162,13 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     return [], missing
 
 
-def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+    """Yields the shapes of a link's elements of a kind, `visual` or `collision`.
+
+    Raises:
+        FileNotFoundError: a mesh is not there.
+        RobotError: see `load_shape`.
+    """
     for element in link.findall(kind):
         geometry = element.find('geometry')
         if geometry is None or len(geometry) == 0:
@@ -174,6 +180,7 @@ def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkSh
             raise RobotError(
                 f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
             ) from error
+<<<<<<< HEAD
         pose = _origin(element.find('origin'))
         for points in pieces:
             yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
@@ -229,6 +236,10 @@ def _slice(
         found.append(a + share * (b - a))
     points = np.concatenate(found)
     return outermost(points, _SLICE_DIRECTIONS)
+=======
+        pose = shape_origin(element.find('origin'))
+        yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
+>>>>>>> origin/main
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
@@ -321,7 +332,8 @@ def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
     return points[np.unique((points @ _directions(directions).T).argmax(axis=0))]
 
 
-def _origin(element: ElementTree.Element | None) -> FloatArray:
+def shape_origin(element: ElementTree.Element | None) -> FloatArray:
+    """Returns the (4, 4) pose of an `<origin>`."""
     T = np.eye(4)
     if element is not None:
         T[:3, 3] = np.array(element.get('xyz', '0 0 0').split(), float)
