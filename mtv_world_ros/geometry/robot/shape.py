@@ -91,7 +91,7 @@ def load_shape(robot: RobotModel) -> RobotShape:
         link.attrib['name']: link
         for link in ElementTree.fromstring(read_text(path, 'urdf_bytes')).iter('link')
     }
-    found = {name: link_shapes(link, path) for name, link in links.items()}
+    found = {name: link_shapes(link, path, sliced=True) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
     missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
@@ -148,12 +148,14 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
     return LinkShape(link=link, points=_moved(T, _cylinder(ROD_RADIUS_M, length)))
 
 
-def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape], list[str]]:
+def link_shapes(
+    link: ElementTree.Element, urdf: Path, *, sliced: bool = False
+) -> tuple[list[LinkShape], list[str]]:
     """Returns a link's shapes, and why there are none; collisions stand in for visuals."""
     missing: list[str] = []
     for kind in ('visual', 'collision'):
         try:
-            shapes = list(shapes_of(link, kind, urdf))
+            shapes = list(shapes_of(link, kind, urdf, sliced=sliced))
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
@@ -162,8 +164,12 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     return [], missing
 
 
-def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+def shapes_of(
+    link: ElementTree.Element, kind: str, urdf: Path, *, sliced: bool = False
+) -> Iterator[LinkShape]:
     """Yields the shapes of a link's elements of a kind, `visual` or `collision`.
+
+    With `sliced`, a mesh that is far from convex is given in slices.
 
     Raises:
         FileNotFoundError: a mesh is not there.
@@ -174,20 +180,19 @@ def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[Link
         if geometry is None or len(geometry) == 0:
             continue
         try:
-            pieces = _pieces(geometry[0], urdf)
+            pieces = _pieces(geometry[0], urdf, sliced)
         except KeyError as error:
             name = link.attrib['name']
             raise RobotError(
                 f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
             ) from error
-<<<<<<< HEAD
-        pose = _origin(element.find('origin'))
+        pose = shape_origin(element.find('origin'))
         for points in pieces:
             yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
 
 
-def _pieces(shape: ElementTree.Element, urdf: Path) -> list[FloatArray]:
-    """Convex parts (N, 3) of a shape; a mesh that is far from convex is cut into slices."""
+def _pieces(shape: ElementTree.Element, urdf: Path, sliced: bool) -> list[FloatArray]:
+    """Convex parts (N, 3): one of a shape, or the slices of a mesh that is far from convex."""
     if shape.tag != 'mesh':
         return [_points(shape, urdf)]
     scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
@@ -196,6 +201,8 @@ def _pieces(shape: ElementTree.Element, urdf: Path) -> list[FloatArray]:
         raise FileNotFoundError(f"'{shape.attrib['filename']}'")
     mesh = _load_mesh(file)
     vertices = np.asarray(mesh.vertices(), np.float64)
+    if not sliced:
+        return [outermost(vertices) * scale]
     return [piece * scale for piece in _convex_pieces(vertices, _edges(mesh))]
 
 
@@ -236,10 +243,6 @@ def _slice(
         found.append(a + share * (b - a))
     points = np.concatenate(found)
     return outermost(points, _SLICE_DIRECTIONS)
-=======
-        pose = shape_origin(element.find('origin'))
-        yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
->>>>>>> origin/main
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
