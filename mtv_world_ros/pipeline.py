@@ -40,9 +40,11 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.rollout_state import ChunkPlan, fit_observation, RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
+from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_of, ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
+from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -113,6 +115,7 @@ class Pipeline:
         horizon: how J falls with the horizon, where it was measured.
         object_motion: where objects go, for models whose trajectory videos show that; None = the
             trajectory video shows them where they were.
+        camera_checker: compares the first pictures with the arm's outline; None = nothing does.
     """
 
     robot: RobotModel
@@ -125,6 +128,7 @@ class Pipeline:
     describer: Describer | None = None
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
+    camera_checker: CameraChecker | None = None
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -133,10 +137,11 @@ class Pipeline:
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
         """Returns the same for a robot of the same joints and tools, e.g. a calibrated one."""
-        motion = self.object_motion
+        motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
             robot=robot,
+            camera_checker=None if checker is None else checker.with_robot(robot),
             object_motion=None if motion is None else motion.with_robot(robot),
         )
 
@@ -163,8 +168,11 @@ class Pipeline:
         Raises:
             ObservationError: the views are not the model's.
         """
+        checker = self.camera_checker
+        check = CameraCheck() if checker is None else checker.check(observation)
         return ImaginedEpisode(
             pipeline=self,
+            camera_check=check,
             instruction=instruction,
             objects=objects,
             seed=seed,
@@ -172,7 +180,7 @@ class Pipeline:
             num_inference_steps=num_inference_steps,
             limit_tolerance=limit_tolerance,
             should_stop=should_stop,
-            _rollouts=(RolloutState.at(observation, self.spec),),
+            _rollouts=(RolloutState.at(check.corrected_observation(observation), self.spec),),
         )
 
     def draw(
@@ -230,6 +238,7 @@ class ImaginedEpisode:
         limit_tolerance: joints may exceed their limits by this [rad or m].
         should_stop: asked between denoising steps and between chunks.
         num_chunks: imagined so far.
+        camera_check: what the first pictures say about the cameras, which are corrected by it.
     """
 
     pipeline: Pipeline
@@ -241,6 +250,7 @@ class ImaginedEpisode:
     limit_tolerance: float
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
+    camera_check: CameraCheck = CameraCheck()
     _rollouts: tuple[RolloutState, ...]
     _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
     _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
@@ -319,6 +329,8 @@ class ImaginedEpisode:
         success, memory = self._judge(state, positions, start_masks, masks, is_real=True)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
         state = state.after(frames, positions[-1], stamp_ns, spec.num_history, memory)
+        if cameras is not None:
+            cameras = self.camera_check.corrected(cameras)
         last = replace(state.observation, cameras=cameras or state.observation.cameras)
         self._rollouts = (replace(state, observation=last, num_imagined=0, source=last),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
@@ -333,6 +345,7 @@ class ImaginedEpisode:
         Raises:
             ObservationError: the views are not the model's.
         """
+        observation = self.camera_check.corrected_observation(observation)
         state, before = RolloutState.at(observation, self.pipeline.spec), self._rollouts[0]
         state = replace(state, memory=before.memory, first=before.first)
         return replace(self, _rollouts=(state,))
@@ -555,9 +568,11 @@ class ImaginedEpisode:
         )
         num_left = pipeline.spec.num_frames - footage.num_frames
         foreseen = None if objects is None else self._foreseen(state, objects, num_left)
-        return pipeline.estimator.estimate(
+        judged = pipeline.estimator.estimate(
             footage, self.instruction, state.memory, foreseen, is_real=is_real
         )
+        check = self.camera_check
+        return judged._replace(estimate=doubted(judged.estimate, check.notes, check.refusal))
 
     def _foreseen(
         self, state: RolloutState, objects: FoundObjects, num_left: int

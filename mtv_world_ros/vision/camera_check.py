@@ -15,8 +15,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import camera_poses, project, scaled, unproject
@@ -41,21 +40,24 @@ _PRIOR = np.array([0.02] * 3 + [0.015] * 3)
 #: standard deviation of an edge's place as a share of the width, at least [px]; neighbouring
 #: points of an outline are not independent: so many count as one
 _EDGE, _LEAST_EDGE_PX, _ALIKE = 0.003, 0.4, 6.0
-#: an outline fits where its edges are met better than under other shifts by so many deviations
-_CLEAR = 3.0
+#: an outline is met better than under other shifts by so many deviations, else nothing shows
+_CLEAR = 4.0
+#: an edge is met within a pixel where it is so strong; share of an outline's points that must be
+#: met for a pose to be believed, and below which the arm is elsewhere
+_MET, _BELIEVED, _ELSEWHERE = 0.5, 0.62, 0.5
 #: offsets of what the camera looks at, as shares of the width: smaller ones are none, larger ones
 #: are not corrected
 _NONE, _LARGE = 0.006, 0.07
 #: a pose known worse than this, of what is looked at, as a share of the width, says nothing
-_UNSURE = 0.006
+_UNSURE = 0.012
 
 
 class _Edges(NamedTuple):
     """Structure of edges, each (H, W) float32: of a unit normal n the strength is n' E n, 0..1."""
 
-    xx: NDArray[np.float32]
-    xy: NDArray[np.float32]
-    yy: NDArray[np.float32]
+    xx: np.ndarray
+    xy: np.ndarray
+    yy: np.ndarray
 
 
 class _Outline(NamedTuple):
@@ -101,6 +103,13 @@ class CameraCheck:
     """What the pictures of an episode's first frame say about its cameras."""
 
     fits: tuple[CameraFit, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The findings in words."""
+        if not self.fits:
+            return 'not checked'
+        return '; '.join(self.notes) or 'the arm is where they should show it'
 
     @property
     def refusal(self) -> str:
@@ -171,7 +180,7 @@ class _Found(NamedTuple):
 
     Attributes:
         T: (4, 4) the found optical frame in the told one.
-        offset: mean shift of the outline, as a share of the width.
+        offset: mean shift of the outline, as a share of the width; NaN = it is met nowhere near.
     """
 
     T: FloatArray
@@ -179,6 +188,12 @@ class _Found(NamedTuple):
 
 
 def _judged(camera: CameraModel, found: _Found) -> CameraFit:
+    if not np.isfinite(found.offset):
+        text = (
+            f"camera '{camera.view}' does not show the arm where joint states and calibration put "
+            'it, nor near; calibrate it again (mtv-world calibrate-camera), see mtv-world doctor'
+        )
+        return CameraFit(view=camera.view, status='refused', T_told_found=np.eye(4), text=text)
     off_m = float(np.linalg.norm(found.T[:3, 3]))
     off_deg = float(np.rad2deg(np.linalg.norm(cv2.Rodrigues(found.T[:3, :3])[0])))
     says = (
@@ -212,8 +227,7 @@ def _search(
     """The pose at which outline and picture agree, or why there is none."""
     if camera.width > _WIDTH:
         camera = scaled(camera, _WIDTH, round(camera.height * _WIDTH / camera.width))
-    edges = _edges(frame, camera)
-    links = _links(robot, parts, positions)
+    edges, links = _edges(frame, camera), _links(robot, parts, positions)
     T_told = camera_poses(camera, robot, positions[None])[0]
     told = _outline(camera, links, T_told)
     if len(told.pixels) < _FEWEST_POINTS:
@@ -221,18 +235,18 @@ def _search(
     shift, clear = _shift(edges, told, camera.width)
     if clear < _CLEAR:
         return 'its outline does not stand out in the picture'
-    T = T_told @ _turned_by(camera, shift)
-    covariance = np.diag(_PRIOR**2)
+    T, covariance = T_told @ _turned_by(camera, shift), np.diag(_PRIOR**2)
     for window in _WINDOWS:
         outline = _outline(camera, links, T)
-        if len(outline.pixels) < _FEWEST_POINTS:
-            return 'the arm is hardly in view'
         T, covariance = _stepped(edges, outline, camera, T_told, T, window * camera.width)
-    slopes = _slopes(camera, told.points)
-    spread = np.einsum('nij,jk,nik->n', slopes, covariance, slopes)
-    if float(np.sqrt(spread.mean())) > _UNSURE * camera.width * 2:
-        return 'too little of its outline is seen to say where the camera is'
+    met = _met(edges, _outline(camera, links, T))
     T_told_found = inverse(T_told) @ T
+    if met < _ELSEWHERE:
+        return _Found(T_told_found, np.nan)
+    slopes = _slopes(camera, told.points)
+    spread = np.einsum('nij,jk,nik->n', slopes, covariance, slopes).mean()
+    if met < _BELIEVED or float(np.sqrt(spread)) > _UNSURE * camera.width:
+        return f'only {met:.0%} of its outline is met in the picture, which is too little'
     moved, _ = project(camera, T_told_found, told.points)
     offset = float(np.nanmean(np.linalg.norm(moved - told.pixels, axis=-1)))
     return _Found(T_told_found, offset / camera.width)
@@ -268,7 +282,7 @@ def _outline(
     image = fill([part[None] for part in np.split(corners, ends)], camera)[0]
     lines, _ = cv2.findContours(image, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if not lines:
-        return _Outline(*np.zeros((2, 0, 2)), np.zeros((0, 3)))
+        return _Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)))
     at = np.concatenate(lines)[:, 0].astype(np.float64)
     inner = ((at > 1) & (at < np.array([camera.width - 2, camera.height - 2]))).all(-1)
     at = at[inner][:: max(1, int(inner.sum()) // _MOST_POINTS)]
@@ -281,7 +295,7 @@ def _outline(
     rays = unproject(camera, at)
     # as deep as the corners that are nearest in the picture
     known = np.isfinite(corners).all(-1)
-    _, nearest = cKDTree(corners[known]).query(at)
+    _, nearest = KDTree(corners[known]).query(at)
     scale = depths[known][nearest] / rays[:, 2]
     return _Outline(at, normals, rays * scale[:, None])
 
@@ -308,6 +322,13 @@ def _shift(edges: _Edges, outline: _Outline, width: int) -> tuple[FloatArray, fl
     score = _strength(blurred, at, outline.normals[thin]).mean(0)
     best = int(score.argmax())
     return shifts[best], float((score[best] - score.mean()) / max(float(score.std()), 1e-9))
+
+
+def _met(edges: _Edges, outline: _Outline) -> float:
+    """Share of an outline's points at which the picture has an edge."""
+    near = np.array([-1.0, 0.0, 1.0])[None, :, None] * outline.normals[:, None]
+    strength = _strength(edges, outline.pixels[:, None] + near, outline.normals)
+    return float((strength.max(axis=1) > _MET).mean()) if len(strength) else 0.0
 
 
 def _turned_by(camera: CameraModel, shift: FloatArray) -> FloatArray:
