@@ -106,6 +106,11 @@ class Settings(NodeSettings):
         "Foresee where objects go, where the checkpoint can; false = the paper's way: trails and "
         'first masks are drawn, and pictures alone decide.',
     )
+    camera_check: bool = at_start(
+        True,
+        "Compare the first pictures of an episode with the arm's outline, correct small errors of "
+        'the calibration for the episode, and give no verdict on large ones.',
+    )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'

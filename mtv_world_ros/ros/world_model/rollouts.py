@@ -199,6 +199,7 @@ class Rollouts:
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            'cameras': self._worker.camera_check.text,
             **self._live.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
