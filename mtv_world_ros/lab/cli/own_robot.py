@@ -124,12 +124,13 @@ def _draw_robot(robot: RobotModel, path: Path) -> None:
 def _add_doctor(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'doctor',
-        help='check calibration, joints and clocks of an episode or of running topics',
+        help='check calibration, joints, clocks and pictures of an episode, of all episodes of a '
+        'folder, or of running topics',
         epilog='Exit status: 0 where everything was checked and is ok, 1 where something is '
         'suspicious or broken, 3 where nothing wrong was found but not everything could be '
         'checked.',
     )
-    parser.add_argument('episode', type=Path, nargs='?')
+    parser.add_argument('episode', type=Path, nargs='?', help='an episode, or a folder of them')
     parser.add_argument('--live', action='store_true', help='check the running ROS topics')
     parser.add_argument(
         '--seconds', type=float, default=10.0, help='with --live: how long to record'
@@ -147,6 +148,9 @@ def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.live == (arguments.episode is not None):
         raise ConfigError('name an EPISODE, or give --live to check the running topics')
     if not arguments.live:
+        paths = _episodes_in(arguments.episode)
+        if paths:
+            return _check_folder(arguments, paths)
         return _check(arguments, arguments.episode, arguments.episode.name)
     from mtv_world_ros.lab.inspection.live import record_topics
 
@@ -160,6 +164,44 @@ def _doctor(arguments: argparse.Namespace) -> int:
         )
         bag = record_topics(arguments.views, Path(folder) / 'live', arguments.seconds)
         return _check(arguments, bag, 'live')
+
+
+def _episodes_in(path: Path) -> list[Path]:
+    """Episodes of a folder that is none itself."""
+    from mtv_world_ros.data.episode_reader import list_episodes
+
+    found = list_episodes(path) if path.is_dir() else []
+    return [] if path in found else found
+
+
+def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.lab.inspection.folder import (
+        folder_markdown,
+        folder_picture,
+        folder_text,
+        inspect_folder,
+    )
+    from mtv_world_ros.lab.inspection.inspect import load_inspector
+    from mtv_world_ros.rendering.images import write_png
+
+    file, source = robot_file(arguments, paths[0])
+    inspector = load_inspector(file)
+    found, pictures = inspect_folder(
+        tqdm(paths, unit='ep'),
+        inspector,
+        lambda path: read_for_checks(path, arguments.views, source, inspector.robot),
+    )
+    out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
+    picture = folder_picture(pictures)
+    if picture is not None:
+        write_png(out / 'episodes.png', picture)
+    write_whole(out / 'report.md', folder_markdown(found, 'episodes.png'))
+    print(folder_text(found))
+    print(f"{found.verdict}: see '{out / 'report.md'}'")
+    return _STATUS[found.verdict]
 
 
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
@@ -289,7 +331,7 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.cli.shared_camera import calibrate_shared, is_shared
+    from mtv_world_ros.lab.cli.shared_camera import calibrate_shared, is_shared
 
     if is_shared(arguments):
         return calibrate_shared(arguments)

@@ -40,6 +40,8 @@ _NUM_SEARCHED = 4
 _NUM_POINT_STARTS = 24
 #: standard deviation of where a place is, against where the background says [`UNITS`]
 _OWN_STD = np.array([3.0] * 3 + [2.0] * 3)
+#: standard deviation of where somebody sees a tool point [share of the image width]
+_POINT_STD = 0.006
 #: weight of these against the mean squared errors of a recording's pixels
 _STIFFNESS = 0.003
 #: a zoom's unit, and its standard deviation where the focal length is known or a mere guess
@@ -114,6 +116,7 @@ class JointCamera:
         self._recordings, self._places = list(recordings), list(places)
         self._zoom_std = _ZOOM_KNOWN if intrinsics_known else _ZOOM_GUESSED
         self._centre = np.mean([one.centre for one in recordings], axis=0)
+        self._points: Sequence[SeenPoint] = ()
         self._seen: dict[tuple[int, int, float, Reading], Changes] = {}
 
     def estimate(
@@ -131,6 +134,7 @@ class JointCamera:
             points: seen tool points, of any of the recordings.
             seed: of the search.
         """
+        self._points = points
         if guess is not None:
             starts = [guess]
         elif points:
@@ -148,7 +152,7 @@ class JointCamera:
         best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
         if guess is None:
             best = self._respread(places.near(_NEAR)[0], best, places)
-        return self.refined(best, _STAGES[1:], 6)
+        return self.refined(best, _STAGES[1:], 9)
 
     def from_points(
         self, places: CameraPlaces, points: Sequence[SeenPoint], seed: int = 0
@@ -293,7 +297,7 @@ class JointCamera:
     def _aligned(
         self, state: JointState, changes: Mapping[int, Changes], iterations: int
     ) -> JointState:
-        damping, cost = 0.01, self._cost(state, changes)
+        damping, cost = 1e-3, self._cost(state, changes)
         for _ in range(iterations):
             steps = self._steps(state, changes)
             tried = self._moved(state, steps, damping)
@@ -301,7 +305,7 @@ class JointCamera:
             if there < cost:
                 gain = (cost - there) / cost
                 state, cost, damping = tried, there, damping / 4
-                if gain < 2e-4:
+                if gain < 1e-4:
                     break
             else:
                 damping *= 12
@@ -318,12 +322,47 @@ class JointCamera:
     def _cost(self, state: JointState, changes: Mapping[int, Changes]) -> float:
         pulls = [(state.own(place) / _OWN_STD) ** 2 for place in state.poses]
         prior = (np.log(state.zoom) / self._zoom_std) ** 2 + float(np.sum(pulls))
+        for point in self._points:
+            apart = self._point_error(
+                point, state.poses[self._places[point.recording]], state.zoom
+            )
+            prior += 2 * float(np.log1p((apart**2).sum() / 2))
         total = _STIFFNESS / _OUTLIER**2 * prior
         for number in changes:
             T = state.poses[self._places[number]]
             errors = self._errors(number, T, state.zoom, changes)
             total += float(np.log1p((errors / _OUTLIER) ** 2).mean())
         return total
+
+    def _point_error(self, point: SeenPoint, T: FloatArray, zoom: float) -> FloatArray:
+        """(2,) how far a point is drawn from where it was seen [standard deviations]."""
+        camera = self._recordings[0].camera
+        local = T[:3, :3].T @ (point.position - T[:3, 3])
+        pixel = zoom * camera.K[[0, 1], [0, 1]] * local[:2] / max(float(local[2]), 0.05)
+        return (pixel + camera.K[:2, 2] - point.pixel) / (_POINT_STD * camera.width)
+
+    def _add_points(self, state: JointState, found: dict[int, _Step]) -> None:
+        """Adds the seen points to the normal equations of their places."""
+        for point in self._points:
+            place = self._places[point.recording]
+            if place not in found:
+                continue
+            T, zoom = state.poses[place], state.zoom
+            now = self._point_error(point, T, zoom)
+            slopes = [
+                (self._point_error(point, moved(T, row, self._centre), zoom)
+                 - self._point_error(point, moved(T, -row, self._centre), zoom)) / 2
+                for row in np.diag(UNITS)
+            ]  # fmt: skip
+            wide = self._point_error(point, T, zoom * np.exp(_ZOOM_UNIT))
+            narrow = self._point_error(point, T, zoom * np.exp(-_ZOOM_UNIT))
+            table = np.stack([*slopes, (wide - narrow) / 2])
+            weight = _STIFFNESS / (1 + float((now**2).sum()) / 2)
+            step = found[place]
+            found[place] = _Step(
+                normal=step.normal + weight * (table @ table.T),
+                gradient=step.gradient + weight * (table @ now),
+            )
 
     def _steps(self, state: JointState, changes: Mapping[int, Changes]) -> dict[int, _Step]:
         """Normal equations by place."""
@@ -350,6 +389,7 @@ class JointCamera:
             found[place] = step if before is None else _Step(
                 normal=before.normal + step.normal, gradient=before.gradient + step.gradient
             )  # fmt: skip
+        self._add_points(state, found)
         return found
 
     def _moved(self, state: JointState, steps: Mapping[int, _Step], damping: float) -> JointState:

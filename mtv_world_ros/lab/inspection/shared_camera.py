@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from mtv_world_ros.bounded_input import read_text
+from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError
@@ -192,7 +191,7 @@ def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
     Raises:
         ConfigError: the file is no such table, or has fewer than four points of the view.
     """
-    values = yaml.safe_load(read_text(path, 'yaml_bytes', '--points'))
+    values = read_yaml(path, 'points file', '--points')
     rows = values.get(view) if isinstance(values, dict) else None
     try:
         found = {
