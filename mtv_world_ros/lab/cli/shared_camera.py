@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.data_types import CameraModel
     from mtv_world_ros.geometry.robot.model import RobotModel
+    from mtv_world_ros.geometry.robot.shape import LinkShape
     from mtv_world_ros.lab.inspection.shared_camera import SharedEstimate
 
 
@@ -77,7 +78,7 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
     )
     print(describe(estimate, episodes, focal_known=known))
-    _write(arguments, estimate, episodes, robot)
+    _write(arguments, estimate, episodes, robot, shape.parts)
     return 0
 
 
@@ -121,12 +122,12 @@ def _write(
     estimate: SharedEstimate,
     episodes: Sequence[Episode],
     robot: RobotModel,
+    parts: Sequence[LinkShape],
 ) -> None:
     """Writes a calibration file and a picture a place, and with `--apply` into the episodes."""
     from dataclasses import replace
 
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
-    from mtv_world_ros.geometry.robot.shape import load_shape
     from mtv_world_ros.lab.inspection.clocks import JointTrack
     from mtv_world_ros.lab.inspection.inspect import overlay_picture
     from mtv_world_ros.rendering.images import write_png
@@ -145,7 +146,6 @@ def _write(
         states = episodes[first].joint_states
         assert states is not None
         shown = replace(episodes[first], cameras={view: estimate.cameras[first]})
-        parts = load_shape(robot).parts
         picture = overlay_picture(shown, view, robot, parts, JointTrack(states, robot))
         write_png(file.with_suffix('.png'), picture)
         print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')

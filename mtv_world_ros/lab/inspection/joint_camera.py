@@ -148,7 +148,7 @@ class JointCamera:
             found.sort(key=lambda state: -float(self.fits(state, _FIRST, near).mean()))
             starts = found[:_NUM_REFINED]
             starts = [self._respread(near[0], state, places) for state in starts]
-        ends = [self.refined(start, _STAGES[:1]) for start in starts]
+        ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
         best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
         if guess is None:
             best = self._respread(places.near(_NEAR)[0], best, places)
@@ -165,7 +165,7 @@ class JointCamera:
         X = np.stack([point.position for point in points])
         seen = np.stack([point.pixel for point in points])
         generator = np.random.default_rng(seed)
-        std = 0.003 if self._zoom_std < 0.1 else 0.1
+        std = min(self._zoom_std, 0.3)
 
         def errors(p: FloatArray) -> FloatArray:
             local = (X - p[3:6]) @ cv2.Rodrigues(p[:3])[0]
