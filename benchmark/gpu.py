@@ -38,9 +38,9 @@ _STAND_INS = ('av', 'dartpy', 'mujoco')
 _LEFT_OUT = (':!docs', ':!benchmark/results', ':!.github', ':!findings')
 _TESTS = (
     'test/model/serving/test_serving.py',
-    'test/training/test_trainer.py',
-    'test/training/test_wan_training.py',
-    'test/training/object_motion/test_train_motion.py',
+    'test/lab/training/test_trainer.py',
+    'test/lab/training/test_wan_training.py',
+    'test/lab/training/object_motion/test_train_motion.py',
     'test/vision/segmenters/test_prompted.py',
 )
 _COMPARED = (
