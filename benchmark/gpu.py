@@ -205,6 +205,8 @@ def pack(options: argparse.Namespace) -> int:
             stdout=subprocess.PIPE,
         )
         subprocess.run(['tar', 'x', '-C', str(tree)], input=archive.stdout, check=True)
+        # commands are found by entry points, which stand in a package's metadata
+        subprocess.run([sys.executable, 'setup.py', '--quiet', 'egg_info'], cwd=tree, check=True)
         _install(work / 'site', options.python)
         subprocess.run(
             ['tar', 'cJf', str(options.file.absolute()), '-C', name, 'gpu', 'site'], check=True
