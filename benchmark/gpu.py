@@ -35,6 +35,7 @@ PACKAGES = (
 )  # fmt: skip
 #: what the measured code imports and never calls
 _STAND_INS = ('av', 'dartpy', 'mujoco')
+_PLATFORMS = tuple(f'manylinux{name}_x86_64' for name in ('2014', '_2_17', '_2_27', '_2_28'))
 _LEFT_OUT = (':!docs', ':!benchmark/results', ':!.github', ':!findings')
 _TESTS = (
     'test/model/serving/test_serving.py',
@@ -91,6 +92,8 @@ def run(options: argparse.Namespace) -> int:
     environment = {**os.environ, **_environment(options.out)}
     sections, failed = [], 0
     for part in parts(options.tiny):
+        if part.title not in (options.parts or [part.title]):
+            continue
         begun, log = time.monotonic(), options.out / f'{part.title.lower()}.log'
         with log.open('wb') as stream:
             try:
@@ -223,7 +226,8 @@ def _install(site: Path, python: str) -> None:
     wanted = [pinned.get(name.lower().replace('_', '-'), name) for name in names]
     pip = [sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps', '--target', str(site)]
     pip += ['--python-version', python, '--only-binary', ':all:', *wanted]
-    subprocess.run([*pip, '--platform', 'manylinux_2_28_x86_64'], check=True)
+    platforms = [x for name in _PLATFORMS for x in ('--platform', name)]
+    subprocess.run([*pip, *platforms], check=True)
     for unused in (*site.glob('cmeel.prefix/include'), *site.glob('cmeel.prefix/share')):
         shutil.rmtree(unused)
     for unused in [*site.rglob('*.a'), *site.rglob('*.pyc')]:
@@ -246,6 +250,8 @@ def main() -> int:
     running = commands.add_parser('run', help='run, and print the page')
     running.add_argument('--out', type=Path, default=ROOT / 'out' / 'gpu')
     running.add_argument('--tiny', action='store_true', help='on a CPU, with a small model')
+    titles = [part.title for part in parts(tiny=False)]
+    running.add_argument('--parts', nargs='+', choices=titles, help='default: all')
     running.set_defaults(handler=run)
     options = parser.parse_args()
     return options.handler(options)

@@ -27,12 +27,14 @@ def scripts() -> SimpleNamespace:
 
 
 def test_the_run_on_a_gpu_goes_through_on_a_cpu_at_tiny_size(tmp_path: Path) -> None:
+    # the tests themselves are in this suite, and 14B is the script of Speed again
     command = [sys.executable, ROOT / 'benchmark' / 'gpu.py', 'run', '--tiny', '--out', tmp_path]
+    command += ['--parts', 'Speed', 'Training']
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     assert told.returncode == 0, told.stdout + told.stderr
     page = (tmp_path / 'page.md').read_text()
     assert page.strip() == told.stdout.strip()
-    for part in ('Tests', 'Speed', 'Training', '14B'):
+    for part in ('Speed', 'Training'):
         assert f'## {part}: status 0, ' in page
     for row in ('one step of the transformer', 'tiny_decoder=random', 'seconds a step'):
         assert f'| {row}' in page
