@@ -315,12 +315,14 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
 
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
     from mtv_world_ros.sim.expert.expert import Expert
-    from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+    from mtv_world_ros.sim.expert.scripted_policy import policy_of_recording, scripted_policy
 
     variant = settings.variant
     expert = Expert(robot)
 
     def make(origin: EpisodeOrigin) -> Policy:
+        if origin.recording:
+            return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
         task, scene_seed = origin.task, origin.scene_seed
         if not task or scene_seed < 0:
             raise PolicyError(
