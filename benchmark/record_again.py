@@ -18,7 +18,7 @@ from mtv_world_ros.sim.world.simulator import SimEpisode
 
 def main() -> None:
     """Records."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('episode', type=Path)
     parser.add_argument('--robot', default='yam_bimanual')
     parser.add_argument('--seed', type=int, default=2326626197, help='of tempo and heights')

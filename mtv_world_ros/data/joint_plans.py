@@ -273,7 +273,7 @@ class _Measured:
         known = (self._stamps - stamp_ns) * 1e-9
         inside = known[(known > begin_s + SAME_S) & (known <= end_s + SAME_S)]
         slots = np.floor((inside - begin_s) / _PERIOD_S)
-        return inside[np.unique(slots, return_index=True)[1]]
+        return np.asarray(inside[np.unique(slots, return_index=True)[1]], np.float64)
 
     def completed(
         self,

@@ -130,7 +130,7 @@ def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
     if chosen.outcome_feature:
         source.feature(chosen.outcome_feature)
     for view in chosen.views.values():
-        source.feature(view.feature, ('video', 'image'))
+        source.colour_feature(view.feature)
         for name in view.features():
             source.feature(name)
 
