@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
 
 #: options that are arguments of `load_pipeline`
-_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter')
+_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter', 'foresight')
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +24,13 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--device', default='cpu')
     parser.add_argument(
         '--threads', type=int, default=0, help='CPU threads; 0 = all but one, of two both'
+    )
+    parser.add_argument(
+        '--no-foresight',
+        dest='foresight',
+        action='store_false',
+        help="the paper's way: trails and first masks are drawn, no object motion is foreseen, "
+        'and pictures alone decide',
     )
     parser.add_argument(
         '--steps',
