@@ -9,11 +9,16 @@ import argparse
 from pathlib import Path
 
 from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.bench.collect.record import (
+    carry_out,
+    expert_generator,
+    RecordConfig,
+    write_take,
+)
+from mtv_world_ros.bench.expert.expert import Expert
+from mtv_world_ros.bench.world.recorded_scene import recorded_scene
+from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.sim.collect.record import carry_out, expert_generator, RecordConfig, write_take
-from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.world.recorded_scene import recorded_scene
-from mtv_world_ros.sim.world.simulator import SimEpisode
 
 
 def main() -> None:

@@ -1,0 +1,753 @@
+"""The scripted expert: top-down pick and place as one joint trajectory, and misses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mtv_world_ros.bench.expert.faulty_way_points import pushed, WayPointFaults
+from mtv_world_ros.bench.expert.way_points import Pull, WayPoint
+from mtv_world_ros.bench.shapes import Grasp, SHAPES
+from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, Shake, Task
+from mtv_world_ros.bench.world.physics import physics_named
+from mtv_world_ros.bench.world.placement import side_of
+from mtv_world_ros.bench.world.scene import Place, Scene, SceneObject
+from mtv_world_ros.bench.world.workcell import Workcell, workcell_of
+from mtv_world_ros.data.episode import NOMINAL
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import SimulatorError, TrajectoryError
+from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.transforms import rotation
+
+#: how long an arm stays where it crowds another, before scaling [s]; by how much of the whole way
+#: its share is reduced until it reaches so far
+_STAYS_S, _LESS = 0.4, 0.05
+#: time in which an arm strikes what another carries, before scaling [s]
+_SLAP_S = 0.3
+#: how long after this arm another one follows it, before scaling [s]
+_TAIL_S = 0.4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PickingConfig:
+    """Gaps between fingers and objects.
+
+    Attributes:
+        release: on either side when the fingers let go; they open wholly above [m].
+        miss_margin: between the fingers and an object that is missed, range [m].
+        max_miss: largest shift past an object, across the fingers' travel [m].
+    """
+
+    release: float = 0.008
+    miss_margin: tuple[float, float] = (0.004, 0.01)
+    max_miss: float = 0.045
+
+
+@dataclass(frozen=True, slots=True)
+class Pick:
+    """How one object is taken.
+
+    Attributes:
+        arm: its name.
+        position: of the tool at the grasp (3,) [m].
+        yaw: of the tool [rad].
+        opening: of the gripper on the way down, 0..1.
+        released: its opening when the object is let go, 0..1.
+    """
+
+    arm: str
+    position: FloatArray
+    yaw: float
+    opening: float
+    released: float
+
+
+def grasp_of(subject: SceneObject) -> Grasp:
+    """Returns how the object's shape is taken."""
+    grasp = SHAPES[subject.shape].grasp
+    assert grasp is not None, f'{subject.shape} cannot be grasped'
+    return grasp
+
+
+def tool_yaw(item: SceneObject) -> float:
+    """Returns the yaw nearest to none under which the object looks the same to a gripper."""
+    step = SHAPES[item.shape].step
+    return float((item.yaw + step / 2) % step - step / 2)
+
+
+def tool_offset(subject: SceneObject, yaw: float) -> FloatArray:
+    """Returns the way (3,) from an object's centre, turned by `yaw`, to the tool that holds it."""
+    grasp = grasp_of(subject)
+    out = grasp.offset(subject.size, side_of(subject))
+    height = (grasp.height - 0.5) * subject.size[2]
+    return np.array([out * np.cos(yaw), out * np.sin(yaw), height])
+
+
+def pick_of(subject: SceneObject, arm: str, max_gap: float, config: PickingConfig) -> Pick:
+    """Returns how an object is taken.
+
+    Args:
+        subject: what is taken, where it lies.
+        arm: that takes it.
+        max_gap: way of one finger from closed to open [m].
+        config: gaps.
+    """
+    yaw, grasp = tool_yaw(subject), grasp_of(subject)
+    gap = grasp.width(subject.size) / 2 + config.release
+    return Pick(
+        arm=arm,
+        position=np.asarray(subject.position) + tool_offset(subject, yaw),
+        yaw=yaw,
+        opening=grasp.opening,
+        released=min(1.0, gap / max_gap),
+    )
+
+
+def miss_shift(
+    subject: SceneObject,
+    others: Sequence[SceneObject],
+    max_gap: float,
+    workcell: Workcell,
+    config: PickingConfig,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Returns the sideways shift (3,) [m] with which the closing fingers miss the subject.
+
+    Past a rim it goes outwards, past anything else across the fingers' travel, to the side with
+    more room.
+    """
+    yaw, grasp = tool_yaw(subject), grasp_of(subject)
+    margin = float(rng.uniform(*config.miss_margin))
+    if grasp.rim_m is not None:
+        side = np.sign(grasp.offset(subject.size, side_of(subject)))
+        inner = grasp.opening * max_gap + workcell.finger_thickness_m
+        return side * (grasp.rim_m / 2 + inner + margin) * _direction(yaw)
+    distance = min(subject.size[1] / 2 + workcell.finger_width_m / 2 + margin, config.max_miss)
+    across = distance * _direction(yaw + np.pi / 2)
+    place = np.asarray(subject.position)
+
+    def room(shift: FloatArray) -> float:
+        gaps = [np.linalg.norm((place + shift - item.position)[:2]) for item in others]
+        return float(min(gaps, default=1.0))
+
+    return max((across, -across), key=room)
+
+
+def _direction(yaw: float) -> FloatArray:
+    return np.array([np.cos(yaw), np.sin(yaw), 0.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpertConfig:
+    """Heights, speeds and timing of the expert.
+
+    Attributes:
+        rate_hz: samples of the trajectory per second.
+        above_grasp: height of the pre-grasp over the grasp, range [m].
+        lift: height of the lift, range [m].
+        above_place: height of the pre-place over the place [m].
+        above_drop: the same over a container, where it is let go higher up [m].
+        drop: height of the lowest point over a container's wall, where it is let go [m].
+        retreat: rise after opening [m].
+        close_s: time to close the gripper.
+        open_s: time to open it.
+        swing_s: time of one swing of a shake.
+        speed: mean speed of the tool between way points [m/s], before scaling.
+        least_s: shortest move between way points, before scaling.
+        motion_s: time from first to last motion of a task of one move, range; scaled to it.
+        motions_s: the same for each move of a task of several.
+        overlap_s: how long before a move ends the other arm may start its own.
+        picking: gaps between fingers and objects.
+    """
+
+    rate_hz: float = 50.0
+    above_grasp: tuple[float, float] = (0.09, 0.10)
+    lift: tuple[float, float] = (0.07, 0.10)
+    above_place: float = 0.05
+    above_drop: float = 0.025
+    drop: float = 0.008
+    retreat: float = 0.07
+    close_s: float = 0.4
+    open_s: float = 0.3
+    swing_s: float = 0.45
+    speed: float = 0.22
+    least_s: float = 0.4
+    motion_s: tuple[float, float] = (6.0, 6.5)
+    motions_s: tuple[float, float] = (4.8, 5.2)
+    overlap_s: float = 2.2
+    picking: PickingConfig = PickingConfig()
+
+
+def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
+    """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
+
+    The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
+    along the base's x. `lean` [rad] swings the tool about its own x, in the plane of the travel.
+    """
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    down = np.array([[sin, -cos, 0.0], [-cos, -sin, 0.0], [0.0, 0.0, -1.0]])
+    pose[:3, :3] = down @ rotation((np.sin(lean / 2), 0.0, 0.0, np.cos(lean / 2)))
+    pose[:3, 3] = position
+    return pose
+
+
+def home_positions(robot: RobotModel) -> FloatArray:
+    """Returns the joint positions (J,) of all arms at rest, grippers open."""
+    positions, workcell = np.zeros(len(robot.joint_names)), workcell_of(robot)
+    for tool in robot.tools:
+        solver, near = ArmSolver(robot, tool), workcell.home_joints[tool.arm]
+        pose = top_down(workcell.home_tools[tool.arm], 0.0)
+        positions[solver.indices] = solver.solve(pose, near)
+        if tool.gripper_joint is not None:
+            positions[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
+    return positions
+
+
+def _rise(height: float) -> FloatArray:
+    return np.array([0.0, 0.0, height])
+
+
+def _flat(way: FloatArray) -> FloatArray:
+    """Unit vector (3,) of a way in the plane; none where there is no way."""
+    flat = way * (1, 1, 0)
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def _missed_move(task: Task, rng: np.random.Generator) -> int:
+    return int(rng.integers(len(task.moves)))
+
+
+class Expert:
+    """Plans a task's moves for a scene, from the objects' true start poses."""
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        config: ExpertConfig | None = None,
+        physics: str = NOMINAL,
+    ) -> None:
+        self.robot = robot
+        self.workcell = physics_named(physics).workcell(workcell_of(robot))
+        self.home = home_positions(robot)
+        self._config = config or ExpertConfig()
+        self._solvers = {}
+        for tool in robot.tools:
+            rest = self.home[ArmSolver(robot, tool).indices]
+            self._solvers[tool.arm] = ArmSolver(robot, tool, rest)
+        self._tools = {tool.arm: tool for tool in robot.tools}
+        self._max_gap = {
+            tool.arm: abs(tool.gripper_open - tool.gripper_closed) for tool in robot.tools
+        }
+
+    def plan(
+        self,
+        task: Task,
+        scene: Scene,
+        rng: np.random.Generator,
+        *,
+        miss: bool,
+        faults: WayPointFaults | None = None,
+    ) -> JointTrajectory:
+        """Returns the trajectory (T, J) with velocities that carries out the task's moves.
+
+        Two moves of different arms overlap: one arm reaches out while the other goes home.
+
+        Args:
+            task: what to do.
+            scene: where everything is at the start, and the goals.
+            rng: draws heights, tempo and the size of a miss.
+            miss: displace one grasp so that the gripper closes on nothing.
+            faults: what goes wrong with the way points of one move.
+
+        Raises:
+            SimulatorError: a way point is out of the arm's reach.
+        """
+        now = {item.role: item for item in scene.objects}
+        missed = _missed_move(task, rng) if miss else None
+        rate = self._config.rate_hz
+        positions, busy, last_arm = self.home[None], 1, ''
+        free: dict[str, int] = {}
+        for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
+            pick = self._pick(now, move, rng, miss=number == missed)
+            stops = usual = self._stops(pick, move, now, goal, rng)
+            objects = [np.asarray(item.position) for item in now.values()]
+            is_wrong = faults is not None and number == faults.move_of(len(task.moves))
+            wrong = faults if is_wrong else None
+            if wrong is not None:
+                stops = wrong.applied(stops, pick.yaw, objects)
+                usual = usual if wrong.keeps_tempo else stops
+            pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
+            others = [arm for arm in self._tools if arm != pick.arm]
+            comes: list[tuple[FloatArray, int]] = []
+            if wrong is not None and others:
+                stops, comes = self._company(pick.arm, others[0], stops, wrong, objects, pace)
+            rows = self._follow(pick.arm, stops, pace)
+            overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
+            start = max(1, busy - overlap, free.get(pick.arm, 1))
+            busy = free[pick.arm] = start + len(rows)
+            last_arm = pick.arm
+            positions = self._lay(positions, rows, start, pick.arm)
+            for rows, before in comes:
+                first = max(start + before, free.get(others[0], 1))
+                free[others[0]] = first + len(rows)
+                positions = self._lay(positions, rows, first, others[0])
+            now[move.subject] = replace(now[move.subject], position=goal)
+        return JointTrajectory(
+            joint_names=self.robot.joint_names,
+            times=np.arange(len(positions)) / rate,
+            positions=positions,
+            velocities=np.gradient(positions, 1 / rate, axis=0),
+        )
+
+    @staticmethod
+    def missed_object(task: Task, rng: np.random.Generator) -> str:
+        """Returns the role that `plan` with the same generator misses."""
+        return task.moves[_missed_move(task, rng)].subject
+
+    def _lay(self, whole: FloatArray, rows: FloatArray, start: int, arm: str) -> FloatArray:
+        """Puts one arm's rows into the whole plan from `start` on; the arms rest at home."""
+        num = max(len(whole), start + len(rows))
+        longer = np.concatenate([whole, np.repeat(self.home[None], num - len(whole), axis=0)])
+        columns = self._columns(arm)
+        longer[start : start + len(rows), columns] = rows[:, columns]
+        return longer
+
+    def _columns(self, arm: str) -> list[int]:
+        gripper = self._tools[arm].gripper_joint
+        more = [] if gripper is None else [self.robot.joint_names.index(gripper)]
+        return [*self._solvers[arm].indices, *more]
+
+    def _pick(
+        self, now: dict[str, SceneObject], move: Move, rng: np.random.Generator, *, miss: bool
+    ) -> Pick:
+        subject, config = now[move.subject], self._config.picking
+        arm = self.workcell.arm_at(subject.position[0])
+        gap = self._max_gap[arm]
+        pick = pick_of(subject, arm, gap, config)
+        if not miss:
+            return pick
+        others = [item for item in now.values() if item is not subject]
+        shift = miss_shift(subject, others, gap, self.workcell, config, rng)
+        return replace(pick, position=pick.position + shift)
+
+    def _stops(
+        self,
+        pick: Pick,
+        move: Move,
+        now: dict[str, SceneObject],
+        goal: Place,
+        rng: np.random.Generator,
+    ) -> list[WayPoint]:
+        config, place, yaw, wide = self._config, pick.position, pick.yaw, pick.opening
+        heights = config.lift if isinstance(move, PickPlace) else move.lift
+        above, lift = (_rise(rng.uniform(*r)) for r in (config.above_grasp, heights))
+        start = [
+            WayPoint('above', place + above, yaw, wide),
+            WayPoint('grasp', place, yaw, wide),
+            WayPoint('close', place, yaw, 0.0, config.close_s),
+        ]
+        if isinstance(move, Shake):
+            middle = self._swings(move, pick, place + lift, -side_of(now[move.subject]))
+            down, turned = place + _rise(0.002), yaw
+        else:
+            down, turned = self._place(pick, move, now, goal)
+            pre_place = down + _rise(
+                config.above_place if move.rest != 'in' else config.above_drop
+            )
+            lifted = np.array([*place[:2], max(place[2] + lift[2], pre_place[2])])
+            middle = [
+                WayPoint('lift', lifted, yaw, 0.0),
+                WayPoint('carry', pre_place, turned, 0.0),
+            ]
+        home = self.workcell.home_tools[pick.arm]
+        return [
+            *start,
+            *middle,
+            WayPoint('lower', down, turned, 0.0),
+            WayPoint('open', down, turned, pick.released, config.open_s),
+            WayPoint('retreat', down + _rise(config.retreat), turned, 1.0),
+            WayPoint('home', home, 0.0, 1.0),
+        ]
+
+    def _swings(
+        self, move: Shake, pick: Pick, lifted: FloatArray, inwards: float
+    ) -> list[WayPoint]:
+        upright = WayPoint('lift', lifted, pick.yaw, 0.0)
+        swings = [
+            replace(
+                upright,
+                phase='carry',
+                lean=inwards * move.lean[k % 2],
+                seconds=self._config.swing_s,
+            )
+            for k in range(move.num_swings)
+        ]
+        return [upright, *swings, replace(upright, phase='carry')]
+
+    def _place(
+        self, pick: Pick, move: PickPlace, now: dict[str, SceneObject], goal: Place
+    ) -> tuple[FloatArray, float]:
+        """Tool position and yaw at which the subject is let go."""
+        subject, turned, rest = now[move.subject], pick.yaw, np.asarray(goal)
+        if move.rest != 'table':
+            reference = now[move.reference]
+            turned = tool_yaw(reference)
+            if move.rest == 'in':
+                top = reference.position[2] + reference.size[2] / 2
+                rest = np.array([*goal[:2], top + self._config.drop + subject.size[2] / 2])
+        return rest + tool_offset(subject, turned) + _rise(0.002), turned
+
+    def _timed(self, stops: list[WayPoint], home: FloatArray) -> list[float]:
+        """Time of each segment before scaling [s]."""
+        seconds, before = [], home
+        for point in stops:
+            travel = float(np.linalg.norm(point.position - before))
+            seconds.append(point.seconds or max(travel / self._config.speed, self._config.least_s))
+            before = point.position
+        return seconds
+
+    def _pace(
+        self, arm: str, usual: list[WayPoint], rng: np.random.Generator, *, alone: bool
+    ) -> tuple[float, float]:
+        """The drawn motion time, and what the usual way points take before scaling [s]."""
+        wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
+        return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
+
+    def _company(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        faults: WayPointFaults,
+        objects: list[FloatArray],
+        pace: tuple[float, float],
+    ) -> tuple[list[WayPoint], list[tuple[FloatArray, int]]]:
+        """Way points of a move, and what another arm does meanwhile: rows, and how late."""
+        comes: list[tuple[FloatArray, int]] = []
+        if faults.squeezed:
+            first, came = self._squeeze(arm, other, stops, faults.squeezed, pace)
+            stops, comes = [*first, *stops], [came]
+        for phase, share in faults.crowds.items():
+            comes.append(self._crowd(arm, other, stops, phase, share, pace))
+        if faults.poached:
+            comes.append(self._poach(arm, other, stops, faults.poached, pace))
+        for pull in faults.pulls(stops, objects):
+            comes.append(self._pull(arm, other, stops, pull, pace))
+        comes += self._crossings(arm, other, stops, faults, objects, pace)
+        return stops, comes
+
+    def _crossings(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        faults: WayPointFaults,
+        objects: list[FloatArray],
+        pace: tuple[float, float],
+    ) -> list[tuple[FloatArray, int]]:
+        """What another arm does in this one's way, as `_company` has it."""
+        comes: list[tuple[FloatArray, int]] = []
+        if faults.slapped:
+            comes.append(self._slap(arm, other, stops, faults.slapped, pace))
+        if places := faults.roams(objects):
+            comes.append((self._roam(other, places, pace), 0))
+        if faults.tailed:
+            rows = self._tail(arm, other, stops, faults.tailed, pace)
+            comes.append((rows, self._late(_TAIL_S, pace)))
+        if faults.hindered:
+            comes.append(self._hinder(arm, other, stops, faults.hindered, pace))
+        return comes
+
+    def _crowd(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        phase: str,
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that comes where this one is in a phase, and how late they begin.
+
+        It goes a share of the way, or as much of it as it reaches, and is there just then.
+        """
+        met = [s.phase for s in stops].index(phase)
+        arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
+        return self._visit(other, stops[met].position, share, pace, arrives=arrives)
+
+    def _poach(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that takes what this one put down, and how late they begin.
+
+        It lifts it, carries it towards where it rests itself, and lets it fall. Where it does not
+        reach so far, it closes nearer to there.
+        """
+        met, home = [s.phase for s in stops].index('open'), self.workcell.home_tools[other]
+        let_go, flat, rise = stops[met], np.array([1, 1, 0]), _rise(self._config.retreat)
+
+        def ways(share: float) -> list[WayPoint]:
+            short = (1 - share) * (home - let_go.position) * flat
+            down = replace(let_go, seconds=None).moved(short)
+            back = (home - down.position) * flat
+            pull = size * back / max(float(np.linalg.norm(back)), size)
+            over, shut = down.moved(rise), replace(down, opening=0.0, seconds=self._config.close_s)
+            lifted = replace(over, opening=0.0)
+            carried = lifted.moved(pull)
+            opened = replace(carried, opening=1.0, seconds=self._config.open_s)
+            return [over, down, shut, lifted, carried, opened, self._rests(other)]
+
+        rows, _ = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        leaves = sum(self._timed(stops[: met + 2], self.workcell.home_tools[arm]))
+        return rows, self._late(leaves, pace)
+
+    def _pull(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        pull: Pull,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that closes on something and pulls, and how late they begin.
+
+        Where it does not reach so far, it closes nearer to where it rests.
+        """
+        home, flat = self.workcell.home_tools[other], np.array([1, 1, 0])
+        rise, config = _rise(pull.rise), self._config
+
+        def ways(share: float) -> list[WayPoint]:
+            short = (1 - share) * (home - pull.position) * flat
+            down = WayPoint('above', pull.position + short, 0.0, 1.0)
+            back = (home - down.position) * flat
+            way = pull.size * back / max(float(np.linalg.norm(back)), pull.size)
+            shut = replace(down, opening=0.0, seconds=config.close_s)
+            pulled = replace(shut, seconds=None).moved(way)
+            opened = replace(pulled, opening=1.0, seconds=config.open_s)
+            left = replace(opened, seconds=None).moved(rise)
+            return [down.moved(rise), down, shut, pulled, opened, left, self._rests(other)]
+
+        arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
+        return self._in_time(other, ways, 1.0, pace, arrives, 3)
+
+    def _squeeze(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[list[WayPoint], tuple[FloatArray, int]]:
+        """Way points of an arm that squeezes its object against another one's hand.
+
+        And rows of that one, which pushes from its side, and how late they begin. Where it does
+        not reach so far, it pushes nearer to where it rests.
+        """
+        own, home = (self.workcell.home_tools[one] for one in (arm, other))
+        to, rise = _flat(home - own), _rise(self._config.above_grasp[0])
+        at = replace(next(stop for stop in stops if stop.phase == 'close'), seconds=None)
+
+        def ways(share: float) -> list[WayPoint]:
+            there = at.moved((1 - share) * (home - at.position) * (1, 1, 0))
+            return [*pushed(there, size, rise, -to), self._rests(other)]
+
+        first = pushed(at, size, rise, to)
+        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
+        # both are down beside it at the same time: the one that is sooner there starts later
+        (over, down, *_), (far, near, *_) = self._timed(first, own), self._timed(done, home)
+        late = over + down - far - near
+        first[0] = replace(first[0], seconds=over + max(-late, 0.0))
+        return first, (rows, self._late(late, pace))
+
+    def _slap(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        size: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that strikes what this one carries, and how late they begin.
+
+        That is when it is over its goal. Where the other does not reach so far, it strikes nearer
+        to where it rests.
+        """
+        over, home = max([s.phase for s in stops].index('open') - 2, 0), self._rests(other)
+        met = stops[over]
+
+        def ways(share: float) -> list[WayPoint]:
+            at = met.moved((1 - share) * (home.position - met.position) * (1, 1, 0))
+            to = _flat(at.position - home.position)
+            _, back, hit, _ = pushed(replace(at, seconds=None), size, _rise(0.0), to)
+            return [back, replace(hit, seconds=_SLAP_S), home]
+
+        arrives = sum(self._timed(stops[: over + 1], self._rests(arm).position))
+        return self._in_time(other, ways, 1.0, pace, arrives)
+
+    def _roam(self, other: str, places: list[FloatArray], pace: tuple[float, float]) -> FloatArray:
+        """Rows of another arm that roams through places, low and open, as far as it reaches."""
+        home, rise = self._rests(other), _rise(self._config.retreat)
+
+        def ways(share: float) -> list[WayPoint]:
+            ends = (home.position * (1, 1, 0) + place * (0, 0, 1) for place in places)
+            low = [
+                replace(home, phase='above', position=end + share * (place - end))
+                for place, end in zip(places, ends, strict=True)
+            ]
+            return [low[0].moved(rise), *low, low[-1].moved(rise), home]
+
+        return self._as_far_as_it_reaches(other, ways, 1.0, pace)[0]
+
+    def _tail(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        share: float,
+        pace: tuple[float, float],
+    ) -> FloatArray:
+        """Rows of another arm that does what this one does, a share of the way to each place.
+
+        Or as much of the way as it reaches, in the same time.
+        """
+        seconds = self._timed(stops, self.workcell.home_tools[arm])
+        same = [replace(s, seconds=time) for s, time in zip(stops, seconds, strict=True)]
+        home = replace(self._rests(other), seconds=seconds[-1])
+
+        def ways(share: float) -> list[WayPoint]:
+            shorts = [(1 - share) * (home.position - s.position) * (1, 1, 0) for s in same[:-1]]
+            return [*(s.moved(way) for s, way in zip(same, shorts, strict=False)), home]
+
+        return self._as_far_as_it_reaches(other, ways, share, pace)[0]
+
+    def _hinder(
+        self,
+        arm: str,
+        other: str,
+        stops: list[WayPoint],
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, int]:
+        """Rows of another arm that stands half-way in this one's way, and how late they begin.
+
+        It goes a share of the way there, or as much of it as it reaches, is there as this one has
+        closed, and stays until that is over its goal.
+        """
+        phases = [s.phase for s in stops]
+        closed = phases.index('close')
+        over = max(phases.index('open') - 2, closed)
+        middle = (stops[closed].position + stops[over].position) / 2
+        times = self._timed(stops, self.workcell.home_tools[arm])
+        stays = max(sum(times[closed + 1 : over + 1]), _STAYS_S)
+        arrives = sum(times[: closed + 1])
+        return self._visit(other, middle, share, pace, arrives=arrives, stays=stays, opening=0.0)
+
+    def _visit(
+        self,
+        arm: str,
+        place: FloatArray,
+        share: float,
+        pace: tuple[float, float],
+        *,
+        arrives: float,
+        stays: float = _STAYS_S,
+        opening: float = 1.0,
+    ) -> tuple[FloatArray, int]:
+        """Rows of an arm that goes to a place (3,) and back, and how late they begin.
+
+        It goes a share of the way, or as much of it as it reaches, arrives at a time before
+        scaling [s], and stays there so long [s].
+        """
+        home = self._rests(arm)
+
+        def ways(share: float) -> list[WayPoint]:
+            there = home.position + share * (place - home.position)
+            near = replace(home, phase='above', position=there, opening=opening)
+            return [near, replace(near, seconds=stays), home]
+
+        return self._in_time(arm, ways, share, pace, arrives)
+
+    def _in_time(
+        self,
+        arm: str,
+        ways: Callable[[float], list[WayPoint]],
+        share: float,
+        pace: tuple[float, float],
+        arrives: float,
+        num: int = 1,
+    ) -> tuple[FloatArray, int]:
+        """Rows of `_as_far_as_it_reaches`, and how late they begin.
+
+        So late that the first `num` of its way points are done at a time before scaling [s].
+        """
+        rows, done = self._as_far_as_it_reaches(arm, ways, share, pace)
+        takes = sum(self._timed(done[:num], self.workcell.home_tools[arm]))
+        return rows, self._late(arrives - takes, pace)
+
+    def _late(self, seconds: float, pace: tuple[float, float]) -> int:
+        """Rows before something begins, of a time before scaling [s]; none if it is too late."""
+        return max(round(seconds * pace[0] / pace[1] * self._config.rate_hz), 0)
+
+    def _rests(self, arm: str) -> WayPoint:
+        return WayPoint('home', self.workcell.home_tools[arm], 0.0, 1.0)
+
+    def _as_far_as_it_reaches(
+        self,
+        arm: str,
+        ways: Callable[[float], list[WayPoint]],
+        share: float,
+        pace: tuple[float, float],
+    ) -> tuple[FloatArray, list[WayPoint]]:
+        """Rows and way points of an arm that goes a share of a way, or as much as it reaches."""
+        while True:
+            way = ways(share)
+            try:
+                return self._follow(arm, way, pace), way
+            except SimulatorError:
+                if not share:
+                    raise
+                share = max(share - _LESS, 0.0)
+
+    def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
+        """Minimum-jerk blends between way points, at a pace."""
+        config = self._config
+        home = self._rests(arm)
+        seconds, (wanted, unscaled) = self._timed(stops, home.position), pace
+        ends = np.cumsum([0.0, *seconds]) * wanted / unscaled
+        points, solver = [home, *stops], self._solvers[arm]
+        rows, joints = [], self.home[solver.indices]
+        for time in np.arange(1, round(ends[-1] * config.rate_hz) + 1) / config.rate_hz:
+            k = min(int(np.searchsorted(ends[1:], time)), len(points) - 2)
+            share = np.clip((time - ends[k]) / (ends[k + 1] - ends[k]), 0.0, 1.0)
+            blend = share**3 * (10 - 15 * share + 6 * share**2)
+            a, b = points[k], points[k + 1]
+            pose = top_down(
+                a.position + blend * (b.position - a.position),
+                a.yaw + blend * (b.yaw - a.yaw),
+                a.lean + blend * (b.lean - a.lean),
+            )
+            try:
+                joints = solver.solve(pose, joints)
+            except TrajectoryError as error:
+                raise SimulatorError(str(error)) from error
+            row = self.home.copy()
+            row[solver.indices] = joints
+            self._set_gripper(row, arm, a.opening + blend * (b.opening - a.opening))
+            rows.append(row)
+        return np.asarray(rows)
+
+    def _set_gripper(self, row: FloatArray, arm: str, opening: float) -> None:
+        tool = self._tools[arm]
+        if tool.gripper_joint is not None:
+            row[self.robot.joint_names.index(tool.gripper_joint)] = (
+                tool.gripper_closed + opening * (tool.gripper_open - tool.gripper_closed)
+            )
