@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.entry_points import policy_kind
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
@@ -292,7 +293,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     """
     config = policy_settings(name, robot)
     if isinstance(config, ScriptedPolicySettings):
-        return _scripted(config, robot)
+        return policy_kind(config.kind).policy_maker(config, robot)
     if isinstance(config, RecordedPolicySettings):
         return partial(_recorded, config, robot)
     made = config.make()
@@ -305,17 +306,16 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
-    from mtv_world_ros.bench.expert.faults import parse_variant
-
     if str(name).startswith('expert'):
         config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
     else:
         config = load_policy_config(bundled('policies', name, 'policy'), robot)
     if isinstance(config, ScriptedPolicySettings):
-        parse_variant(config.variant)
+        policy_kind(config.kind).check(config)
     return config
 
 
+<<<<<<< HEAD
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
     from mtv_world_ros.bench.expert.expert import Expert
     from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
@@ -337,6 +337,8 @@ def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMake
     return make
 
 
+=======
+>>>>>>> origin/main
 def _recorded(
     settings: RecordedPolicySettings, robot: RobotModel, origin: EpisodeOrigin
 ) -> RecordedPolicy:
