@@ -315,30 +315,6 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     return config
 
 
-<<<<<<< HEAD
-def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
-    from mtv_world_ros.bench.expert.expert import Expert
-    from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
-
-    variant = settings.variant
-    expert = Expert(robot)
-
-    def make(origin: EpisodeOrigin) -> Policy:
-        if origin.recording:
-            return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
-        task, scene_seed = origin.task, origin.scene_seed
-        if not task or scene_seed < 0:
-            raise PolicyError(
-                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
-                "'scene_seed' to those of the recorded episode"
-            )
-        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
-
-    return make
-
-
-=======
->>>>>>> origin/main
 def _recorded(
     settings: RecordedPolicySettings, robot: RobotModel, origin: EpisodeOrigin
 ) -> RecordedPolicy:
