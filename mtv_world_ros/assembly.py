@@ -135,8 +135,8 @@ def load_pipeline(
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
     """
+    from mtv_world_ros.foresight.loading import load_foresight
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import load_predictor
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -149,9 +149,9 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
-    motion = None  # its helpers start while the world model is loaded
+    motion = None
     if foresight and loaded.object_motion is not None:
-        motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
+        motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,
         device=device,

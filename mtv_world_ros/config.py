@@ -56,6 +56,7 @@ def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidato
 #: a YAML list
 ListOf = Annotated[tuple[Item, ...], Strict(False)]
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[float, float], Strict(False), expected('a list of 2 numbers')]
 Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]

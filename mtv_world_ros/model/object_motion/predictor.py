@@ -306,7 +306,14 @@ class TrackedObjects:
         sizes = np.broadcast_to(sizes, (1 + self.model.num_disturbed, *sizes.shape))
         return sizes if self.contact is None else np.concatenate([sizes, self.contact.sizes])
 
-    def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Nothing is doubted."""
+        return ()
+
+    def advance(
+        self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
+    ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one, the others are of disturbed places and sizes. Row 0
@@ -314,6 +321,7 @@ class TrackedObjects:
 
         Args:
             positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            should_stop: not asked.
         """
         known = np.asarray(np.isfinite(self.reference).all(-1))
         places, features = self.model.disturbed(
