@@ -37,6 +37,7 @@ class Reason(StrEnum):
     TRAJECTORY_TOO_LONG = 'trajectory_too_long'
     JOINT_NAMES = 'joint_names'
     JOINT_LIMITS = 'joint_limits'
+    JOINT_SPEEDS = 'joint_speeds'
     INSTRUCTION_TOO_LONG = 'instruction_too_long'
     NO_CLOCK = 'no_clock'
     NOT_ACTIVE = 'not_active'
