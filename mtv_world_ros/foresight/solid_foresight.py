@@ -184,7 +184,8 @@ class TrackedSolids:
         """(K, O, 3) extents in each of the futures [m], NaN = not known."""
         sizes = np.full((self.foresight.settings.num_motions, len(self.solids), 3), np.nan)
         for number, future in enumerate(self._futures()):
-            sizes[number, self._known] = [solid.size for solid in future.solids]
+            found = [solid.size for solid in future.solids]
+            sizes[number, self._known] = np.reshape(found, (len(found), 3))  # also of none
         return sizes
 
     @property
