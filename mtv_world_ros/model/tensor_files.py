@@ -16,7 +16,7 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
@@ -153,9 +153,20 @@ def _stored(file: Path, part: Any, name: str) -> StoredTensor:
     def read() -> Tensor:
         # opened for each: a file that stays open keeps all that was read of it in memory
         with _opened(file) as handle:
-            return handle.get_tensor(name)
+            tensor: Tensor = handle.get_tensor(name)
+        check_finite(tensor, name, file)
+        return tensor
 
     return StoredTensor(tuple(part.get_shape()), part.get_dtype(), read)
+
+
+def read_tensors(path: Path, stem: str = '') -> dict[str, Tensor]:
+    """Returns the tensors that `open_tensors` finds, all of them read.
+
+    Raises:
+        CheckpointError: as there, or one holds what is no number.
+    """
+    return {name: stored.read() for name, stored in open_tensors(path, stem).items()}
 
 
 @contextmanager
