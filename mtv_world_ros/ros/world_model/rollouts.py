@@ -205,6 +205,7 @@ class Rollouts:
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
             **self._buffer.ages(self._node.get_clock().now().nanoseconds),
+            **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
         }
 
     def _on_image(self, view: str, message: Image | CompressedImage) -> None:
