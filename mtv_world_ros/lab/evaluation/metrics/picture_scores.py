@@ -90,7 +90,8 @@ def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
     mx, my = blurred(x), blurred(y)
     vx, vy, both = blurred(x * x) - mx**2, blurred(y * y) - my**2, blurred(x * y) - mx * my
     top = (2 * mx * my + _C1) * (2 * both + _C2)
-    return (top / ((mx**2 + my**2 + _C1) * (vx + vy + _C2))).mean(axis=-1)
+    found = top / ((mx**2 + my**2 + _C1) * (vx + vy + _C2))
+    return np.asarray(found.mean(axis=-1), np.float64)
 
 
 #: numbers of an episode by view and name; a name is `psnr`, `psnr_held`, `psnr_shuffled`, ...
