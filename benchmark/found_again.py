@@ -90,9 +90,9 @@ def main() -> None:
 def _errors(pipeline: Pipeline, recording: Recording) -> Iterator[tuple[str, float, float]]:
     """What an object is, and the errors of its place [m]; NaN = not found."""
     names, motion = recording.names, pipeline.object_motion
-    if recording.object_poses is None or motion is None or motion.contact is None:  # type: ignore[attr-defined]
+    if recording.object_poses is None or motion is None:  # type: ignore[attr-defined]
         raise SystemExit(f"'{recording.path}' has no true object poses, or no contact is computed")
-    floor = motion.contact.table_m  # type: ignore[attr-defined]
+    floor = motion.settings.table_m  # type: ignore[attr-defined]
     poses = recording.object_poses[:, [recording.objects.index(name) for name in names]]
     first = _seen(pipeline, recording, 0)
     whole = [_anew(first, item, name, floor) for item, name in enumerate(names)]
