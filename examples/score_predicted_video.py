@@ -35,7 +35,7 @@ nearest = np.abs(recording.times[:, None] - prediction.video.times).argmin(axis=
 start = prediction.start_masks.masks[:, :, 0]  # (V, O, H, W)
 names = prediction.masks.names
 real = pipeline.segmenter.segment(
-    recording.frames[:, nearest], names, first_masks=start, first_frames=observation.frames
+    recording.frames[:, nearest], names, first_masks=start, first_frames=recording.frames[:, 0]
 )
 imagined_j = jaccard(prediction.masks.masks, real.masks)  # (V, O, T)
 held_j = jaccard(np.broadcast_to(start[:, :, None], real.masks.shape), real.masks)

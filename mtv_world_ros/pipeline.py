@@ -39,9 +39,11 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
+from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
+from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -110,6 +112,7 @@ class Pipeline:
         horizon: how J falls with the horizon, where it was measured.
         object_motion: where objects go, for models whose trajectory videos show that; None = the
             trajectory video shows them where they were.
+        camera_checker: compares the first pictures with the arm's outline; None = nothing does.
     """
 
     robot: RobotModel
@@ -122,6 +125,7 @@ class Pipeline:
     describer: Describer | None = None
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
+    camera_checker: CameraChecker | None = None
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -130,10 +134,11 @@ class Pipeline:
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
         """Returns the same for a robot of the same joints and tools, e.g. a calibrated one."""
-        motion = self.object_motion
+        motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
             robot=robot,
+            camera_checker=None if checker is None else checker.with_robot(robot),
             object_motion=None if motion is None else motion.with_robot(robot),
         )
 
@@ -160,8 +165,12 @@ class Pipeline:
         Raises:
             ObservationError: the views are not the model's.
         """
+        checker = self.camera_checker
+        check = CameraCheck() if checker is None else checker.check(observation)
+        observation = check.corrected_observation(observation)
         return ImaginedEpisode(
             pipeline=self,
+            camera_check=check,
             instruction=instruction,
             objects=objects,
             seed=seed,
@@ -237,6 +246,7 @@ class ImaginedEpisode:
         limit_tolerance: joints may exceed their limits by this [rad or m].
         should_stop: asked between denoising steps and between chunks.
         num_chunks: imagined so far.
+        camera_check: what the first pictures say about the cameras, which are corrected by it.
     """
 
     pipeline: Pipeline
@@ -248,6 +258,7 @@ class ImaginedEpisode:
     limit_tolerance: float
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
+    camera_check: CameraCheck = CameraCheck()
     _rollouts: tuple[RolloutState, ...]
     _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -326,6 +337,8 @@ class ImaginedEpisode:
         state = state.after(
             frames, positions[-1], stamp_ns, spec.num_history, memory, state.objects
         )
+        if cameras is not None:
+            cameras = self.camera_check.corrected(cameras)
         last = replace(state.observation, cameras=cameras or state.observation.cameras)
         objects = state.objects.branch(last)
         self._rollouts = (replace(state, observation=last, num_imagined=0, objects=objects),)
@@ -341,6 +354,7 @@ class ImaginedEpisode:
         Raises:
             ObservationError: the views are not the model's.
         """
+        observation = self.camera_check.corrected_observation(observation)
         before = self._rollouts[0]
         objects = before.objects.branch(observation)
         state = RolloutState.at(observation, self.pipeline.spec, objects)
@@ -473,9 +487,11 @@ class ImaginedEpisode:
         """The estimate after a chunk with joints at (1 + T, J), and what it remembers."""
         pipeline, cameras = self.pipeline, state.observation.cameras
         footage = footage_of(pipeline.robot, cameras, positions, start_masks, masks)
-        return pipeline.estimator.estimate(
+        judged = pipeline.estimator.estimate(
             footage, self.instruction, state.memory, foreseen, is_real=is_real
         )
+        check = self.camera_check
+        return judged._replace(estimate=doubted(judged.estimate, check.notes, check.refusal))
 
     def _majority(self, state: RolloutState) -> Majority:
         """Says which futures end as most do, so that pictures and the estimate say the same."""

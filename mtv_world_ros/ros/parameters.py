@@ -106,6 +106,11 @@ class Settings(NodeSettings):
         "Foresee where objects go, where the checkpoint can; false = the paper's way: trails and "
         'first masks are drawn, and pictures alone decide.',
     )
+    camera_check: bool = at_start(
+        True,
+        "Compare the first pictures of an episode with the arm's outline, correct small errors of "
+        'the calibration for the episode, and give no verdict on large ones.',
+    )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'
@@ -250,6 +255,44 @@ def _answered(serve: Callable[[Any, Any], Any], request: Any, response: Any) -> 
         return response
 
 
+def declare_one(
+    node: Node,
+    name: str,
+    default: Any,
+    described: ParameterDescriptor,
+    within: str = '',
+    *,
+    empty: Any = None,
+) -> Any:
+    """Declares one parameter and returns its value.
+
+    Args:
+        node: owner.
+        name: of the parameter.
+        default: its default, which says the type.
+        described: range and meaning.
+        within: range, in words.
+        empty: value that `[]` stands for, which rclpy takes as "not set"; None = it is refused.
+
+    Raises:
+        ConfigError: the value given at start-up is refused.
+    """
+    kind = type(default).__name__
+    given = node._parameter_overrides.get(name)  # rclpy has no public way to ask
+    is_unset = given is not None and given.type_ == Parameter.Type.NOT_SET
+    if is_unset and empty is None:
+        raise ConfigError(
+            f"parameter '{name}' is given without a value, or as []; it must be of type "
+            f'{kind}{within}, or be left out'
+        )
+    try:
+        return node.declare_parameter(
+            name, empty if is_unset else default, described, ignore_override=is_unset
+        ).value
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+        raise ConfigError(f"parameter '{name}' must be of type {kind}{within}: {error}") from error
+
+
 def refuse_unknown(node: Node) -> None:
     """Refuses parameters that were given at start-up and that the node does not have.
 
@@ -338,13 +381,12 @@ def _declare(node: Node, name: str, field: FieldInfo) -> object:
     if node.has_parameter(name):  # a lifecycle node is configured again
         return node.get_parameter(name).value
     default = [''] if field.default == () else field.default  # ROS has no empty list
-    try:
-        value = node.declare_parameter(name, default, descriptor(field)).value
-    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        limits = span(field)
-        within = ' in [{:g}, {:g}]'.format(*limits) if limits else ''
-        kind = type(default).__name__
-        raise ConfigError(f"parameter '{name}' must be of type {kind}{within}: {error}") from error
+    limits = span(field)
+    within = ' in [{:g}, {:g}]'.format(*limits) if limits else ''
+    is_list = isinstance(default, list)
+    value = declare_one(
+        node, name, default, descriptor(field), within, empty=[''] if is_list else None
+    )
     refused = _refusal(name, field, value)
     if refused:
         raise ConfigError(f'parameter {refused}')

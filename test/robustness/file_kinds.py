@@ -27,10 +27,11 @@ from wild_numbers import judged, with_wild_number
 import wild_plans
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
-from mtv_world_ros.data.bag.messages import deserialize, parse_joint_trajectory, typestore
+from mtv_world_ros.data.bag.messages import deserialize, typestore
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.recover import recover
 from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -198,7 +199,7 @@ def _read_message(data: bytes, _: Path) -> Any:
     if data:
         message = deserialize(TYPES[data[0] % len(TYPES)], data[1:])
         if data[0] % len(TYPES) == 0:
-            parse_joint_trajectory(message)
+            read_plan(message)
 
 
 def _answers() -> list[bytes]:

@@ -261,6 +261,8 @@ class RobotModel:
                 f"joint '{self.joint_names[joint]}' of robot '{self.name}' has its lower limit "
                 f'{lower[joint]} above the upper one {upper[joint]}'
             )
+        for name, low, high in zip(self.joint_names, lower, upper, strict=True):
+            check_can_move(name, low, high, f"robot '{self.name}'")
         speeds = np.array([model.velocityLimit[joint.velocity] for joint in joints])
         for array in (lower, upper, speeds):
             array.flags.writeable = False
@@ -366,6 +368,21 @@ def _link_frames(model: pin.Model) -> dict[str, int]:
     """Links by name; joints have frames too, maybe of the same name."""
     kind = pin.FrameType.BODY
     return {frame.name: i for i, frame in enumerate(model.frames) if frame.type == kind}
+
+
+def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
+    """Refuses a joint whose limits are equal; a URDF without stops has 0 and 0.
+
+    Raises:
+        RobotError: what to write instead.
+    """
+    if lower == upper:
+        raise RobotError(
+            f"joint '{joint}' of {where} cannot move: its limits are {lower:g} and {upper:g}; a "
+            "URDF whose <limit> has no 'lower' and 'upper' means 0 and 0. Give both there, make "
+            "the joint type 'continuous' if it turns without stops, or leave it out of 'joints' "
+            "in the robot's YAML if it rests"
+        )
 
 
 def check_positions(

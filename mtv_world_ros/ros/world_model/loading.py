@@ -35,6 +35,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
         describer=settings.describer or None,
         serving=settings.serving,
         foresight=settings.foresight,
+        camera_check=settings.camera_check,
     )
 
 

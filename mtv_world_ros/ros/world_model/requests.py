@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
+from mtv_world_ros.data.joint_plans import check_plan_joints
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import to_trajectory
-from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason, refused_plan, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
@@ -64,7 +65,8 @@ class RequestMaker:
         """
         settings = self._settings()
         trajectory = to_trajectory(message)
-        self._check_joints(trajectory, settings.limit_tolerance)
+        with refused_plan():
+            check_plan_joints(trajectory, self.robot, settings.limit_tolerance)
         stamp_ns = to_ns(message.header.stamp)
         limits = TimeLimits(
             trajectory_age=settings.max_trajectory_age_s, horizon=settings.max_horizon_s
@@ -91,14 +93,6 @@ class RequestMaker:
             received_ns=now_ns,
             limit_tolerance=settings.limit_tolerance,
         )
-
-    def _check_joints(self, trajectory: JointTrajectory, tolerance: float) -> None:
-        """Joints that are not named keep their position; none is outside its limits."""
-        home = np.clip(0.0, self.robot.lower, self.robot.upper)
-        with rejected_as(Reason.JOINT_NAMES):
-            whole = match_joints(trajectory, self.robot, home, allow_missing=True)
-        with rejected_as(Reason.JOINT_LIMITS):
-            check_positions(self.robot, whole.positions, tolerance=tolerance)
 
     def _check_speeds(
         self, trajectory: JointTrajectory, positions: FloatArray, tolerance: float

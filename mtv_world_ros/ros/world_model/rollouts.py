@@ -199,11 +199,13 @@ class Rollouts:
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            'cameras': self._worker.camera_check.text,
             **self._live.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
             **self._buffer.ages(self._node.get_clock().now().nanoseconds),
+            **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
         }
 
     def _on_image(self, view: str, message: Image | CompressedImage) -> None:
