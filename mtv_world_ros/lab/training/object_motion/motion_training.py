@@ -12,18 +12,17 @@ from functools import partial
 import math
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import torch
 from torch import Tensor
 import torch.nn.functional as F
-from torch.optim import _muon
 from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import check_free, write_whole
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.object_motion.orthogonal_momentum import OrthogonalMomentum
 from mtv_world_ros.lab.training.object_motion.tracks import object_tracks, ObjectTracks, read_each
 from mtv_world_ros.lab.training.object_motion.windows import Batch, pools_of, TrackPool
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
@@ -349,45 +348,16 @@ def _tensors(batch: Batch, forced: Tensor, lost_m: Tensor) -> list[Tensor]:
 
 
 def _optimizers(network: ObjectMotionNetwork, rate: float) -> list[torch.optim.Optimizer]:
-    """Muon (Jordan et al. 2024) for matrices; AdamW for biases and what has few outputs."""
+    """Orthogonalised momentum for matrices; AdamW for biases and what has few outputs."""
     weights: list[Tensor] = []
     others: list[Tensor] = []
     for parameter in network.parameters():
         is_matrix = parameter.ndim == 2 and len(parameter) >= _LEAST_ROWS
         (weights if is_matrix else others).append(parameter)
     return [
-        _Muon(weights, lr=rate, weight_decay=1e-4, adjust_lr_fn='match_rms_adamw'),
+        OrthogonalMomentum(weights, lr=rate, weight_decay=1e-4),
         torch.optim.AdamW(others, lr=rate, betas=(0.9, 0.99), weight_decay=1e-4),
     ]
-
-
-class _Muon(torch.optim.Muon):
-    """Multiplies in float32: torch's multiplies in bfloat16, slowly where a processor lacks it."""
-
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:
-        """Does a step."""
-        with mock.patch.object(_muon, '_zeropower_via_newtonschulz', orthogonalized):
-            return super().step(closure)
-
-
-def orthogonalized(
-    gradient: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float
-) -> Tensor:
-    """Returns about U V^T of a matrix U S V^T, by Newton-Schulz iterations (Jordan et al. 2024).
-
-    Args:
-        gradient: (N, M).
-        coefficients: of x, x^3 and x^5.
-        steps: iterations.
-        eps: least norm to divide by.
-    """
-    a, b, c = coefficients
-    x = gradient.T if gradient.shape[0] > gradient.shape[1] else gradient
-    x = x / x.norm().clamp(min=eps)
-    for _ in range(steps):
-        square = x @ x.T
-        x = torch.addmm(x, torch.addmm(square, square, square, beta=b, alpha=c), x, beta=a)
-    return x.T if gradient.shape[0] > gradient.shape[1] else x
 
 
 def _save(
