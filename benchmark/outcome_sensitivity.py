@@ -35,7 +35,7 @@ from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.sim.collect.episode_maker import CollectConfig
 from mtv_world_ros.sim.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import EXPERT
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.sim.world.scene import Scene

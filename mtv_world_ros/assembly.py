@@ -302,7 +302,7 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
-    from mtv_world_ros.sim.expert.faults import parse_variant
+    from mtv_world_ros.sim.expert.faults.catalogue import parse_variant
 
     if str(name).startswith('expert'):
         config: PolicyConfig = ScriptedPolicySettings(variant=str(name))

@@ -92,7 +92,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.sim.collect.collect_dataset import collect
     from mtv_world_ros.sim.collect.episode_maker import CollectConfig
     from mtv_world_ros.sim.collect.record import RecordConfig
-    from mtv_world_ros.sim.expert.faults import kinds_named
+    from mtv_world_ros.sim.expert.faults.catalogue import kinds_named
     from mtv_world_ros.sim.world.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)

@@ -11,7 +11,7 @@ from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.ranking.optimism import is_contact, name_of, read_last_frames
 from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.sim.collect.contact_sheet import titled
-from mtv_world_ros.sim.expert.faults import EXPERT
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT
 
 #: paper between the pictures [px]
 _GAP = 6

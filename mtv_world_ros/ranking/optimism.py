@@ -28,7 +28,7 @@ from mtv_world_ros.evaluation.metrics.statistics import (
 )
 from mtv_world_ros.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.rendering.images import encode_png
-from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, parse_variant
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT, FAULTS, parse_variant
 
 #: end of the names of pictures of where objects are
 OBJECTS = '.objects.png'

@@ -7,7 +7,7 @@ from math import isfinite
 
 from mtv_world_ros.documents import DASH, Table
 from mtv_world_ros.ranking.optimism import JUDGES, MEASURES, Optimism, Score, true_rate
-from mtv_world_ros.sim.expert.faults import FAULTS
+from mtv_world_ros.sim.expert.faults.catalogue import FAULTS
 
 REMARK = (
     'Cells: value [95 % interval] count. False success: real failures called a success, of those '

@@ -29,7 +29,7 @@ from mtv_world_ros.policies.policy_config import (
 )
 from mtv_world_ros.policies.server_process import PORT, ServerProcess
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import parse_variant
+from mtv_world_ros.sim.expert.faults.catalogue import parse_variant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import tasks_named
 

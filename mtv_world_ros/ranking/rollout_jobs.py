@@ -11,7 +11,7 @@ from mtv_world_ros.data_types import SuccessEstimate
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import EXPERT, parse_variant
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT, parse_variant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import tasks_named
 from mtv_world_ros.success.verdict import verdict

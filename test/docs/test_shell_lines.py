@@ -201,7 +201,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.model.actions import check_control
     from mtv_world_ros.model.serving.serving_options import ServingOptions
-    from mtv_world_ros.sim.expert.faults import parse_variant
+    from mtv_world_ros.sim.expert.faults.catalogue import parse_variant
     from mtv_world_ros.sim.tasks.tasks import tasks_named
     from mtv_world_ros.sim.world.zero_shot import kinds_named
     from mtv_world_ros.training.training_config import load_training_config

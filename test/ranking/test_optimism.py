@@ -17,7 +17,7 @@ from mtv_world_ros.ranking.optimism import (
 )
 from mtv_world_ros.ranking.optimism_tables import optimism_tables
 from mtv_world_ros.ranking.policy_sets import POLICY_SETS
-from mtv_world_ros.sim.expert.faults import FAULTS, kinds_of, parse_variant
+from mtv_world_ros.sim.expert.faults.catalogue import FAULTS, kinds_of, parse_variant
 
 
 @pytest.mark.parametrize('split', ['train', 'calibrate', 'test'])

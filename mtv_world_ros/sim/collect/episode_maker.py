@@ -17,7 +17,7 @@ from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.sim.collect.siblings import BoundarySearch
 from mtv_world_ros.sim.expert.expert import Expert, ExpertConfig
-from mtv_world_ros.sim.expert.faults import draw_variant, parse_variant, PolicyVariant
+from mtv_world_ros.sim.expert.faults.catalogue import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.sim.world.cameras import CameraMoves, TRAINING_MOVES
 from mtv_world_ros.sim.world.randomize import RandomizationConfig

@@ -17,7 +17,7 @@ from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import PolicyVariant
+from mtv_world_ros.sim.expert.faults.catalogue import PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
 from mtv_world_ros.sim.world.randomize import draw_scene

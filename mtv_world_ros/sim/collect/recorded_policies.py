@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mtv_world_ros.data.episode_reader import read_info
-from mtv_world_ros.sim.expert.faults import EXPERT, parse_variant, refuse_kinds
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT, parse_variant, refuse_kinds
 
 #: key of an episode's metadata
 POLICY = 'policy'

@@ -21,7 +21,7 @@ from mtv_world_ros.parallel import run_all
 from mtv_world_ros.sim.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.sim.collect.record import RecordConfig, simulate
 from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults import EXPERT, FAULTS, PolicyVariant
+from mtv_world_ros.sim.expert.faults.catalogue import EXPERT, FAULTS, PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
 from mtv_world_ros.sim.world.simulator import SimEpisode

@@ -14,7 +14,7 @@ from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.sim.expert.faults import (
+from mtv_world_ros.sim.expert.faults.catalogue import (
     draw_variant,
     FAULTS,
     kinds_named,

@@ -6,7 +6,7 @@ import pytest
 from mtv_world_ros.data_types import Observation
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.geometry.robot.model import check_positions
-from mtv_world_ros.sim.expert.faults import parse_variant, PolicyVariant
+from mtv_world_ros.sim.expert.faults.catalogue import parse_variant, PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
 from mtv_world_ros.sim.world.simulator import SimEpisode
 from mtv_world_ros.success.task import ever_and_final
