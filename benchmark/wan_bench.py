@@ -19,7 +19,6 @@ from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, sample_latents
-from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.prepare import prepare
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
@@ -53,16 +52,11 @@ class Bench:
         video = config.video
         shape = (1, len(video.views), 1 + video.num_frames, video.height, video.width, 3)
         self.frames = torch.randint(0, 256, shape, dtype=torch.uint8, device=self.device)
-        self.followers = None
-        if serving.context_parallel > 1:
-            self.followers = Followers(self.transformer, serving)
         prepare(self.transformer, serving, self.device)
         self._forget_peak()
 
     def close(self) -> None:
-        """Ends the other processes and frees the device."""
-        if self.followers is not None:
-            self.followers.close()
+        """Frees the device."""
         del self.transformer, self.autoencoder, self.decoder
         gc.collect()
         if self.device.type == 'cuda':

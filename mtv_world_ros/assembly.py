@@ -108,6 +108,7 @@ def load_pipeline(
     serving: str = '',
     calibrated: bool = True,
     adapter: Path | None = None,
+    foresight: bool = True,
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -123,10 +124,12 @@ def load_pipeline(
         segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
         describer: YAML file of what names the objects of the first real frame; empty = the
             words of the instruction.
-        serving: what makes the model faster or smaller, e.g. `context_parallel=2`; see
+        serving: what makes the model faster or smaller, e.g. `compile=true`; see
             `ServingOptions`.
         calibrated: use the checkpoint's calibration of the success estimate, where it has one.
         adapter: LoRA adapter to use in place of the checkpoint's own.
+        foresight: foresee where objects go, where the checkpoint can; False = the paper's way:
+            trails and first masks alone are drawn, and pictures alone decide.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
@@ -146,7 +149,7 @@ def load_pipeline(
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
     motion = None  # its helpers start while the world model is loaded
-    if loaded.object_motion is not None:
+    if foresight and loaded.object_motion is not None:
         motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,

@@ -140,6 +140,10 @@ class Pipeline:
             object_motion=None if motion is None else motion.with_robot(robot),
         )
 
+    def without_foresight(self) -> Pipeline:
+        """Returns the paper's way: trails and first masks are drawn, no motion is foreseen."""
+        return replace(self, object_motion=None)
+
     def begin(
         self,
         observation: Observation,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import names
+from mtv_world_ros.cli.shared_options import add_physics, names
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -74,6 +74,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         default='all',
         help='first: render the first frame only, for train-motion',
     )
+    add_physics(parser)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1)
@@ -111,6 +112,7 @@ def _collect(arguments: argparse.Namespace) -> int:
             policies=arguments.policies,
             kinds=kinds_named(arguments.faults) if arguments.faults else (),
             siblings=arguments.siblings,
+            physics=arguments.physics,
             record=RecordConfig(
                 pictures=arguments.pictures, frame_period_s=_period(arguments.fps)
             ),

@@ -63,6 +63,11 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
     parser.add_argument('--episodes', type=int, help='use only the first N episodes')
+    parser.add_argument(
+        '--physics',
+        metavar='NAME',
+        help='only the episodes that were collected with this physics; default: all, counted',
+    )
     parser.add_argument('--workers', type=int, default=1, help='processes that score episodes')
     parser.add_argument(
         '--actions',
@@ -155,18 +160,19 @@ def _row(entry: Entry, pipeline: Pipeline) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.data.splits import of_physics, select
 
     entries = parse_entries(arguments.checkpoints)
     check_model(arguments.device, *(entry.path for entry in entries))
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    selection, truth = of_physics(selection, arguments.physics)
     from mtv_world_ros.evaluation.report.comparison import write_comparison
 
-    print(f'{arguments.dataset}: {selection}')
+    print(f'{arguments.dataset}: {selection}; physics: {truth}')
     alone = len(entries) == 1
     folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]
     summaries = [
-        _score(arguments, entry, selection, folder)
+        _score(arguments, entry, selection, truth, folder)
         for entry, folder in zip(entries, folders, strict=True)
     ]
     text = write_comparison(summaries, arguments.out)
@@ -185,7 +191,7 @@ def _slug(label: str) -> str:
 
 
 def _score(
-    arguments: argparse.Namespace, entry: Entry, selection: Selection, out: Path
+    arguments: argparse.Namespace, entry: Entry, selection: Selection, truth: str, out: Path
 ) -> Summary:
     from mtv_world_ros.assembly import asked_describer, fingerprint, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
@@ -222,6 +228,7 @@ def _score(
         provenance={
             **provenance(arguments),
             'dataset': f'{arguments.dataset}: {selection}',
+            'physics': truth,
         },
         parallel=Parallel(
             workers=arguments.workers,

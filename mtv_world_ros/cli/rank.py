@@ -16,9 +16,11 @@ from mtv_world_ros.cli.shared_options import (
     add_dtype,
     add_model_options,
     add_overwrite,
+    add_physics,
     add_segmenter,
     add_serving,
     check_model,
+    physics_text,
     pipeline_choices,
     provenance,
     threads_of_workers,
@@ -106,6 +108,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action='store_false',
         help='keep the last frames of each rollout alone, without a video to play: faster',
     )
+    add_physics(parser)
     add_overwrite(parser)
     add_checkpoint(parser)
     add_dtype(parser)
@@ -117,7 +120,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
-    names = _names(arguments)
+    names, truth = _names(arguments), physics_text(arguments.physics)
     check_model(arguments.device, *names)
     listed = _listed(arguments)
     jobs = _jobs(arguments, listed)
@@ -139,6 +142,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         max_chunks=arguments.max_chunks,
         hold=arguments.hold,
         clips=arguments.clips,
+        physics=arguments.physics,
     )
     if listed:
         policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())
@@ -165,6 +169,7 @@ def _rank(arguments: argparse.Namespace) -> int:
             provenance={
                 **provenance(arguments),
                 'checkpoint': checkpoint.settings['checkpoint'],
+                'physics': truth,
             },
             # the first report has all checkpoints side by side
             optimism={k: v for k, v in optimism.items() if number == 0 or k == names[number]},
@@ -245,7 +250,8 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
         policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
     check_tasks(listed, tasks)
-    expert = Expert(checkpoint_robot(arguments.checkpoint, arguments.robot))
+    robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
+    expert = Expert(robot, physics=arguments.physics)
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
     if listed:
         of = {policy.name: policy for policy in listed}
@@ -261,6 +267,7 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
 def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
     """Settings that rollouts depend on: with other settings they are run again."""
     from mtv_world_ros.assembly import fingerprint
+    from mtv_world_ros.data.episode import NOMINAL
     from mtv_world_ros.files import share_path
     from mtv_world_ros.importing.stored_objects import stage_key
 
@@ -269,6 +276,7 @@ def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
         'task files': fingerprint(share_path('config', 'tasks')).split()[-1],
         'robot': arguments.robot or '',
         'segmenter': arguments.segmenter,
+        **({} if arguments.physics == NOMINAL else {'physics': arguments.physics}),
     }
     if arguments.describer:
         settings['describer'] = sha256(stage_key(arguments.describer, '')).hexdigest()[:8]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
 
 #: options that are arguments of `load_pipeline`
-_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter')
+_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter', 'foresight')
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +24,13 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--device', default='cpu')
     parser.add_argument(
         '--threads', type=int, default=0, help='CPU threads; 0 = all but one, of two both'
+    )
+    parser.add_argument(
+        '--no-foresight',
+        dest='foresight',
+        action='store_false',
+        help="the paper's way: trails and first masks are drawn, no object motion is foreseen, "
+        'and pictures alone decide',
     )
     parser.add_argument(
         '--steps',
@@ -40,7 +47,7 @@ def add_serving(parser: argparse.ArgumentParser) -> None:
         '--serving',
         default='',
         metavar='"NAME=VALUE ..."',
-        help='options that make the model faster or smaller, e.g. "context_parallel=2"',
+        help='options that make the model faster or smaller, e.g. "compile=true"',
     )
     parser.add_argument(
         '--adapter', type=Path, help="LoRA folder or file, instead of the checkpoint's own"
@@ -121,6 +128,28 @@ def add_describer(parser: argparse.ArgumentParser) -> None:
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     """Adds `--checkpoint`."""
     parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
+
+
+def add_physics(parser: argparse.ArgumentParser) -> None:
+    """Adds `--physics`."""
+    parser.add_argument(
+        '--physics',
+        default='nominal',
+        metavar='NAME',
+        help="what is true in the simulator, of config/physics.yaml: 'nominal', which flatters, "
+        'or a shift such as bold or delay_100ms; the world model is told nothing of it',
+    )
+
+
+def physics_text(name: str) -> str:
+    """Returns what is true, for pages.
+
+    Raises:
+        SimulatorError: unknown name.
+    """
+    from mtv_world_ros.sim.world.physics import physics_named
+
+    return f'{name}: {physics_named(name).text}'
 
 
 def add_overwrite(parser: argparse.ArgumentParser) -> None:

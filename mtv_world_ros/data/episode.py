@@ -28,6 +28,8 @@ METADATA_NAME = 'mtv_world'
 MASKS_BY = 'masks_by'
 #: key of the metadata that names the views whose camera's pose was not known at the import
 UNKNOWN_CAMERAS = 'unknown_cameras'
+#: key of the metadata that names the physics of a simulated episode, and the usual one
+PHYSICS, NOMINAL = 'physics', 'nominal'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
 

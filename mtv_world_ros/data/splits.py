@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.data.episode_reader import list_episodes
+from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
+from mtv_world_ros.data.episode_reader import list_episodes, read_info
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 
 #: describes a data set; `mtv-world collect` writes it
@@ -75,6 +77,36 @@ def select(
         zero_shot={path: marks[path.name] for path in paths if marks.get(path.name)},
         num_in_dataset=len(found),
     )
+
+
+def of_physics(selection: Selection, physics: str | None = None) -> tuple[Selection, str]:
+    """Returns the episodes of one physics, and what is true in them, in words.
+
+    Args:
+        selection: any episodes.
+        physics: as `collect --physics` named it; None = all of them.
+
+    Raises:
+        ConfigError: no episode is of this physics.
+    """
+    found = {path: _physics(read_info(path)) for path in selection.paths}
+    if physics is None:
+        counts = Counter(found.values())
+        return selection, ', '.join(f'{name} ({num})' for name, num in counts.most_common())
+    paths = [path for path, name in found.items() if name == physics]
+    if not paths:
+        known = sorted(set(found.values()))
+        raise ConfigError(
+            f"no episode is of the physics '{physics}'{nearest(physics, known)} (--physics); "
+            f'there are {", ".join(known)}'
+        )
+    return replace(selection, paths=paths), f'{physics} ({len(paths)})'
+
+
+def _physics(info: EpisodeInfo) -> str:
+    """What is true in an episode; the simulator's older ones do not say it."""
+    usual = NOMINAL if info.seed is not None else 'not stated'
+    return info.metadata.get(PHYSICS, usual)
 
 
 def _card(dataset: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mtv_world_ros.data_types import ByteArray, FloatArray, History
-from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
+from mtv_world_ros.errors import CheckpointError, ModelMemoryError
 from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import check_same_model
 from mtv_world_ros.model.checkpoint import Checkpoint
@@ -31,7 +31,6 @@ from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.model.serving.context_parallel import Followers
 from mtv_world_ros.model.serving.memory_check import check_memory
 from mtv_world_ros.model.serving.prepare import decoder_of, prepare
 from mtv_world_ros.model.serving.serving_options import ServingOptions
@@ -87,9 +86,6 @@ class DiffusionWorldModel:
         if checkpoint.adapter is not None:
             check_same_model(self.card, checkpoint.adapter)
         self._adapters.use(checkpoint.adapter)
-        self._followers = None
-        if serving.context_parallel > 1:
-            self._followers = Followers(self.transformer, serving)
         prepare(self.transformer, serving, self.device)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
         self._decoder = decoder_of(self.autoencoder, serving, dtype)
@@ -104,7 +100,7 @@ class DiffusionWorldModel:
         self.image_encoder = checkpoint.image_encoder
         if self.image_encoder is not None:
             self.image_encoder.to(self.device, dtype, stays=not serving.offload)
-        if serving.compile or serving.cuda_graphs:
+        if serving.compile:
             self._warm_up()
 
     def _warm_up(self) -> None:
@@ -132,12 +128,6 @@ class DiffusionWorldModel:
             ConfigError: peft is not installed.
         """
         if path is not None:
-            if self._serving.weights != 'same':
-                raise ConfigError(
-                    f'weights={self._serving.weights} keeps no weights that an adapter could be '
-                    'added to; start with that adapter in the checkpoint, or with weights=same in '
-                    "'serving'"
-                )
             check_same_model(self.card, path)
         return self._adapters.read(path)
 
@@ -152,13 +142,6 @@ class DiffusionWorldModel:
                 return
             adapter = self.read_adapter(adapter)
         self._adapters.use(adapter)
-        if self._followers is not None:
-            self._followers.send_weights()
-
-    def close(self) -> None:
-        """Ends the processes that it started, if any; the model cannot be used afterwards."""
-        if self._followers is not None:
-            self._followers.close()
 
     def predict(
         self,
@@ -290,7 +273,7 @@ class DiffusionWorldModel:
             torch.cuda.empty_cache()
         return ModelMemoryError(
             f'out of memory on {self.device} with {views} views of {count} frames of '
-            f"{width}x{height}; set offload=true or weights=float8 in 'serving', use a smaller "
+            f"{width}x{height}; set offload=true in 'serving', use a smaller "
             'preset or another device, or free memory there '
             f'({str(error).splitlines()[0]})'
         )

@@ -1,7 +1,7 @@
 """How optimistic imagination is: real failures called a success, and commands that are ignored.
 
-Beside the judge that looks at imagined pictures stand one that sees none (`no_picture_rule`) and
-one that sees the simulator's.
+Beside the judge that sees imagined pictures and foreseen motions stand those that have one of the
+two alone, one that sees none (`no_picture_rule`) and one that sees the simulator's.
 """
 
 from __future__ import annotations
@@ -34,10 +34,14 @@ from mtv_world_ros.sim.expert.faults.catalogue import EXPERT, FAULTS, parse_vari
 OBJECTS = '.objects.png'
 #: who judges: field of a result -> words
 JUDGES = {
-    'imagined': 'imagination',
-    'no_picture': 'no pictures',
-    'seen': "simulator's frames",
+    'foreseen': 'foreseen motions alone',
+    'pictures': 'pictures alone (paper)',
+    'imagined': 'both',
+    'no_picture': 'no-picture rule',
+    'seen': 'real frames',
 }
+#: of these, the columns of the optimism table
+COLUMNS = {'imagined': 'imagination', 'no_picture': 'no pictures', 'seen': "simulator's frames"}
 #: what is measured of each judge, in the order of the tables
 MEASURES = {
     'pearson': 'r observed',
@@ -126,7 +130,9 @@ class Optimism:
                 policies and the expert.
         """
         chosen = self.rollouts(kind)
-        compared = [r for r in self.results if r.policy == EXPERT or kind in (None, *kinds_of(r))]
+        compared = [
+            r for r in self.results if kind is None or r.policy == EXPERT or kind in kinds_of(r)
+        ]
         failed = [r for r in chosen if not r.final and isfinite(judged_by(r, judge).success)]
         flips = [r for r in chosen if name_of(r) in self.flips] if judge == 'imagined' else []
         of_contact = [r for r in flips if is_contact(r)]

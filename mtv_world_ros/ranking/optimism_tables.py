@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from mtv_world_ros.documents import DASH, Table
-from mtv_world_ros.ranking.optimism import JUDGES, MEASURES, Optimism, Score, true_rate
+from mtv_world_ros.ranking.optimism import (
+    COLUMNS,
+    JUDGES,
+    MEASURES,
+    Optimism,
+    Score,
+    true_rate,
+)
+from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.sim.expert.faults.catalogue import FAULTS
 
 REMARK = (
@@ -26,6 +34,39 @@ REMARK = (
 _NAME_LENGTH = 17
 
 
+def worth_table(results: Sequence[Result], worth: Mapping[str, Mapping[str, Score]]) -> Table:
+    """Returns what a picture is worth: one row a judge.
+
+    Args:
+        results: rollouts.
+        worth: of each judge over them, see `Summary.worth`.
+    """
+    rows = [[words, *_worth(worth[judge])] for judge, words in JUDGES.items()]
+    rate = true_rate(results)
+    return Table(
+        caption=f'What a picture is worth: {rate.count} rollouts, {rate.value:.0%} really succeed',
+        head=['judged by', 'n', 'AUROC', 'false success', 'no verdict', 'r'],
+        rows=rows,
+    )
+
+
+def _worth(scores: Mapping[str, Score]) -> list[str]:
+    r, free = scores['pearson'], scores['pearson_noise_free']
+    low, high = free.interval
+    around = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
+    return [
+        str(scores['auroc'].count),
+        _value(scores['auroc']),
+        _cell(scores['false_success']),
+        _value(scores['abstention']),
+        f'{_number(r.value)}{around}',
+    ]
+
+
+def _value(score: Score) -> str:
+    return _cell(score).rpartition(' ')[0] or DASH
+
+
 def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
     """Returns the tables: overall, then by fault kind.
 
@@ -40,12 +81,12 @@ def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
 
 def _overall(by_model: Mapping[str, Optimism]) -> Table:
     first = next(iter(by_model.values()))
-    heads = _heads(list(by_model)) if len(by_model) > 1 else [JUDGES['imagined']]
+    heads = _heads(list(by_model)) if len(by_model) > 1 else [COLUMNS['imagined']]
     columns = {
         head: found.scores('imagined')
         for head, found in zip(heads, by_model.values(), strict=True)
     }
-    columns |= {JUDGES[judge]: first.scores(judge) for judge in JUDGES if judge != 'imagined'}
+    columns |= {COLUMNS[judge]: first.scores(judge) for judge in COLUMNS if judge != 'imagined'}
     rows = [
         [words, *(_cell(scores[measure]) for scores in columns.values())]
         for measure, words in MEASURES.items()

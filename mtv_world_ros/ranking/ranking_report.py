@@ -13,8 +13,8 @@ from mtv_world_ros.documents import DASH, render, Table
 from mtv_world_ros.evaluation.metrics.statistics import MIN_SCENES
 from mtv_world_ros.evaluation.report.charts import Point, scatter_chart
 from mtv_world_ros.files import write_json, write_whole
-from mtv_world_ros.ranking.optimism import JUDGES as SHORT_WORDS
-from mtv_world_ros.ranking.optimism_tables import optimism_tables
+from mtv_world_ros.ranking.optimism import COLUMNS as SHORT_WORDS
+from mtv_world_ros.ranking.optimism_tables import optimism_tables, worth_table
 from mtv_world_ros.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
 from mtv_world_ros.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
 from mtv_world_ros.ranking.rollout_cards import rollout_cards
@@ -35,6 +35,13 @@ _CEILING = (
     "'{seen}' is what imagination could reach at best: its errors are the estimator's, the rest "
     "are the world model's."
 )
+_WORTH = (
+    'What decides: the foreseen motions of objects; pictures show them. In the first table, '
+    'foreseen motions alone: the share of those that succeed, from the commands and the first '
+    "frame. Pictures alone: the paper's way, trails and first masks are drawn and no motion is "
+    'foreseen. Both: the estimate. The no-picture rule: an object sticks to a gripper that closes '
+    "near it. Real frames: the same estimator on the simulator's. n: rollouts with an estimate."
+)
 _INTERVALS = (
     'Intervals of rates: Wilson, 95 %. The noise of few scenes makes the observed r too small and '
     'the observed MMRV too large. Noise-free: what they would be on endless scenes, an estimate '
@@ -46,6 +53,7 @@ _INTERVALS = (
 def tables(summary: Summary) -> list[Table]:
     """Returns the ranking's tables."""
     return [
+        worth_table(summary.results, summary.worth),
         *optimism_tables(summary.optimism),
         _agreement(summary),
         *(_rates(summary, task) for task in (None, *summary.tasks)),
@@ -62,6 +70,8 @@ def remarks(summary: Summary) -> list[str]:
     found = [
         _MEANING,
         _CEILING.format(seen=JUDGES['seen'].capitalize()),
+        _truth_remark(summary),
+        _WORTH,
         _agreement_remark(summary),
         _unknown_remark(summary),
         _INTERVALS,
@@ -81,6 +91,11 @@ def remarks(summary: Summary) -> list[str]:
             f'{first.name}: {reason}'
         )
     return [remark for remark in found if remark]
+
+
+def _truth_remark(summary: Summary) -> str:
+    truth = summary.provenance.get('physics', '')
+    return f'Truth of the simulator: {truth}.' if truth else ''
 
 
 def _agreement_remark(summary: Summary) -> str:
@@ -286,6 +301,7 @@ def _failures(summary: Summary) -> list[Table]:
 def console(summary: Summary) -> str:
     """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
     tables = [
+        worth_table(summary.results, summary.worth),
         *optimism_tables(summary.optimism),
         _agreement(summary),
         _rates(summary, None),

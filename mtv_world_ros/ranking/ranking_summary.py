@@ -23,7 +23,8 @@ from mtv_world_ros.evaluation.metrics.statistics import (
     mean_interval,
     wilson,
 )
-from mtv_world_ros.ranking.optimism import judged_by, Optimism
+from mtv_world_ros.ranking.optimism import judged_by, Optimism, Score
+from mtv_world_ros.ranking.optimism import JUDGES as ALL_JUDGES
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 
 #: label of all tasks together
@@ -165,6 +166,12 @@ class Summary:
         return self._agreements[judge, task]
 
     @cached_property
+    def worth(self) -> dict[str, dict[str, Score]]:
+        """What each judge's word is worth, by measure: foreseen motions, pictures, both, ..."""
+        found = Optimism(results=self.results, flips={})
+        return {judge: found.scores(judge) for judge in ALL_JUDGES}
+
+    @cached_property
     def rule_agreement(self) -> dict[str, Agreement]:
         """Agreement of the no-picture rule's rates, all tasks."""
         return self._agreement(RULE, None)
@@ -280,6 +287,10 @@ class Summary:
             'abstained': {judge: self.abstained(judge).as_json() for judge in JUDGES},
             'confusion': {judge: self.confusion(judge) for judge in JUDGES},
             'speed': self.speed(),
+            'worth': {
+                judge: {measure: score.as_json() for measure, score in scores.items()}
+                for judge, scores in self.worth.items()
+            },
             'optimism': {name: found.as_json() for name, found in self.optimism.items()},
             'num_true_for_powered': self.num_true,
             'num_rollouts': len(self.results),

@@ -92,6 +92,14 @@ class Judged:
         )
 
     @classmethod
+    def of_motions(cls, estimate: SuccessEstimate | None) -> Judged:
+        """Returns what the motions alone say that an estimate rests on: how many succeed."""
+        feature = nan if estimate is None else estimate.features.get('foreseen', nan)
+        if not isfinite(feature):
+            return cls.stated(nan, 'abstains: no motion was foreseen')
+        return cls.stated((1 + feature) / 2, 'the share of foreseen motions that succeed')
+
+    @classmethod
     def stated(cls, probability: float, reason: str) -> Judged:
         """Returns a verdict without J; NaN = abstains."""
         interval = (probability, probability)
@@ -116,6 +124,9 @@ class Judged:
 
 def _number(value: float | None) -> float:
     return nan if value is None else float(value)
+
+
+_NOT_MEASURED = Judged.stated(nan, 'abstains: not measured')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,6 +186,8 @@ class Result:
         ever: the task was done at some time, in the simulator.
         final: it held at the end; this is what counts as success.
         imagined: the estimate at the end of the imagined episode.
+        foreseen: what the foreseen motions alone say that it rests on.
+        pictures: the estimate where none is foreseen, the paper's way.
         seen: the same estimator on the simulator's own frames: what is wrong with it is not the
             world model's fault.
         no_picture: the rule that sees the commands and the first frame alone.
@@ -197,6 +210,8 @@ class Result:
     imagined: Judged
     seen: Judged
     no_picture: Judged
+    foreseen: Judged = _NOT_MEASURED
+    pictures: Judged = _NOT_MEASURED
     num_chunks: int
     num_imagined: int
     is_over: bool
@@ -213,7 +228,8 @@ class Result:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Result:
         """Reads what `as_json` returned, NaN as null."""
-        judged = {key: Judged.from_json(values[key]) for key in ('imagined', 'seen', 'no_picture')}
+        keys = ('imagined', 'foreseen', 'pictures', 'seen', 'no_picture')
+        judged = {key: Judged.from_json(values[key]) for key in keys if key in values}
         course = values.get('course')
         told = {'course': None if course is None else Course.from_json(course)}
         return cls(**{**values, **judged, **told})

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data_types import ObjectMasks
+from mtv_world_ros.data.episode import NOMINAL
+from mtv_world_ros.data_types import ObjectMasks, SuccessEstimate
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
@@ -46,6 +47,7 @@ class RolloutConfig:
             number of answers in a row; 0 = then it goes on.
         clips: keep each rollout as a video, a contact sheet and frames; takes as long as
             imagining it.
+        physics: name in the catalogue of what is true in the simulator.
         make_policy: makes a policy for an episode.
     """
 
@@ -53,6 +55,7 @@ class RolloutConfig:
     max_chunks: int = 8
     hold: int = 0
     clips: bool = True
+    physics: str = NOMINAL
     make_policy: MakePolicy = scripted_policy
 
     def __post_init__(self) -> None:
@@ -75,8 +78,8 @@ class RolloutRunner:
 
     def __init__(self, pipeline: Pipeline, config: RolloutConfig) -> None:
         self.pipeline, self.config = pipeline, config
-        self._expert = Expert(pipeline.robot)
-        self._sim = SimEpisode(pipeline.robot, self._expert.home)
+        self._expert = Expert(pipeline.robot, physics=config.physics)
+        self._sim = SimEpisode(pipeline.robot, self._expert.home, physics=config.physics)
 
     def score(self, job: Job) -> Result:
         """Returns what a policy reached.
@@ -114,6 +117,9 @@ class RolloutRunner:
         imagined = ImaginedWorld(episode, world.start)
         run = self._run(real.policy, imagined, real.instruction, job)
         imagining_s = time.perf_counter() - begun
+        begun = time.perf_counter()
+        pictures = self._pictures_alone(job, real, observed.names) or imagined.success
+        pictures_s = time.perf_counter() - begun
         both = BothWorlds(
             fps=self.pipeline.spec.fps,
             real=world.chunks,
@@ -129,6 +135,8 @@ class RolloutRunner:
             ever=real.ever,
             final=real.final,
             imagined=Judged.of(imagined.success),
+            foreseen=Judged.of_motions(imagined.success),
+            pictures=Judged.of(pictures),
             seen=Judged.of(found[-1].success if found else None),
             no_picture=_judge_without_pictures(self._begin(real, job, observed.names), world),
             num_chunks=real.run.num_chunks,
@@ -142,6 +150,7 @@ class RolloutRunner:
                 'rendering': world.rendering_s,
                 'judging the simulated frames': judging_s,
                 'imagining': imagining_s,
+                'imagining without foresight': pictures_s,
             },
             course=both.course(),
             files={
@@ -151,11 +160,26 @@ class RolloutRunner:
             },
         )
 
+    def _pictures_alone(
+        self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
+    ) -> SuccessEstimate | None:
+        """The estimate of an episode in which no motion is foreseen; None = none ever is."""
+        if self.pipeline.object_motion is None:
+            return None
+        episode = self._begin(real, job, objects, self.pipeline.without_foresight())
+        world = ImaginedWorld(episode, real.world.start)
+        self._run(real.policy, world, real.instruction, job)
+        return world.success
+
     def _begin(
-        self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()
+        self,
+        real: SimulatedRollout,
+        job: Job,
+        objects: tuple[str, ...] = (),
+        pipeline: Pipeline | None = None,
     ) -> ImaginedEpisode:
         """An episode that begins with the simulator's first observation."""
-        return self.pipeline.begin(
+        return (pipeline or self.pipeline).begin(
             real.world.start,
             instruction=real.instruction,
             objects=objects,

@@ -99,6 +99,11 @@ class Settings(NodeSettings):
         "YAML of what names the objects of an episode's first real frame where `objects` is "
         "empty, like config/describer.yaml; empty = the instruction's colour words.",
     )
+    foresight: bool = at_start(
+        True,
+        "Foresee where objects go, where the checkpoint can; false = the paper's way: trails and "
+        'first masks are drawn, and pictures alone decide.',
+    )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'

@@ -49,7 +49,12 @@ def trajectory() -> JointTrajectory:
 
 
 def write_episode(
-    path: Path, *, compressed: bool = True, views: tuple[str, ...] = ('low', 'high')
+    path: Path,
+    *,
+    compressed: bool = True,
+    views: tuple[str, ...] = ('low', 'high'),
+    seed: int | None = 7,
+    metadata: dict[str, str] | None = None,
 ) -> Path:
     cameras = [camera(view) for view in views]
     with EpisodeWriter(
@@ -58,9 +63,9 @@ def write_episode(
         instruction='stack the red block on the blue block',
         robot='yam_bimanual',
         cameras=cameras,
-        seed=7,
+        seed=seed,
         objects=('red block', 'blue block'),
-        metadata={'simulator': 'test'},
+        metadata={'simulator': 'test', **(metadata or {})},
     ) as writer:
         writer.write_instruction(START_NS)
         writer.write_trajectory(START_NS, trajectory())

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from mtv_world_ros.data.splits import select
+from mtv_world_ros.data.splits import of_physics, select
 from mtv_world_ros.errors import ConfigError, EpisodeError
 
 
@@ -59,3 +59,17 @@ def test_what_cannot_be_used_is_an_error(dataset, tmp_path_factory):
     (dataset / 'dataset.json').write_text('{"splits": 3')
     with pytest.raises(ConfigError, match='not a data set card'):
         select(dataset)
+
+
+def test_episodes_of_one_physics_are_chosen_and_all_are_counted(tmp_path, make_episode):
+    make_episode('usual')
+    make_episode('late', metadata={'physics': 'delay_100ms'})
+    make_episode('real', seed=None)
+    found = select(tmp_path)
+    same, text = of_physics(found)
+    assert same == found
+    assert sorted(text.split(', ')) == ['delay_100ms (1)', 'nominal (1)', 'not stated (1)']
+    late, text = of_physics(found, 'delay_100ms')
+    assert names(late) == ['late'] and text == 'delay_100ms (1)'
+    with pytest.raises(ConfigError, match="'delay_100' .*did you mean 'delay_100ms'.*not stated"):
+        of_physics(found, 'delay_100')

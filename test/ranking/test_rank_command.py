@@ -12,6 +12,7 @@ from mtv_world_ros.cli import main
         (['--episodes', '0'], '--episodes is 0; it must be at least 1'),
         (['--true-episodes', '-1'], '--true-episodes is -1; it must be 0 or more'),
         (['--max-chunks', '0'], '--max-chunks'),
+        (['--physics', 'bald'], "unknown physics 'bald' (did you mean 'bold'?)"),
         (['--hold', '-1'], '--hold is -1; it must be 0 or more'),
         (['--describer', 'nowhere.yaml'], "describer file 'nowhere.yaml'"),
     ],

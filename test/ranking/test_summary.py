@@ -5,9 +5,10 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.ranking.ranking_report import console, markdown, remarks, write_ranking
+from mtv_world_ros.ranking.optimism import JUDGES
+from mtv_world_ros.ranking.ranking_report import console, markdown, remarks, tables, write_ranking
 from mtv_world_ros.ranking.ranking_summary import Summary
-from mtv_world_ros.ranking.rollout_jobs import Job, Result
+from mtv_world_ros.ranking.rollout_jobs import Job, Judged, Result
 
 #: (policy, true outcomes, imagined probabilities) of four episodes
 POLICIES = (
@@ -129,3 +130,41 @@ def test_a_result_survives_its_file(make_result):
     back = Result.from_json(values)
     assert isnan(back.imagined.probability) and back.seen == result.seen
     assert back.imagined.reasons == ('why',) and back.seconds == result.seconds
+
+
+def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
+    def said(value):
+        return Judged.stated(value, 'said')
+
+    results = [
+        make_result(
+            policy,
+            index,
+            final,
+            0.9 if final else 0.2,
+            rule=True,
+            # motions rank half of the pairs rightly, pictures none
+            foreseen=said(1.0 if final or policy == 'expert-miss-1' else 0.0),
+            pictures=said(nan if index == 3 else 0.3 if final else 0.8),
+        )
+        for index in range(6)
+        for policy, final in (('expert', True), ('expert-miss-1', False), ('expert-stop-1', False))
+    ]
+    summary = Summary(results=results, failed={}, num_true=1, provenance={'physics': 'bold: x'})
+    worth = summary.worth
+    assert {judge: scores['auroc'].value for judge, scores in worth.items()} == {
+        'foreseen': 0.75,
+        'pictures': 0.0,
+        'imagined': 1.0,
+        'no_picture': 0.5,
+        'seen': 1.0,
+    }
+    assert worth['foreseen']['false_success'].value == 0.5
+    assert worth['pictures']['abstention'].value == pytest.approx(3 / 18)
+    assert worth['pictures']['auroc'].count == 15
+    said_in_json = summary.as_json()['worth']['pictures']['false_success']
+    assert said_in_json['value'] == 1.0 and said_in_json['count'] == 10
+    first = tables(summary)[0]
+    assert [row[0] for row in first.rows] == list(JUDGES.values())
+    assert 'Truth of the simulator: bold: x.' in remarks(summary)
+    assert '[' in str(first.rows[0][3]), 'no interval'

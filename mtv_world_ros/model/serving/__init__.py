@@ -1,1 +1,1 @@
-"""What makes prediction fast: compilation, float8, several GPUs."""
+"""How a checkpoint is served: options, what they change, what they need of a device."""

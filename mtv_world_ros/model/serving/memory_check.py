@@ -57,7 +57,6 @@ def check_memory(
 def _advice(serving: ServingOptions) -> str:
     ways = [
         *([] if serving.offload else ['offload=true']),
-        *([] if serving.weights == 'float8' else ['weights=float8']),
         *([] if serving.tiny_decoder else ['tiny_decoder=FILE']),
     ]
     if not ways:
@@ -79,19 +78,12 @@ def free_bytes(device: torch.device) -> int | None:
 def weight_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
     """Returns what the weights take that are on the device all the time."""
     blocks = [_weights(block) for block in checkpoint.transformer.blocks]
-    linear = sum(
-        m.weight.numel()
-        for m in checkpoint.transformer.blocks.modules()
-        if isinstance(m, nn.Linear)
-    )
     numbers = _weights(checkpoint.transformer)
     if serving.offload:  # one computes while the next one comes
         numbers -= sum(blocks) - 2 * max(blocks)
-        linear = 2 * linear // len(blocks)
-    saved = linear * (dtype.itemsize - 1) if serving.weights == 'float8' else 0
     if checkpoint.image_encoder is not None and not serving.offload:
         numbers += _weights(checkpoint.image_encoder.model)
-    return (numbers + _weights(checkpoint.autoencoder)) * dtype.itemsize - saved
+    return (numbers + _weights(checkpoint.autoencoder)) * dtype.itemsize
 
 
 def _weights(module: nn.Module) -> int:
@@ -133,8 +125,7 @@ def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: tor
             peak_bytes(lambda: transformer(latents, **arguments)),
             peak_bytes(lambda: decoder.decode(latents.flatten(0, 1))),
         )
-    # a graph keeps its memory to itself
-    return sum(parts) if serving.cuda_graphs else max(parts)
+    return max(parts)
 
 
 def _class_name(checkpoint: Checkpoint) -> str:

@@ -35,6 +35,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
         segmenter=settings.segmenter,
         describer=settings.describer or None,
         serving=settings.serving,
+        foresight=settings.foresight,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.errors import EpisodeError, PolicyError, SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.file import load_robot
@@ -20,6 +21,7 @@ from mtv_world_ros.sim.expert.expert import Expert, ExpertConfig
 from mtv_world_ros.sim.expert.faults.catalogue import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.sim.world.cameras import CameraMoves, TRAINING_MOVES
+from mtv_world_ros.sim.world.physics import physics_named
 from mtv_world_ros.sim.world.randomize import RandomizationConfig
 from mtv_world_ros.sim.world.simulator import SimEpisode
 from mtv_world_ros.sim.world.workcell import workcell_of
@@ -46,6 +48,7 @@ class CollectConfig:
         kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
         siblings: episodes of each scene, the expert's and some with faults of `kinds` whose sizes
             lie on both sides of the boundary between success and failure; 0 = no siblings.
+        physics: name in the catalogue of what is true.
     """
 
     robot: str = _DEFAULT_ROBOT
@@ -58,6 +61,7 @@ class CollectConfig:
     policies: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
     siblings: int = 0
+    physics: str = NOMINAL
 
     def __post_init__(self) -> None:
         if not 0 <= self.moved_share <= 1:
@@ -65,6 +69,7 @@ class CollectConfig:
                 f'the share of episodes with moved cameras is {self.moved_share}; it must be in '
                 '[0, 1]; set --moved-cameras'
             )
+        physics_named(self.physics)
         for name in self.policies:
             parse_variant(name)
         if self.siblings and (self.siblings < 2 or self.policies or not self.kinds):
@@ -89,7 +94,7 @@ def plain_config(config: CollectConfig) -> dict[str, Any]:
     workcell = workcell_of(load_robot(bundled('robots', config.robot, '--robot')))
     config = replace(config, randomization=config.randomization.of(workcell))
     values = json.loads(json.dumps(asdict(config)))
-    usual = {'robot': _DEFAULT_ROBOT, 'siblings': 0}
+    usual = {'robot': _DEFAULT_ROBOT, 'siblings': 0, 'physics': NOMINAL}
     return {k: v for k, v in values.items() if k not in usual or v != usual[k]}
 
 
@@ -101,7 +106,7 @@ class EpisodeMaker:
         randomization = config.randomization.of(workcell_of(self._robot))
         config = replace(config, randomization=randomization)
         self._config = config
-        self._expert = Expert(self._robot, config.expert)
+        self._expert = Expert(self._robot, config.expert, config.physics)
 
     def make(self, job: Job) -> Spent:
         """Simulates attempts until one is as wanted, and writes it.
@@ -145,7 +150,7 @@ class EpisodeMaker:
 
         def physics(seed: int) -> SimEpisode:
             config = cameras_of(seed, self._config)
-            return SimEpisode(self._robot, self._expert.home, config, rendering=False)
+            return self._sim(config, rendering=False)
 
         record = replace(self._config.record, pictures='first')
         return BoundarySearch(
@@ -160,7 +165,7 @@ class EpisodeMaker:
         )
         if job.zero_shot is None:
             randomization = cameras_of(seed, config)
-        sim = SimEpisode(self._robot, self._expert.home, randomization)
+        sim = self._sim(randomization)
         faulty = self._policy(job, seed)
         try:
             return sim, simulate(
@@ -168,6 +173,15 @@ class EpisodeMaker:
             )
         except (SimulatorError, PolicyError):
             return sim, None
+
+    def _sim(self, randomization: RandomizationConfig, *, rendering: bool = True) -> SimEpisode:
+        return SimEpisode(
+            self._robot,
+            self._expert.home,
+            randomization,
+            rendering=rendering,
+            physics=self._config.physics,
+        )
 
     def _policy(self, job: Job, seed: int) -> PolicyVariant | None:
         """What acts in place of the expert."""

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode import Episode, NOMINAL, PHYSICS
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
@@ -20,12 +20,14 @@ from mtv_world_ros.sim.expert.expert import Expert
 from mtv_world_ros.sim.expert.faults.catalogue import PolicyVariant
 from mtv_world_ros.sim.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
+from mtv_world_ros.sim.world.physics import physics_named
 from mtv_world_ros.sim.world.randomize import draw_scene
 from mtv_world_ros.sim.world.simulator import (
     CONTROL_PERIOD_S,
     scene_generator,
     SimEpisode,
     SimObservation,
+    situation_of,
 )
 from mtv_world_ros.sim.world.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
@@ -270,13 +272,18 @@ def write_take(
         extra: further MCAP metadata.
     """
     objects = tuple(item.name for item in sim.scene.objects)
-    metadata = {'ever': str(take.ever).lower(), 'final': str(take.final).lower(), **extra}
+    metadata = {
+        'ever': str(take.ever).lower(),
+        'final': str(take.final).lower(),
+        PHYSICS: sim.physics,
+        **extra,
+    }
     with EpisodeWriter(
         path,
         task=sim.task.name,
         instruction=sim.instruction,
         robot=sim.robot.name,
-        cameras=sim.scene.cameras,
+        cameras=sim.told_cameras,
         seed=seed,
         objects=objects,
         metadata=metadata,
@@ -315,7 +322,9 @@ def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
             f"'{info.path}' has no object poses with a seed; only simulated ones do"
         )
     task = task_named(info.task)
-    scene = draw_scene(task, scene_generator(info.seed), workcell_of(robot))
+    physics = physics_named(info.metadata.get(PHYSICS, NOMINAL))
+    workcell = physics.workcell(workcell_of(robot))
+    scene = draw_scene(task, scene_generator(info.seed), workcell)
     names = tuple(item.name for item in scene.objects)
     if names != info.objects:
         raise EpisodeError(
@@ -323,18 +332,12 @@ def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
         )
     stamps, poses = episode.object_poses
     rows = np.searchsorted(states.stamps_ns, stamps)
-    roles = [item.role for item in scene.objects]
-    return TruePoses(
-        positions={role: poses[:, i, :3, 3] for i, role in enumerate(roles)},
-        rotations={role: poses[:, i, :3, :3] for i, role in enumerate(roles)},
-        sizes={item.role: item.size for item in scene.objects},
-        openings=robot.gripper_openings(states.positions[rows]),
-        goals=task.goals(scene.goals),
-    )
+    openings = robot.gripper_openings(states.positions[rows])
+    return situation_of(scene, task, poses, openings)
 
 
 def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:
-    for camera in sim.scene.cameras if seen.images else ():
+    for camera in sim.told_cameras if seen.images else ():
         writer.write_camera_info(camera.view, stamp, camera)
         writer.write_image(camera.view, stamp, seen.images[camera.view])
         writer.write_mask(camera.view, stamp, seen.masks[camera.view])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
@@ -17,6 +18,7 @@ from mtv_world_ros.sim.expert.faults.variant_faults import WayPointFaults
 from mtv_world_ros.sim.expert.way_points import WayPoint
 from mtv_world_ros.sim.shapes import Grasp, SHAPES
 from mtv_world_ros.sim.tasks.tasks import Move, PickPlace, Shake, Task
+from mtv_world_ros.sim.world.physics import physics_named
 from mtv_world_ros.sim.world.placement import side_of
 from mtv_world_ros.sim.world.scene import Place, Scene, SceneObject
 from mtv_world_ros.sim.world.workcell import Workcell, workcell_of
@@ -212,8 +214,14 @@ def _missed_move(task: Task, rng: np.random.Generator) -> int:
 class Expert:
     """Plans a task's moves for a scene, from the objects' true start poses."""
 
-    def __init__(self, robot: RobotModel, config: ExpertConfig | None = None) -> None:
-        self.robot, self.workcell = robot, workcell_of(robot)
+    def __init__(
+        self,
+        robot: RobotModel,
+        config: ExpertConfig | None = None,
+        physics: str = NOMINAL,
+    ) -> None:
+        self.robot = robot
+        self.workcell = physics_named(physics).workcell(workcell_of(robot))
         self.home = home_positions(robot)
         self._config = config or ExpertConfig()
         self._solvers = {}

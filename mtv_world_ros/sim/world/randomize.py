@@ -56,12 +56,15 @@ class RandomizationConfig:
         )
 
 
-def _draw_object(role: ObjectRole, side: float, taken: set[str], rng: Rng) -> SceneObject:
+def _draw_object(
+    role: ObjectRole, side: float, taken: set[str], rng: Rng, scale: float
+) -> SceneObject:
     """An object of a role, in a colour that no other has; `side` -1 exchanges left and right."""
     name = str(rng.choice([shape for shape in role.shapes if SHAPES[shape].free(taken)]))
     shape = SHAPES[name]
     word = str(rng.choice([word for word in shape.colours if word not in taken]))
-    size = shape.size(float(rng.uniform(*role.size_share)))
+    x, y, z = shape.size(float(rng.uniform(*role.size_share)))
+    size = (x * scale, y * scale, z * scale)
     red, green, blue = (channel / 255 for channel in PALETTE[word])
     x, y = side * float(rng.uniform(*role.x_range)), float(rng.uniform(*role.y_range))
     return SceneObject(
@@ -75,13 +78,15 @@ def _draw_object(role: ObjectRole, side: float, taken: set[str], rng: Rng) -> Sc
     )
 
 
-def _draw_objects(task: Task, roles: Sequence[ObjectRole], rng: Rng) -> dict[str, SceneObject]:
+def _draw_objects(
+    task: Task, roles: Sequence[ObjectRole], rng: Rng, scale: float
+) -> dict[str, SceneObject]:
     side = float(rng.choice((-1.0, 1.0))) if task.mirrored else 1.0
     items: dict[str, SceneObject] = {}
     # what comes in few colours chooses first
     for role in sorted(roles, key=lambda role: _num_colours(role)):
         taken = {item.name.split()[0] for item in items.values()}
-        items[role.role] = _draw_object(role, side, taken, rng)
+        items[role.role] = _draw_object(role, side, taken, rng, scale)
     return {role.role: items[role.role] for role in roles}
 
 
@@ -127,7 +132,7 @@ def draw_scene(
     assert config.cameras is not None and config.placement is not None
     roles = [role for role in task.roles if rng.uniform() < role.probability]
     for _ in range(MAX_DRAWS):
-        items = _draw_objects(task, roles, rng)
+        items = _draw_objects(task, roles, rng, workcell.object_size)
         shifts = [(float(x), float(y)) for x, y in rng.uniform(-1, 1, (len(task.moves), 2))]
         goals = goals_of(task, items, shifts)
         if not is_feasible(task, items, goals, config.placement, workcell):
@@ -146,11 +151,22 @@ def draw_scene(
         )
         for spec in config.cameras
     )
+    table_m = workcell.table_m
     scene = Scene(
-        objects=tuple(items.values()), cameras=cameras, look=_draw_look(rng), goals=goals
+        objects=tuple(
+            replace(item, position=_raised(item.position, table_m)) for item in items.values()
+        ),
+        cameras=cameras,
+        look=_draw_look(rng),
+        goals=tuple(_raised(goal, table_m) for goal in goals),
+        table_m=table_m,
     )
     check_cameras(scene, workcell.base_link)
     return scene
+
+
+def _raised(place: Place, height: float) -> Place:
+    return (place[0], place[1], place[2] + height)
 
 
 def instruction_of(task: Task, scene: Scene) -> str:

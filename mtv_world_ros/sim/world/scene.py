@@ -63,12 +63,14 @@ class Scene:
         cameras: in the order of the views.
         look: table and light.
         goals: where the subject of each of the task's moves should come to rest [m].
+        table_m: height of the table [m].
     """
 
     objects: tuple[SceneObject, ...]
     cameras: tuple[CameraModel, ...]
     look: SceneLook
     goals: tuple[Place, ...] = ()
+    table_m: float = 0.0
 
 
 def _numbers(values: tuple[float, ...]) -> str:
@@ -127,8 +129,8 @@ def scene_xml(scene: Scene, robot: RobotModel) -> str:
     <light type="directional" dir="{_numbers(look.light_direction)}" pos="0 0 2" castshadow="false"
            diffuse="{look.diffuse} {look.diffuse} {look.diffuse}" ambient="0 0 0"
            specular="0 0 0"/>
-    <geom name="table" type="plane" size="3 3 0.1" rgba="{_numbers(look.table_rgb)} 1"
-          friction="0.9 0.01 0.0005" condim="4"/>
+    <geom name="table" type="plane" pos="0 0 {scene.table_m:.9g}" size="3 3 0.1"
+          rgba="{_numbers(look.table_rgb)} 1" friction="0.9 0.01 0.0005" condim="4"/>
     {''.join(camera_xml(camera, camera.T_mount_camera) for camera in fixed)}
     {bodies_xml(robot, moving)}
     {''.join(_object_xml(item) for item in scene.objects)}

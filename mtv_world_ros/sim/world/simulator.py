@@ -7,12 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.sim.tasks.tasks import Task, task_named
 from mtv_world_ros.sim.world.arm import actuators_of
 from mtv_world_ros.sim.world.opengl import load_mujoco
+from mtv_world_ros.sim.world.physics import (
+    DelayLine,
+    ModelParts,
+    physics_named,
+    picture_generator,
+)
 from mtv_world_ros.sim.world.randomize import draw_scene, instruction_of, RandomizationConfig
 from mtv_world_ros.sim.world.scene import Scene, scene_xml, TIMESTEP_S
 from mtv_world_ros.sim.world.workcell import workcell_of
@@ -45,6 +52,26 @@ def scene_generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
 
 
+def situation_of(scene: Scene, task: Task, poses: FloatArray, openings: FloatArray) -> TruePoses:
+    """Returns where objects were, from the table up.
+
+    Args:
+        scene: of O objects.
+        task: has the goals.
+        poses: T_base_object (T, O, 4, 4) [m].
+        openings: (A, T) of the grippers.
+    """
+    up = np.array([0.0, 0.0, scene.table_m])
+    goals = task.goals(scene.goals)
+    return TruePoses(
+        positions={item.role: poses[:, i, :3, 3] - up for i, item in enumerate(scene.objects)},
+        rotations={item.role: poses[:, i, :3, :3] for i, item in enumerate(scene.objects)},
+        sizes={item.role: item.size for item in scene.objects},
+        openings=openings,
+        goals={role: goal - up for role, goal in goals.items()},
+    )
+
+
 class SimEpisode:
     """Physics and cameras of one episode at a time.
 
@@ -53,6 +80,11 @@ class SimEpisode:
         home: (J,) joint positions at reset [rad or m].
         config: what is randomised, and the image size; default: the workcell's.
         rendering: False runs physics alone, without OpenGL; images are then empty.
+        physics: name in the catalogue (`config/physics.yaml`) of what is true here.
+
+    Attributes:
+        physics: that name.
+        told_cameras: the scene's cameras as they are calibrated.
     """
 
     def __init__(
@@ -62,10 +94,14 @@ class SimEpisode:
         config: RandomizationConfig | None = None,
         *,
         rendering: bool = True,
+        physics: str = NOMINAL,
     ) -> None:
-        self.robot = robot
+        self.robot, self.physics = robot, physics
         self.home = np.asarray(home, dtype=np.float64)
-        self._workcell = workcell_of(robot)
+        self._physics = physics_named(physics)
+        self._workcell = self._physics.workcell(workcell_of(robot))
+        # reported less true positions
+        self._zeros = self._physics.joint_zeros(robot)
         self._config = config or RandomizationConfig()
         self._rendering = rendering
         self._mujoco = load_mujoco(rendering=rendering)
@@ -77,10 +113,12 @@ class SimEpisode:
         self._lead = np.array([actuator.kv / actuator.kp for actuator in actuators])
         self._renderer: Any = None
         self._model: Any = None
+        self._seed = 0
 
     def reset(self, seed: int, task: str | Task) -> SimObservation:
         """Builds the scene of a seed and returns its first observation."""
         self.task = task_named(task) if isinstance(task, str) else task
+        self._seed = seed
         scene = draw_scene(self.task, scene_generator(seed), self._workcell, self._config)
         return self.load(scene, self.task)
 
@@ -99,16 +137,23 @@ class SimEpisode:
             raise SimulatorError(
                 f"the scene of task '{task.name}' does not build: {error}"
             ) from error
+        actuators = actuators_of(self.robot)
+        roles = [item.role for item in scene.objects]
+        parts = ModelParts.of(self._model, roles, self.robot, actuators)
+        self._physics.change(self._model, mujoco, parts)
         self._data = mujoco.MjData(self._model)
         self._index_model()
+        self.told_cameras = self._physics.told_cameras(scene.cameras, self._seed)
+        self._noise = picture_generator(self._seed)
         if self._rendering:
             height, width = scene.cameras[0].height, scene.cameras[0].width
             self._renderer = mujoco.Renderer(self._model, height, width)
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-        self._target, self._seen = self.home, []
-        self._data.qpos[self._arm_qpos] = self._spread(self.home)
-        self._data.ctrl[:] = self._spread(self.home)
+        self._target, self._arrived, self._seen = self.home, self.home, []
+        self._delay = DelayLine(self.home, self._physics.delay_s / CONTROL_PERIOD_S)
+        self._data.qpos[self._arm_qpos] = self._spread(self.home - self._zeros)
+        self._data.ctrl[:] = self._spread(self.home - self._zeros)
         mujoco.mj_forward(self._model, self._data)
         return self.observe()
 
@@ -143,11 +188,12 @@ class SimEpisode:
             TrajectoryError: wrong number of joints, or not finite.
         """
         targets = self._checked(targets)
-        velocity = (self._spread(targets) - self._spread(self._target)) / CONTROL_PERIOD_S
-        self._data.ctrl[:] = self._spread(targets) + self._lead * velocity
+        arrived = self._delay.pass_on(targets)
+        velocity = (self._spread(arrived) - self._spread(self._arrived)) / CONTROL_PERIOD_S
+        self._data.ctrl[:] = self._spread(arrived - self._zeros) + self._lead * velocity
         num_steps = round(CONTROL_PERIOD_S / TIMESTEP_S)
         self._mujoco.mj_step(self._model, self._data, nstep=num_steps)
-        self._target = targets
+        self._target, self._arrived = targets, arrived
 
     def _checked(self, targets: FloatArray) -> FloatArray:
         targets = np.asarray(targets, dtype=np.float64)
@@ -162,7 +208,7 @@ class SimEpisode:
         """Returns the measured joint positions (J,) in the robot's order [rad or m]."""
         driven = (self._data.qpos[self._arm_qpos] - self._offsets) / self._multipliers
         sums = np.bincount(self._columns, driven, minlength=len(self.home))
-        return sums / np.bincount(self._columns, minlength=len(self.home))
+        return sums / np.bincount(self._columns, minlength=len(self.home)) + self._zeros
 
     def object_poses(self) -> FloatArray:
         """Returns T_base_object (O, 4, 4) of the objects' centres [m]."""
@@ -178,14 +224,8 @@ class SimEpisode:
 
     def situation(self) -> TruePoses:
         """Returns the true poses since reset, on which the task's relations are evaluated."""
-        poses, scene = self.seen_poses(), self.scene
-        return TruePoses(
-            positions={item.role: poses[:, i, :3, 3] for i, item in enumerate(scene.objects)},
-            rotations={item.role: poses[:, i, :3, :3] for i, item in enumerate(scene.objects)},
-            sizes={item.role: item.size for item in scene.objects},
-            openings=self.robot.gripper_openings(np.array([seen for _, seen in self._seen])),
-            goals=self.task.goals(scene.goals),
-        )
+        openings = self.robot.gripper_openings(np.array([seen for _, seen in self._seen]))
+        return situation_of(self.scene, self.task, self.seen_poses(), openings)
 
     def observe(self, *, rendering: bool = True) -> SimObservation:
         """Renders all views (unless disabled) and evaluates whether the task is done."""
@@ -204,7 +244,7 @@ class SimEpisode:
         images, masks = {}, {}
         for camera in self.scene.cameras:
             self._renderer.update_scene(self._data, camera.view)
-            images[camera.view] = self._renderer.render()
+            images[camera.view] = self._physics.pictured(self._renderer.render(), self._noise)
             masks[camera.view] = self._render_instances()
         return images, masks
 

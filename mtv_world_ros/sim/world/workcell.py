@@ -99,6 +99,8 @@ class Workcell:
         finger_thickness_m: along it.
         placement: limits of its scenes.
         cameras: nominal ones, in the order of the views.
+        table_m: height of the table [m].
+        object_size: factor of the objects' sizes.
     """
 
     base_link: str
@@ -109,6 +111,8 @@ class Workcell:
     finger_thickness_m: float
     placement: PlacementConfig
     cameras: tuple[AnyCameraSpec, ...]
+    table_m: float = 0.0
+    object_size: float = 1.0
 
     def arm_at(self, x: float) -> str:
         """Returns the arm that handles an object at `x`: the one whose base is nearest."""
