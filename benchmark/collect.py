@@ -17,16 +17,16 @@ import time
 
 from page import measure, parse_arguments, publish, table
 
+from mtv_world_ros.bench.collect.episode_jobs import jobs_of
+from mtv_world_ros.bench.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
+from mtv_world_ros.bench.tasks.tasks import task_named, tasks_named
+from mtv_world_ros.bench.world.opengl import load_mujoco
+from mtv_world_ros.bench.world.randomize import draw_scene
+from mtv_world_ros.bench.world.scene import scene_xml
+from mtv_world_ros.bench.world.simulator import scene_generator
+from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.sim.collect.episode_jobs import jobs_of
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig, EpisodeMaker, Spent
-from mtv_world_ros.sim.tasks.tasks import task_named, tasks_named
-from mtv_world_ros.sim.world.opengl import load_mujoco
-from mtv_world_ros.sim.world.randomize import draw_scene
-from mtv_world_ros.sim.world.scene import scene_xml
-from mtv_world_ros.sim.world.simulator import scene_generator
-from mtv_world_ros.sim.world.workcell import workcell_of
 
 PARTS = {'planning and physics': 'physics_s', 'rendering': 'rendering_s', 'writing': 'writing_s'}
 

@@ -37,24 +37,24 @@ from mtv_world_ros.assembly import (
     load_pipeline,
     robot_path,
 )
-from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
-from mtv_world_ros.evaluation.references import ACTIONS
-from mtv_world_ros.evaluation.report.comparison import write_comparison
-from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.report.tables import estimates_json
-from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.model.checkpoint import load_checkpoint
-from mtv_world_ros.training.training_config import (
+from mtv_world_ros.lab.cli.train import set_overrides
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.lab.evaluation.references import ACTIONS
+from mtv_world_ros.lab.evaluation.report.comparison import write_comparison
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.report.tables import estimates_json
+from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.training.training_config import (
     load_training_config,
     TrainingConfig,
     TrainingRun,
 )
-from mtv_world_ros.training.training_run import spread, train
+from mtv_world_ros.lab.training.training_run import spread, train
+from mtv_world_ros.model.checkpoint import load_checkpoint
 
 
 def parse() -> argparse.Namespace:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from page import table
 
-from mtv_world_ros.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.report.tables import cell
+from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.report.tables import cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,8 +27,8 @@ from tqdm import tqdm
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.recording import cached_recording, clip_starts, cut_clip, Recording
 from mtv_world_ros.data.splits import select
+from mtv_world_ros.lab.training.training_run import spread
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.training.training_run import spread
 
 STEPS = (1, 2, 4, 8, 16)
 #: RGB difference (of 255) from which a pixel counts as changed

@@ -21,7 +21,7 @@ from page import publish, table
 import torch
 
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
-from mtv_world_ros.training.distillation import distill, DistillConfig
+from mtv_world_ros.lab.training.distillation import distill, DistillConfig
 
 
 def student(steps: int, options: argparse.Namespace) -> Path:

@@ -28,7 +28,7 @@ from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.robot.shape import moving_links
-from mtv_world_ros.inspection.inspect import Inspector, load_inspector
+from mtv_world_ros.lab.inspection.inspect import Inspector, load_inspector
 
 #: (episode, view, sign) -> the same with something wrong
 Fault = Callable[[Episode, str, float], Episode]

@@ -18,9 +18,9 @@ from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape, rods
-from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.inspection.inspect import Inspector
-from mtv_world_ros.inspection.motion_residual import measure_residual, ResidualSearch
+from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.lab.inspection.inspect import Inspector
+from mtv_world_ros.lab.inspection.motion_residual import measure_residual, ResidualSearch
 
 SEARCH = ResidualSearch(lags_s=(0.0,))
 

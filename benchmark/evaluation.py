@@ -24,9 +24,9 @@ import torch
 
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
-from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 
 
 def main() -> None:

@@ -30,31 +30,31 @@ from page import parse_arguments, publish, table
 import torch
 
 from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fingerprint
+from mtv_world_ros.bench.ranking.no_picture_rule import is_done, Thing
+from mtv_world_ros.bench.ranking.optimism import area_interval
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.recorded_policies import refuse_test_kinds
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.metrics.statistics import wilson
-from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
+from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.lab.training.object_motion.tracks import (
+    fine_commands,
+    first_frame,
+    FirstFrame,
+    recorded_positions,
+)
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.object_motion.predictor import (
     load_predictor,
     ObjectMotionPredictor,
     TrackedObjects,
 )
-from mtv_world_ros.ranking.no_picture_rule import is_done, Thing
-from mtv_world_ros.ranking.optimism import area_interval
-from mtv_world_ros.sim.collect.recorded_policies import refuse_test_kinds
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
-from mtv_world_ros.training.object_motion.tracks import (
-    fine_commands,
-    first_frame,
-    FirstFrame,
-    recorded_positions,
-)
 
 VIEWS = ('low', 'high')
 RULE = 'no pictures, no networks: the rule'

@@ -24,10 +24,10 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.evaluation.imagined_stretches import stretches
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.solids import find_solid, fit_solid, is_vessel, Solid
+from mtv_world_ros.lab.evaluation.imagined_stretches import stretches
 from mtv_world_ros.pipeline import Pipeline
 
 _MOVED_M, _WHOLE = 0.004, 0.9

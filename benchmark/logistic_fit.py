@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import Bounds, minimize
 from scipy.special import expit, log_expit
 
-from mtv_world_ros.evaluation.calibration.fit import fit_logistic, MAX_BIAS
+from mtv_world_ros.lab.evaluation.calibration.fit import fit_logistic, MAX_BIAS
 
 
 def random_set(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

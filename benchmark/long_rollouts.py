@@ -33,14 +33,14 @@ from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.data_types import ByteArray, History
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
-from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import write_json
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.training.training_run import spread
 from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.training.training_run import spread
 
 PLAIN, ANCHOR, HISTORY = 'plain chaining', 'anchor', 'anchor + history'
 WITHOUT_ANCHOR = 'history'

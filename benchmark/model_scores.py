@@ -14,13 +14,13 @@ from page import in_turns
 from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.evaluation.evaluate_episodes import evaluate, Parallel
-from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
-from mtv_world_ros.evaluation.report.evaluation_summary import Summary
-from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.files import share_path
-from mtv_world_ros.training.training_config import load_training_config, TrainingRun
-from mtv_world_ros.training.training_run import spread
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
+from mtv_world_ros.lab.training.training_run import spread
 
 #: columns of a table, and what `Summary.estimates` calls them
 COLUMNS = {'J moving': 'j_moving', 'J objects': 'j_object_mean', 'skill': 'skill'}

@@ -25,21 +25,21 @@ from pathlib import Path
 import numpy as np
 from page import publish, table
 
+from mtv_world_ros.bench.collect.episode_maker import CollectConfig
+from mtv_world_ros.bench.collect.record import carry_out, RecordConfig, Take
+from mtv_world_ros.bench.expert.expert import Expert
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT
+from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
+from mtv_world_ros.bench.tasks.tasks import task_named
+from mtv_world_ros.bench.world.scene import Scene
+from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.record import carry_out, RecordConfig, Take
-from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.expert.faults.catalogue import EXPERT
-from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
-from mtv_world_ros.sim.tasks.tasks import task_named
-from mtv_world_ros.sim.world.scene import Scene
-from mtv_world_ros.sim.world.simulator import CONTROL_PERIOD_S, SimEpisode
+from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
 
 #: turn of an object, for every metre of noise [rad]
 _TURN_PER_M = 0.02 / 0.0007

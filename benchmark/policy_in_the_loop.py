@@ -23,18 +23,18 @@ import numpy as np
 from page import parse_arguments, publish, table
 
 from mtv_world_ros.assembly import assemble_policy, load_pipeline
+from mtv_world_ros.bench.expert.expert import home_positions
+from mtv_world_ros.bench.ranking.worlds import run_policy, SimulatedWorld
+from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
+from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.model import world_model as model_module
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.ranking.worlds import run_policy, SimulatedWorld
-from mtv_world_ros.sim.expert.expert import home_positions
-from mtv_world_ros.sim.world.simulator import SimEpisode
 
 #: the expert's plans are shorter than the episodes: it holds still at their end
 POLICY = 'kind: scripted\nvariant: expert\nhold_s: 60.0\n'

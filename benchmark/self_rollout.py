@@ -26,8 +26,8 @@ from tqdm import tqdm
 from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.recording import cached_recording
 from mtv_world_ros.data.splits import select
-from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
-from mtv_world_ros.training.training_run import spread, train
+from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
+from mtv_world_ros.lab.training.training_run import spread, train
 
 #: RGB difference (of 255) from which a pixel counts as changed
 _CHANGE = 24

@@ -24,19 +24,19 @@ from pathlib import Path
 import numpy as np
 from page import publish, table
 
+from mtv_world_ros.bench.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
+from mtv_world_ros.bench.collect.dataset_readme import commands
+from mtv_world_ros.bench.collect.episode_jobs import episode_seed
+from mtv_world_ros.bench.collect.episode_maker import CollectConfig
+from mtv_world_ros.bench.collect.record import simulate
+from mtv_world_ros.bench.episode_measures import EpisodeMeasures, measure
+from mtv_world_ros.bench.expert.expert import Expert
+from mtv_world_ros.bench.tasks.tasks import task_named
+from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.sim.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
-from mtv_world_ros.sim.collect.dataset_readme import commands
-from mtv_world_ros.sim.collect.episode_jobs import episode_seed
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.record import simulate
-from mtv_world_ros.sim.episode_measures import EpisodeMeasures, measure
-from mtv_world_ros.sim.expert.expert import Expert
-from mtv_world_ros.sim.tasks.tasks import task_named
-from mtv_world_ros.sim.world.simulator import SimEpisode
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: indices that no data set reaches

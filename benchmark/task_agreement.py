@@ -18,12 +18,12 @@ from pathlib import Path
 
 from page import publish, table
 
+from mtv_world_ros.bench.collect.episode_maker import CollectConfig
+from mtv_world_ros.bench.collect.record import true_poses
+from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.sim.collect.episode_maker import CollectConfig
-from mtv_world_ros.sim.collect.record import true_poses
-from mtv_world_ros.sim.tasks.tasks import task_named
 from mtv_world_ros.success.task import ever_and_final
 
 HEAD = ('task', 'episodes', 'frames', 'ever', 'final', 'disagree')

@@ -13,6 +13,7 @@ from diffusers import WanImageToVideoPipeline, WanTransformer3DModel
 import torch
 from torch import nn, Tensor
 
+from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.conditioning import condition, Conditioning, decode_frames
 from mtv_world_ros.model.history_tokens import with_anchor, with_history
@@ -23,7 +24,6 @@ from mtv_world_ros.model.serving.prepare import prepare
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.training_config import TrainingConfig
 
 _IMAGE_TOKENS = 257
 #: of a stock Wan image-to-video transformer: noisy 16, mask 4, image 16

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.evaluation.video import write_video
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
@@ -20,6 +19,7 @@ from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
+from mtv_world_ros.rendering.video import write_video
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples'))

@@ -15,8 +15,8 @@ import numpy as np
 from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.data_types import Observation
-from mtv_world_ros.evaluation.video import write_video
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rendering.video import write_video
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

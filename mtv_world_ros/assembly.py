@@ -305,7 +305,7 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
-    from mtv_world_ros.sim.expert.faults.catalogue import parse_variant
+    from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
 
     if str(name).startswith('expert'):
         config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
@@ -317,8 +317,8 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
 
 
 def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
-    from mtv_world_ros.sim.expert.expert import Expert
-    from mtv_world_ros.sim.expert.scripted_policy import scripted_policy
+    from mtv_world_ros.bench.expert.expert import Expert
+    from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 
     variant = settings.variant
     expert = Expert(robot)

@@ -243,7 +243,7 @@ def test_wrong_values_get_one_line(
 def test_states_are_saved_by_time_too(tmp_path: Path) -> None:
     words = train_words(tmp_path, '--set', 'optimizer.steps=3', '--save-minutes', '0')
     seen = []
-    from mtv_world_ros.training.trainer import Trainer
+    from mtv_world_ros.lab.training.trainer import Trainer
 
     save = Trainer.save_state
     with pytest.MonkeyPatch.context() as patch:

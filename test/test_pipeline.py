@@ -16,18 +16,18 @@ from mtv_world_ros.errors import (
     RolloutPreempted,
     TrajectoryError,
 )
-from mtv_world_ros.evaluation.imagined_stretches import (
-    imagine_stretch,
-    last_chunk,
-    observe_stretch,
-    stretches,
-)
-from mtv_world_ros.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.lab.evaluation.imagined_stretches import (
+    imagine_stretch,
+    last_chunk,
+    observe_stretch,
+    stretches,
+)
+from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
 from mtv_world_ros.model.object_motion.predictor import Member, ObjectMotionPredictor

@@ -147,7 +147,7 @@ def physics_text(name: str) -> str:
     Raises:
         SimulatorError: unknown name.
     """
-    from mtv_world_ros.sim.world.physics import physics_named
+    from mtv_world_ros.bench.world.physics import physics_named
 
     return f'{name}: {physics_named(name).text}'
 

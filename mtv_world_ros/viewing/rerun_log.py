@@ -12,7 +12,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.evaluation.results import StoredRollout
+from mtv_world_ros.lab.evaluation.results import StoredRollout
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 from mtv_world_ros.viewing.streams import KINDS, Streams
 

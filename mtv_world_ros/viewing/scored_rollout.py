@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
-from mtv_world_ros.evaluation.report.read_back import read_evaluations
-from mtv_world_ros.evaluation.results import EpisodeResult, load_rollout, StoredRollout
-from mtv_world_ros.ranking.both_worlds import FRAMES
-from mtv_world_ros.ranking.rollout_cards import (
+from mtv_world_ros.bench.ranking.both_worlds import FRAMES
+from mtv_world_ros.bench.ranking.rollout_cards import (
     rollout_file,
     told,
     verdict,
     when_they_part,
     worst_first,
 )
-from mtv_world_ros.ranking.rollout_jobs import Result
-from mtv_world_ros.ranking.run_jobs import read_results
+from mtv_world_ros.bench.ranking.rollout_jobs import Result
+from mtv_world_ros.bench.ranking.run_jobs import read_results
+from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
+from mtv_world_ros.lab.evaluation.results import EpisodeResult, load_rollout, StoredRollout
 
 #: of a ranking's and an evaluation's folder
 RANKING, EVALUATION = 'ranking.json', 'metrics.json'

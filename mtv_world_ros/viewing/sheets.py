@@ -9,14 +9,14 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.evaluation.video import (
+from mtv_world_ros.rendering.images import resize_frames, write_png
+from mtv_world_ros.rendering.video import (
     Comparison,
     contact_sheet,
     KINDS,
     side_by_side,
     write_video,
 )
-from mtv_world_ros.rendering.images import resize_frames, write_png
 from mtv_world_ros.viewing.streams import read_streams, Streams
 
 SHEET, VIDEO = 'contact_sheet.png', 'comparison.mp4'

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from mtv_world_ros.bench.collect.dataset_readme import KEYS
+from mtv_world_ros.bench.collect.siblings import Sibling
 from mtv_world_ros.geometry.calibration_file import _View
 from mtv_world_ros.geometry.robot.file import ArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
-from mtv_world_ros.sim.collect.dataset_readme import KEYS
-from mtv_world_ros.sim.collect.siblings import Sibling
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 

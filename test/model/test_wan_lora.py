@@ -12,9 +12,9 @@ from wan_files import DIM
 from wan_lora import build, RANK, run
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.lora import ADAPTER, Adapters, add_adapter, save_adapter
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.training.training_config import load_training_config
 
 
 def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.assembly import assemble_policy, robot_path
+from mtv_world_ros.bench.ranking.policy_list import load_policy_list
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.demo.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.recorded_policy import RecordedPolicy
-from mtv_world_ros.ranking.policy_list import load_policy_list
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 COMMANDS = JointTrajectory(

@@ -306,7 +306,7 @@ def _read_policy(data: bytes, folder: Path) -> Any:
 
 
 def _read_policies(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.ranking.policy_list import load_policy_list
+    from mtv_world_ros.bench.ranking.policy_list import load_policy_list
 
     return load_policy_list(_file(folder / 'policies.yaml', data), _yam())
 
@@ -318,7 +318,7 @@ def _read_mapping(data: bytes, folder: Path) -> Any:
 
 
 def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.importing.mapping import load_mapping
+    from mtv_world_ros.lab.importing.mapping import load_mapping
 
     (folder / 'cameras').mkdir(exist_ok=True)
     shutil.copy(share_path('config', 'cameras', 'yam_bimanual.yaml'), folder / 'cameras')
@@ -327,7 +327,7 @@ def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
 
 
 def _read_preset(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.training.training_config import load_training_config
+    from mtv_world_ros.lab.training.training_config import load_training_config
 
     return load_training_config(str(_file(folder / 'preset.yaml', data)))
 
@@ -359,7 +359,7 @@ def _trees() -> list[bytes]:
 
 
 def _read_state_card(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.training.resume import read_card, STATE
+    from mtv_world_ros.lab.training.resume import read_card, STATE
 
     (folder / STATE).mkdir(exist_ok=True)
     _file(folder / STATE / 'state.json', data)
@@ -374,19 +374,19 @@ def _features() -> list[bytes]:
 
 
 def _read_features(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.evaluation.metrics.frechet.feature_store import load_features
+    from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import load_features
 
     return load_features(_file(folder / 'features.npz', data))
 
 
 def _videos() -> list[bytes]:
-    from mtv_world_ros.evaluation.video import encode_video
+    from mtv_world_ros.rendering.video import encode_video
 
     return [encode_video(np.zeros((4, 32, 48, 3), np.uint8), 5.0)]
 
 
 def _read_video(data: bytes, _: Path) -> Any:
-    from mtv_world_ros.evaluation.video import decode_video
+    from mtv_world_ros.rendering.video import decode_video
 
     return decode_video(data)
 

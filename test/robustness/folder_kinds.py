@@ -149,9 +149,9 @@ def _read_calibration(folder: Path) -> Any:
 
 def make_ranking(folder: Path) -> None:
     """One result of a ranking."""
+    from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
+    from mtv_world_ros.bench.ranking.run_jobs import FOLDER
     from mtv_world_ros.files import write_json
-    from mtv_world_ros.ranking.rollout_jobs import Judged, Result
-    from mtv_world_ros.ranking.run_jobs import FOLDER
 
     judged = Judged(probability=0.5, interval=(0.25, 0.75), jaccard=((0.5,),), reasons=('a',))
     result = Result(
@@ -164,15 +164,15 @@ def make_ranking(folder: Path) -> None:
 
 
 def _read_ranking(folder: Path) -> Any:
-    from mtv_world_ros.ranking.run_jobs import read_results
+    from mtv_world_ros.bench.ranking.run_jobs import read_results
 
     return read_results(folder)
 
 
 def make_evaluation(folder: Path) -> None:
     """An evaluation of one episode."""
-    from mtv_world_ros.evaluation.metrics.scores import ScoreRow
-    from mtv_world_ros.evaluation.results import EpisodeResult
+    from mtv_world_ros.lab.evaluation.metrics.scores import ScoreRow
+    from mtv_world_ros.lab.evaluation.results import EpisodeResult
 
     numbers = dict.fromkeys(
         ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_mirrored', 'j_ceiling', 'j_self'),
@@ -196,14 +196,14 @@ def make_evaluation(folder: Path) -> None:
 
 
 def _read_evaluation(folder: Path) -> Any:
-    from mtv_world_ros.evaluation.report.read_back import read_evaluations
+    from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
 
     return read_evaluations(folder)
 
 
 def make_rollout(folder: Path) -> None:
     """The frames of a scored episode."""
-    from mtv_world_ros.evaluation.results import save_rollout, StoredRollout
+    from mtv_world_ros.lab.evaluation.results import save_rollout, StoredRollout
 
     frames, masks = np.zeros((2, 3, 32, 48, 3), np.uint8), np.zeros((2, 1, 3, 32, 48), bool)
     rollout = StoredRollout(
@@ -215,7 +215,7 @@ def make_rollout(folder: Path) -> None:
 
 
 def _read_rollout(folder: Path) -> Any:
-    from mtv_world_ros.evaluation.results import load_rollout
+    from mtv_world_ros.lab.evaluation.results import load_rollout
 
     return load_rollout(folder / 'rollout.npz')
 
@@ -254,7 +254,7 @@ def make_latents(folder: Path) -> None:
     """A cache of two clips, and one of other settings."""
     import torch
 
-    from mtv_world_ros.training.latent_cache.latent_store import LatentCache
+    from mtv_world_ros.lab.training.latent_cache.latent_store import LatentCache
 
     for settings in (CACHE_SETTINGS, {'autoencoder': 'b'}):
         with_clips = LatentCache(folder, settings)
@@ -264,7 +264,7 @@ def make_latents(folder: Path) -> None:
 
 
 def _read_latents(folder: Path) -> Any:
-    from mtv_world_ros.training.latent_cache.latent_store import LatentCache
+    from mtv_world_ros.lab.training.latent_cache.latent_store import LatentCache
 
     LatentCache(folder, {'autoencoder': 'c'})
     held = LatentCache(folder, CACHE_SETTINGS)
@@ -360,7 +360,9 @@ def _read_mesh(folder: Path) -> Any:
 
 @cache
 def _dataset_writer() -> Any:
-    spec = importlib.util.spec_from_file_location('datasets', ROOT / 'test/importing/conftest.py')
+    spec = importlib.util.spec_from_file_location(
+        'datasets', ROOT / 'test/lab/importing/conftest.py'
+    )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules['datasets_of_tests'] = module
@@ -379,7 +381,7 @@ make_dataset_v3 = partial(make_dataset, 'v3.0')
 
 
 def _read_dataset(folder: Path) -> Any:
-    from mtv_world_ros.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
 
     dataset = LeRobotDataset(folder / 'data')
     for entry in dataset.episodes.values():
@@ -398,7 +400,7 @@ def make_camera_file(folder: Path) -> None:
 
 
 def _read_camera_file(folder: Path) -> Any:
-    from mtv_world_ros.importing.camera_parameters import camera_model, CameraSource
+    from mtv_world_ros.lab.importing.camera_parameters import camera_model, CameraSource
 
     source = CameraSource.model_validate(
         {

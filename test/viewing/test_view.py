@@ -134,7 +134,7 @@ def test_without_the_extra_one_line_says_so(
 
 
 def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path: Path) -> None:
-    from mtv_world_ros.evaluation.video import decode_video
+    from mtv_world_ros.rendering.video import decode_video
     from mtv_world_ros.viewing.sheets import compared, write_pictures
 
     predictions = write_predictions(tmp_path / 'predictions')

@@ -20,7 +20,7 @@ from mtv_world_ros.data.bag.video_packets import (
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import EpisodeError, ObservationError
-from mtv_world_ros.importing.bags import with_guessed_views
+from mtv_world_ros.lab.importing.bags import with_guessed_views
 
 NUM, HEIGHT, WIDTH = 12, 48, 64
 

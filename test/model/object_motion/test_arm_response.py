@@ -12,15 +12,15 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.predictor import load_response
-from mtv_world_ros.training.object_motion.response_fit import (
+from mtv_world_ros.lab.training.object_motion.response_fit import (
     fit_response,
     found_response,
     joint_recording,
     tool_errors,
     with_floor,
 )
+from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.model.object_motion.predictor import load_response
 
 ROBOTS = ('yam_bimanual', 'franka')
 DEMO = share_path('resource', 'demo_episode')

@@ -16,6 +16,7 @@ from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.lab.training.object_motion.contact_fit import read_contact
 from mtv_world_ros.model.object_motion import contact_motions, predictor
 from mtv_world_ros.model.object_motion.contact_motions import (
     check_robot,
@@ -29,7 +30,6 @@ from mtv_world_ros.model.object_motion.predictor import (
     save_contact,
 )
 from mtv_world_ros.model.object_motion.rigid_bodies import _FREE, RigidBodies
-from mtv_world_ros.training.object_motion.contact_fit import read_contact
 
 #: of commands between two rows that come back
 ROWS = 5

@@ -19,6 +19,7 @@ from wan_files import TRANSFORMER
 from wan_predictions import imported, predict
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
+from mtv_world_ros.lab.training.training_config import HistoryConfig, load_training_config
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.conditioning import decode_frames
@@ -27,7 +28,6 @@ from mtv_world_ros.model.serving import memory_check, prepare
 from mtv_world_ros.model.serving.serving_options import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.training.training_config import HistoryConfig, load_training_config
 
 
 @pytest.fixture(scope='module')

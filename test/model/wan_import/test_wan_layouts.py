@@ -14,6 +14,7 @@ import torch
 from wan_files import clip_shapes, clip_text_shapes, Shapes, umt5_shapes, vae_original_name
 from wan_reference import video_tensors
 
+from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.wan_import.wan_weights import NEW
 from mtv_world_ros.model.wan_keys import (
@@ -23,7 +24,6 @@ from mtv_world_ros.model.wan_keys import (
     text_encoder_keys,
     transformer_keys,
 )
-from mtv_world_ros.training.training_config import load_training_config
 
 
 def hash_of(shapes: Shapes) -> str:

@@ -1,0 +1,1 @@
+"""The bench: simulates, collects and ranks policies."""

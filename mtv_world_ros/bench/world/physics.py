@@ -1,0 +1,207 @@
+"""The truth's physics: a catalogue of shifts from the nominal one, and what each changes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from mtv_world_ros.bench.world.actuator import Actuator
+from mtv_world_ros.bench.world.workcell import Workcell
+from mtv_world_ros.config import Positive, read_yaml, Schema, validated
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.errors import nearest, SimulatorError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.model import RobotModel
+
+#: geoms of this priority are the pads of fingers
+_PAD_PRIORITY = 1
+#: draws which way each joint's zero is off; of an episode's pictures and cameras its seed does
+_ZERO_SEED, _SPAWN_KEY = 17, 8
+
+_NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Physics(Schema):
+    """One entry of `config/physics.yaml`: how the truth differs from the nominal one."""
+
+    text: str = Field(description='what is different, in words')
+    table_friction: Positive = Field(default=1.0, description='factor, of all but finger pads')
+    grip_friction: Positive = Field(default=1.0, description='factor, of finger pads')
+    object_mass: Positive = Field(default=1.0, description='factor')
+    gripper_force: Positive = Field(
+        default=1.0, description="factor, of grippers' gains and limits"
+    )
+    contact_time: Annotated[float, Field(ge=1)] = Field(
+        default=1.0, description='factor of the time constant of contacts'
+    )
+    delay_s: _NotNegative = Field(default=0.0, description='commands reach the joints so late [s]')
+    joint_zero_deg: _NotNegative = Field(
+        default=0.0,
+        description='each turning joint but grippers is off by this, either way [degrees]',
+    )
+    table_m: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
+        default=0.0, description='height of the table [m]'
+    )
+    object_size: Annotated[float, Field(ge=0.7, le=1.2)] = Field(default=1.0, description='factor')
+    camera_m: _NotNegative = Field(
+        default=0.0, description='told place of each camera is off by [m]'
+    )
+    camera_deg: _NotNegative = Field(default=0.0, description='told direction is off by [degrees]')
+    blur_px: _NotNegative = Field(default=0.0, description='standard deviation of the blur [px]')
+    noise: _NotNegative = Field(
+        default=0.0, description='standard deviation of the noise [grey levels]'
+    )
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = Field(
+        default=None, description='pictures are compressed; none = they are not'
+    )
+
+    def workcell(self, workcell: Workcell) -> Workcell:
+        """Returns a workcell with this table and objects of this size."""
+        return replace(workcell, table_m=self.table_m, object_size=self.object_size)
+
+    def joint_zeros(self, robot: RobotModel) -> FloatArray:
+        """Returns (J,) reported less true positions [rad]; 0 of grippers and what slides."""
+        signs = np.random.default_rng(_ZERO_SEED).choice((-1.0, 1.0), len(robot.joint_names))
+        grippers = {tool.gripper_joint for tool in robot.tools}
+        model = robot.pinocchio_model
+        turns = [
+            name not in grippers
+            and 'JointModelP' not in model.joints[model.getJointId(name)].shortname()
+            for name in robot.joint_names
+        ]
+        return np.where(turns, np.deg2rad(self.joint_zero_deg) * signs, 0.0)
+
+    def change(self, model: Any, mujoco: Any, change: ModelParts) -> None:
+        """Changes a compiled scene in place.
+
+        Args:
+            model: the nominal `MjModel`.
+            mujoco: the module.
+            change: which of its parts are objects and grippers.
+        """
+        pads = model.geom_priority == _PAD_PRIORITY
+        model.geom_friction *= np.where(pads, self.grip_friction, self.table_friction)[:, None]
+        model.geom_solref[:, 0] *= self.contact_time
+        model.body_mass[change.objects] *= self.object_mass
+        model.body_inertia[change.objects] *= self.object_mass
+        for number in change.grippers:
+            model.actuator_gainprm[number, 0] *= self.gripper_force
+            model.actuator_biasprm[number, 1:3] *= self.gripper_force
+            model.actuator_forcerange[number] *= self.gripper_force
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def told_cameras(self, cameras: Sequence[CameraModel], seed: int) -> tuple[CameraModel, ...]:
+        """Returns the cameras as they are calibrated, off in directions that a seed draws."""
+        if not (self.camera_m or self.camera_deg):
+            return tuple(cameras)
+        rng = _generator(seed)
+        return tuple(self._told(camera, rng) for camera in cameras)
+
+    def _told(self, camera: CameraModel, rng: np.random.Generator) -> CameraModel:
+        way, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        pose = np.array(camera.T_mount_camera)
+        pose[:3, :3] = cv2.Rodrigues(axis * np.deg2rad(self.camera_deg))[0] @ pose[:3, :3]
+        pose[:3, 3] += self.camera_m * way
+        return replace(camera, T_mount_camera=pose)
+
+    def pictured(self, image: ByteArray, rng: np.random.Generator) -> ByteArray:
+        """Returns a picture (H, W, 3) as the camera gives it."""
+        if self.blur_px:
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.blur_px), np.uint8)
+        if self.noise:
+            noisy = image + rng.normal(0.0, self.noise, image.shape)
+            image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        if self.jpeg_quality is not None:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality]
+            _, coded = cv2.imencode('.jpg', image[..., ::-1], quality)
+            decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+            assert decoded is not None
+            image = np.asarray(decoded[..., ::-1], np.uint8)
+        return image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelParts:
+    """Numbers of what a shift changes in a compiled scene.
+
+    Attributes:
+        objects: bodies of the free objects.
+        grippers: actuators of the grippers.
+    """
+
+    objects: list[int]
+    grippers: list[int]
+
+    @classmethod
+    def of(
+        cls, model: Any, roles: Sequence[str], robot: RobotModel, actuators: Sequence[Actuator]
+    ) -> ModelParts:
+        """Returns those of a scene with objects of these roles."""
+        columns = {
+            robot.joint_names.index(tool.gripper_joint)
+            for tool in robot.tools
+            if tool.gripper_joint is not None
+        }
+        return cls(
+            objects=[model.body(role).id for role in roles],
+            grippers=[n for n, actuator in enumerate(actuators) if actuator.column in columns],
+        )
+
+
+class DelayLine:
+    """Commands on their way to the joints.
+
+    Args:
+        first: (J,) commanded for ever before.
+        periods: they arrive so many periods late; between two of them they are interpolated.
+    """
+
+    def __init__(self, first: FloatArray, periods: float) -> None:
+        self._share = periods % 1.0
+        self._last = deque([first] * (int(periods) + 2), maxlen=int(periods) + 2)
+
+    def pass_on(self, command: FloatArray) -> FloatArray:
+        """Returns (J,) what arrives as a command (J,) is sent."""
+        self._last.append(command)
+        return self._last[1] * (1 - self._share) + self._last[0] * self._share
+
+
+def picture_generator(seed: int) -> np.random.Generator:
+    """Returns what draws the noise of an episode's pictures."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY, 1)))
+
+
+def _generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY,)))
+
+
+@cache
+def catalogue() -> dict[str, Physics]:
+    """Returns all physics by name, the nominal one first."""
+    path = share_path('config', 'physics.yaml')
+    entries = read_yaml(path, 'physics catalogue', 'physics')
+    return {
+        name: validated(Physics, values, f"'{path}', {name}") for name, values in entries.items()
+    }
+
+
+def physics_named(name: str) -> Physics:
+    """Returns a physics by name.
+
+    Raises:
+        SimulatorError: unknown name; the text names the nearest known one.
+    """
+    known = catalogue()
+    if name not in known:
+        raise SimulatorError(
+            f"unknown physics '{name}'{nearest(name, known)} (--physics); known are "
+            f'{", ".join(known)} (config/physics.yaml)'
+        )
+    return known[name]

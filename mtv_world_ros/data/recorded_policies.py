@@ -1,0 +1,47 @@
+"""Which scripted policy acted in recorded episodes, and which of them must not be learned from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, parse_variant, refuse_kinds
+from mtv_world_ros.data.episode_reader import read_info
+
+#: key of an episode's metadata
+POLICY = 'policy'
+
+
+def recorded_policy(path: Path) -> str:
+    """Returns the scripted policy of an episode; empty = another one, or not recorded.
+
+    Raises:
+        EpisodeError: the episode's metadata cannot be used.
+    """
+    name = read_info(path).metadata.get(POLICY, '')
+    return name if name.split('-')[0] == EXPERT else ''
+
+
+def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies.
+
+    Raises:
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: a policy has an unknown fault.
+    """
+    named = {Path(path): recorded_policy(path) for path in paths}
+    return {path: parse_variant(policy).kinds for path, policy in named.items() if policy}
+
+
+def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
+    """Refuses episodes of policies with faults of the split `test`.
+
+    Args:
+        paths: folders of episodes.
+        what: they are not for, in words.
+
+    Raises:
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: names the policies and their kinds.
+    """
+    refuse_kinds(sorted({recorded_policy(path) for path in paths} - {''}), 'test', what)

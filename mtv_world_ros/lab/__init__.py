@@ -1,0 +1,1 @@
+"""The lab: trains, scores, imports and checks."""

@@ -1,0 +1,206 @@
+"""`mtv-world calibrate`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.shared_options import (
+    add_dtype,
+    add_model_options,
+    add_overwrite,
+    add_seeds,
+    add_segmenter,
+    add_serving,
+    add_task,
+    check_model,
+    pipeline_choices,
+    provenance,
+    threads_of_workers,
+)
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import check_free
+
+if TYPE_CHECKING:
+    from mtv_world_ros.data.splits import Selection
+    from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+    from mtv_world_ros.lab.evaluation.results import EpisodeResult
+    from mtv_world_ros.success.calibration import HorizonCurve
+
+_EPILOG = """\
+Every episode is imagined as a whole from its first frame with its own commands; the success
+estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
+success_calibration.json and horizon.json; DIR gets calibration.md, reliability.html and
+calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5.
+Running the same command again continues an interrupted run.
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'calibrate',
+        help="fit a checkpoint's success estimate to recorded outcomes",
+        epilog=_EPILOG,
+    )
+    parser.add_argument('checkpoint', help="folder, or 'bundled'")
+    parser.add_argument('dataset', type=Path, help='folder of episodes with outcomes')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: test where there is one"
+    )
+    parser.add_argument('--episodes', type=int, help='use only so many')
+    parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
+    add_seeds(parser)
+    parser.add_argument(
+        '--l2', type=float, default=1.0, help='strength of the prior on the weights'
+    )
+    parser.add_argument(
+        '--no-store',
+        dest='store',
+        action='store_false',
+        help='write the report only; do not change the checkpoint',
+    )
+    add_overwrite(parser)
+    add_dtype(parser)
+    add_model_options(parser)
+    add_serving(parser)
+    add_segmenter(parser)
+    add_task(parser)
+    parser.set_defaults(handler=_calibrate)
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import checkpoint_path
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.success.calibration import save_calibration, save_horizon
+
+    check_model(arguments.device, arguments.checkpoint)
+    folder = checkpoint_path(arguments.checkpoint)
+    _check_places(arguments, folder)
+    selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.lab.evaluation.calibration.calibration_report import (
+        write_calibration_report,
+    )
+    from mtv_world_ros.lab.evaluation.calibration.fit import calibrate, samples_of
+
+    print(f'{arguments.dataset}: {selection}')
+    refuse_test_kinds(selection.paths, 'calibration')
+    made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
+    runs = _imagine(arguments, selection)
+    segmenter = str(runs[0].settings['segmenter'])
+    samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
+    found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
+    horizon = _horizon([run.results for run in runs], runs[0], made)
+    text = write_calibration_report(arguments.out, found, horizon)
+    if arguments.store:
+        print(f'stored: {save_calibration(folder, found.calibration)}')
+        if horizon is not None:
+            print(f'stored: {save_horizon(folder, horizon)}')
+    print(text)
+    return 0
+
+
+def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies, by what their results are called.
+
+    Raises:
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: a policy has an unknown fault.
+    """
+    from mtv_world_ros.data.recorded_policies import recorded_kinds
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import result_names
+
+    names = result_names(paths)
+    return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}
+
+
+def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
+    """Refuses to write into the installed package, and to replace an earlier calibration."""
+    from mtv_world_ros.assembly import BUNDLED
+    from mtv_world_ros.success.calibration import CALIBRATION
+
+    check_free(arguments.out / 'calibration.json', arguments.overwrite)
+    if not arguments.store:
+        return
+    if arguments.checkpoint == BUNDLED:
+        raise ConfigError(
+            "'bundled' is part of the installed package, into which nothing is written; copy it "
+            f"with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
+        )
+    check_free(folder / CALIBRATION, arguments.overwrite, 'checkpoint')
+
+
+def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
+    """Imagines and scores the episodes once a seed."""
+    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+    from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.pipeline import SEED_STEP
+
+    load = partial(
+        load_pipeline,
+        arguments.checkpoint,
+        **pipeline_choices(arguments),
+        calibrated=False,
+    )
+    pipeline = load(num_threads=arguments.threads)
+    threads = threads_of_workers(arguments)
+    return [
+        evaluate(
+            pipeline,
+            selection.paths,
+            arguments.out / f'seed_{index}',
+            EvaluationConfig(
+                mode='imagine',
+                seed=arguments.seed + SEED_STEP * index,
+                num_inference_steps=arguments.steps,
+                actions=('true',),
+                ceiling=False,
+                observed=True,
+            ),
+            name=fingerprint(
+                arguments.checkpoint,
+                calibrated=False,
+                adapter=arguments.adapter,
+                task=arguments.task,
+            ),
+            zero_shot=selection.zero_shot,
+            provenance=provenance(arguments),
+            parallel=Parallel(
+                workers=arguments.workers,
+                make_pipeline=partial(load, num_threads=threads),
+                threads=threads,
+            ),
+            overwrite=arguments.overwrite,
+        )
+        for index in range(arguments.seeds)
+    ]
+
+
+def _horizon(
+    runs: Sequence[Sequence[EpisodeResult]], summary: Summary, made: dict[str, str]
+) -> HorizonCurve | None:
+    """J of the objects that move against the horizon; None = nothing moves."""
+    from mtv_world_ros.lab.evaluation.metrics.horizon import curve
+    from mtv_world_ros.success.calibration import HorizonCurve
+
+    rows: dict[str, list] = {}
+    for result in (result for run in runs for result in run):
+        rows.setdefault(result.episode, []).extend(result.rows)
+    found = curve(list(rows.values()), None, 'j_frames')
+    if not found.values:
+        return None
+    return HorizonCurve(
+        period_s=1 / summary.spec.fps,
+        values=found.values,
+        lower=tuple(low if isfinite(low) else 0.0 for low, _ in found.band),
+        segmenter=str(summary.settings['segmenter']),
+        num_episodes=len(rows),
+        made=made,
+    )

@@ -1,0 +1,317 @@
+"""`mtv-world recover`, `import-bag`, `import-dataset` and `export-dataset`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import sys
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.shared_options import add_describer
+
+if TYPE_CHECKING:
+    from mtv_world_ros.data.bag_mapping import BagMapping
+    from mtv_world_ros.lab.importing.stored_objects import ObjectStage
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the commands."""
+    _add_recover(commands)
+    _add_import_bag(commands)
+    _add_import_dataset(commands)
+    _add_export_dataset(commands)
+
+
+def _add_recover(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'recover', help='make whole bags of recordings that were killed or cut off'
+    )
+    parser.add_argument(
+        'bag',
+        type=Path,
+        help='a damaged bag, the name a recording would have had, or the folder it was made in '
+        '(recordings in progress are hidden folders .NAME.*.tmp)',
+    )
+    parser.add_argument(
+        '--out', type=Path, help='bag to make, e.g. on another disk; default: beside the damaged'
+    )
+    parser.set_defaults(handler=_recover)
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.bag.recover import find_damaged, recover
+
+    damaged = find_damaged(arguments.bag)
+    for source in damaged:
+        out = arguments.out
+        if out is not None and len(damaged) > 1:
+            out = out / source.name.strip('.')
+        bag = recover(source, out)
+        total = sum(bag.num_messages.values())
+        print(f"recovered '{bag.path}': {total} messages over {bag.seconds:.1f} s")
+        for topic, count in sorted(bag.num_messages.items()):
+            print(f'  {topic} {count}')
+        for line in bag.lost:
+            print(f'  lost: {line}')
+        print(f"  '{source}' is as it was; delete it once you have looked at the new bag")
+    return 0
+
+
+def _add_objects(parser: argparse.ArgumentParser) -> None:
+    add_describer(parser)
+    parser.add_argument(
+        '--segmenter',
+        choices=('auto', 'colour', 'sam2', 'sam3'),
+        help="stores the objects' masks with the episodes; default: none, or those recorded",
+    )
+    parser.add_argument('--device', default='cpu', help='of the segmenter')
+
+
+def _object_stage(arguments: argparse.Namespace) -> ObjectStage:
+    from mtv_world_ros.assembly import asked_describer, assemble_segmenter
+    from mtv_world_ros.lab.importing.stored_objects import ObjectStage, stage_key
+
+    segmenter = arguments.segmenter and assemble_segmenter(arguments.segmenter, arguments.device)
+    return ObjectStage(
+        describer=asked_describer(arguments.describer),
+        segmenter=segmenter or None,
+        key=stage_key(arguments.describer, segmenter.name if segmenter else ''),
+    )
+
+
+def _add_import_bag(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'import-bag',
+        help="convert a robot's own rosbag2 recordings into episodes",
+        epilog='config/datasets/bag.yaml describes the mapping file; without one, views are all '
+        'image topics. OUT also gets robot/ and mapping.yaml, which --topics takes elsewhere. '
+        'Call it again to continue: finished episodes are kept. Exit status: 1 if a bag failed.',
+    )
+    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='or folder of bags')
+    parser.add_argument('--topics', type=Path, metavar='FILE', help='mapping: which topic is what')
+    parser.add_argument(
+        '--robot', help="YAML, or a bundled robot; default: the mapping's, or /robot_description"
+    )
+    parser.add_argument(
+        '--action',
+        metavar='TOPIC',
+        help="of the commands, or 'state': the measured positions that follow; default: the "
+        "mapping's, or joint_trajectory",
+    )
+    parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
+    parser.add_argument('--out', type=Path, required=True)
+    _add_objects(parser)
+    parser.set_defaults(handler=_import_bag)
+
+
+def _import_bag(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+    import yaml
+
+    from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.geometry.robot.file import ROBOT_YAML
+    from mtv_world_ros.lab.importing.bags import (
+        episode_name,
+        find_bags,
+        import_bags,
+        summary_line,
+        with_guessed_views,
+    )
+
+    mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
+    if arguments.action:
+        mapping = mapping.replace(action=arguments.action)
+    bags = find_bags(arguments.bags)
+    mapping = with_guessed_views(mapping, bags[0])
+    robot = _robot_of_bags(arguments, mapping, bags[0])
+    summary = import_bags(
+        bags,
+        arguments.out,
+        mapping,
+        robot,
+        calibration=arguments.calibration,
+        stage=_object_stage(arguments),
+        progress=lambda paths: tqdm(paths, unit='bag'),
+    )
+    values = mapping.replace(robot='robot/robot.yaml').model_dump(
+        mode='json', exclude_defaults=True
+    )
+    write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
+    for view, row in mapping.views.items():
+        print(f'view {view}: {mapping.topic(row.image)}')
+    for bag in summary.made:
+        place = arguments.out / episode_name(bag)
+        print(summary_line(place, objects=bool(arguments.segmenter)))
+    for bag, lines in summary.warnings.items():
+        for line in lines:
+            print(f'{bag}: {line}', file=sys.stderr)
+    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
+    for bag, reason in summary.failed.items():
+        print(f'{bag}: {reason}', file=sys.stderr)
+    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    return 1 if summary.failed else 0
+
+
+def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path) -> Path:
+    """The robot's YAML; that of the first bag's `/robot_description` is written into OUT."""
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.lab.importing.bags import described_robot
+
+    name = arguments.robot or mapping.robot
+    if name:
+        return robot_path(name)
+    folder = arguments.out / 'robot'
+    if (folder / 'robot.yaml').is_file():  # confirmed or corrected since the last call
+        return folder / 'robot.yaml'
+    file, notes = described_robot(bag, mapping, folder)
+    for note in notes:
+        print(f'guessed: {note}')
+    print(f'look at it with: mtv-world robot {file}')
+    return file
+
+
+def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'import-dataset',
+        help='convert a LeRobot dataset (v2.0, v2.1, v3.0) into episodes',
+        epilog='config/datasets/example.yaml describes the mapping file. Call it again to '
+        'continue: finished episodes are kept. Exit status: 1 if an episode failed.',
+    )
+    parser.add_argument('dataset', type=Path, help='folder with meta/, data/ and videos/')
+    parser.add_argument(
+        '--mapping',
+        type=Path,
+        help='which feature is what; default: made of --robot and --calibration, for columns that '
+        "are named like the robot's joints [rad or m]",
+    )
+    parser.add_argument('--robot', help='without --mapping: YAML, or a bundled robot')
+    parser.add_argument(
+        '--calibration', type=Path, help="without --mapping: of the cameras, by the views' names"
+    )
+    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
+    _add_objects(parser)
+    parser.set_defaults(handler=_import_dataset)
+
+
+def _import_dataset(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.geometry.robot.file import ROBOT_YAML
+    from mtv_world_ros.lab.importing.convert import import_dataset
+
+    summary = import_dataset(
+        arguments.dataset,
+        arguments.mapping or _guessed_mapping(arguments),
+        arguments.out,
+        episodes=_numbers(arguments.episodes),
+        stage=_object_stage(arguments),
+        progress=lambda numbers: tqdm(numbers, unit='ep'),
+    )
+    for number, lines in summary.warnings.items():
+        for line in lines:
+            print(f'episode {number}: {line}', file=sys.stderr)
+    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
+    for number, reason in summary.failed.items():
+        print(f'episode {number}: {reason}', file=sys.stderr)
+    if summary.made or summary.kept:
+        print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    return 1 if summary.failed else 0
+
+
+def _guessed_mapping(arguments: argparse.Namespace) -> Path:
+    """Writes OUT/mapping.yaml for columns and views that are named like joints and cameras."""
+    import yaml
+
+    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.lab.importing.mapping import guess_mapping
+
+    if arguments.robot is None or arguments.calibration is None:
+        raise ConfigError(
+            'give --mapping (config/datasets/example.yaml has all keys), or --robot and '
+            "--calibration where the columns are named like the robot's joints"
+        )
+    values, left_out = guess_mapping(
+        LeRobotDataset(arguments.dataset), arguments.robot, arguments.calibration
+    )
+    file = arguments.out / 'mapping.yaml'
+    write_whole(file, yaml.safe_dump(values, sort_keys=False))
+    print(f'mapping: {file}')
+    if left_out:
+        print(f"left out, not in '{arguments.calibration}': {', '.join(left_out)}")
+    return file
+
+
+def _numbers(text: str | None) -> list[int] | None:
+    from mtv_world_ros.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(',')]
+    except ValueError as error:
+        raise ConfigError(f"--episodes is '{text}', must be numbers such as 0,4,7") from error
+
+
+def _add_export_dataset(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'export-dataset',
+        help='write episodes as a LeRobot dataset (v3.0)',
+        epilog='OUT/meta/mapping.yaml is the mapping with which import-dataset reads it back.',
+    )
+    parser.add_argument('episodes', type=Path, help='folder of episodes, or one episode')
+    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--fps', type=int, default=10, help='rows a second')
+    parser.add_argument(
+        '--size', default='', metavar='WxH', help='of the images [px]; default: as recorded'
+    )
+    parser.add_argument(
+        '--images',
+        action='store_true',
+        help='PNG images in the tables in place of MP4: lossless, no video decoder is needed',
+    )
+    parser.add_argument(
+        '--robot', default='yam_bimanual', help="a bundled robot's name, or a robot's YAML"
+    )
+    parser.set_defaults(handler=_export)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.data.episode_reader import list_episodes
+    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.files import bundled
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.importing.lerobot_writer import export_dataset, MAPPING
+
+    if arguments.fps < 1:
+        raise ConfigError(f'--fps is {arguments.fps}; it must be at least 1')
+    path = bundled('robots', arguments.robot, '--robot')
+    named = arguments.robot if path.stem == arguments.robot else str(path.resolve())
+    count = export_dataset(
+        list_episodes(arguments.episodes),
+        arguments.out,
+        load_robot(path),
+        named,
+        arguments.fps,
+        progress=lambda paths: tqdm(paths, unit='ep'),
+        size=_size(arguments.size),
+        as_videos=not arguments.images,
+    )
+    print(f'{count} episodes; mapping: {arguments.out / MAPPING}')
+    return 0
+
+
+def _size(text: str) -> tuple[int, int] | None:
+    from mtv_world_ros.errors import ConfigError
+
+    if not text:
+        return None
+    width, _, height = text.partition('x')
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ConfigError(f"--size is '{text}'; it must be WIDTHxHEIGHT in pixels, e.g. 96x72")
+    return int(width), int(height)

@@ -1,0 +1,427 @@
+"""`mtv-world train`, and how it scores held-out episodes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import math
+from pathlib import Path
+import shlex
+import shutil
+from typing import Any, TYPE_CHECKING
+
+from mtv_world_ros.cli.shared_options import add_describer, add_dtype, add_segmenter, add_source
+from mtv_world_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
+
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.lab.evaluation.results import StoredRollout
+    from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
+    from mtv_world_ros.lab.training.training_run import HeldOut, Judge
+    from mtv_world_ros.vision.describers.describer import Describer
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'train',
+        help='train a world model on a folder of episodes',
+        description='Several processes, GPUs or machines train together when a launcher starts '
+        'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
+        'accelerate launch --multi_gpu with the same -m. optimizer.batch_size is that of all of '
+        'all processes together: they see the same clips as one process would.',
+    )
+    parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
+    parser.add_argument('--out', type=Path, help='resumes what is there')
+    parser.add_argument('--preset', default='small', help='name or YAML file')
+    parser.add_argument(
+        '--control',
+        help='how actions enter: trajectory_video, policy2vec, ee_mlp or fast_tokens; '
+        'default: what the preset says',
+    )
+    parser.add_argument('--views', help='e.g. low,high or low; default: those of the preset')
+    parser.add_argument(
+        '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
+    )
+    parser.add_argument(
+        '--dry-run', action='store_true', help='print memory and arithmetic of a step, then exit'
+    )
+    parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
+    parser.add_argument(
+        '--latent-cache',
+        type=Path,
+        metavar='DIR',
+        help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
+        'share it',
+    )
+    add_source(parser)
+    add_run_options(parser)
+    parser.add_argument(
+        '--data-workers',
+        type=int,
+        default=0,
+        metavar='N',
+        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
+        'says how long training waited for clips',
+    )
+    parser.add_argument(
+        '--peak-tflops',
+        type=float,
+        default=0.0,
+        metavar='N',
+        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
+        'large matrices, measured at the start',
+    )
+    add_held_out(parser)
+    parser.set_defaults(handler=_train)
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Adds what `train` and `distill` share: overrides, episodes, seed, device, saving."""
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='SECTION.KEY=VALUE',
+        dest='overrides',
+        help='of the preset, e.g. optimizer.steps=2000',
+    )
+    parser.add_argument(
+        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
+    )
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
+    )
+    parser.add_argument(
+        '--cache',
+        type=Path,
+        metavar='DIR',
+        help='keeps the decoded recordings; several runs may share it',
+    )
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--device', default='cpu')
+    add_describer(parser)
+    add_segmenter(parser)
+    add_dtype(parser)
+    parser.add_argument(
+        '--threads',
+        type=int,
+        default=0,
+        help='CPU threads per process; 0 = its share of all cores',
+    )
+    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    parser.add_argument(
+        '--save-minutes',
+        type=float,
+        default=10.0,
+        help='longest time between saved states [min]; Ctrl-C and SIGTERM save, too',
+    )
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.lab.training.training_config import load_training_config
+
+    config = load_training_config(arguments.preset, _overrides(arguments))
+    if arguments.dry_run:
+        return _dry_run(config, arguments)
+    if arguments.dataset is None or arguments.out is None:
+        raise ConfigError(
+            'training needs a folder of episodes and a folder for its results: '
+            'mtv-world train DATASET --out DIR; without them only --dry-run works'
+        )
+    from mtv_world_ros.assembly import (
+        asked_describer,
+        assemble_segmenter,
+        checkpoint_path,
+        robot_path,
+    )
+    from mtv_world_ros.model.card import read_card
+
+    # importing torch takes seconds: what is often mistyped is checked before
+    if not arguments.dataset.is_dir():
+        select(arguments.dataset)  # says that it holds no episodes
+    if arguments.init:
+        read_card(checkpoint_path(arguments.init))
+    from mtv_world_ros.model.runtime import check_device, choose_dtype
+
+    check_device(arguments.device)
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.training.training_run import train
+
+    source = load_source(arguments.topics, arguments.calibration)
+    dtype = choose_dtype(arguments.dtype, arguments.device)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    use_threads(arguments)
+    refuse_test_kinds(paths, 'training')
+    run = run_of(arguments, config, paths).replace(
+        initial=checkpoint_path(arguments.init) if arguments.init else None,
+        data_workers=arguments.data_workers,
+        peak_tflops=arguments.peak_tflops,
+        latent_cache=arguments.latent_cache,
+        source=source,
+    )
+    folder = train(
+        run,
+        robot=load_robot(robot_path(config.video.robot)),
+        segmenter=assemble_segmenter(arguments.segmenter, device=arguments.device),
+        describer=asked_describer(arguments.describer),
+        held_out=held_out(arguments, paths, dtype, source),
+    )
+    print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
+    model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
+    dataset = str(arguments.held_out or arguments.dataset)
+    out = arguments.out / f'evaluation_{read_card(folder).trained_on["steps"]}'
+    words = [model[0], dataset, *model[1:], '--out', str(out)]
+    print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
+    return 0
+
+
+def use_threads(arguments: argparse.Namespace) -> None:
+    """Lets torch use the threads of `--threads`: 0 = the process's share of the cores."""
+    import os
+
+    import torch
+
+    from mtv_world_ros.parallel import threads_each
+
+    processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
+    torch.set_num_threads(arguments.threads or threads_each(processes))
+
+
+def run_of(
+    arguments: argparse.Namespace, config: TrainingConfig, paths: Sequence[Path]
+) -> TrainingRun:
+    """Returns the training of the options that `add_run_options` adds."""
+    from mtv_world_ros.lab.training.training_config import TrainingRun
+
+    return TrainingRun(
+        config=config,
+        dataset=tuple(paths),
+        out=arguments.out,
+        num_episodes=arguments.episodes,
+        seed=arguments.seed,
+        device=arguments.device,
+        dtype=arguments.dtype,
+        save_every=arguments.save_every,
+        save_minutes=arguments.save_minutes,
+        cache=arguments.cache,
+    )
+
+
+def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Overrides of the preset by options; --set has precedence."""
+    from mtv_world_ros.errors import ConfigError
+
+    overrides: dict[str, Any] = {}
+    if arguments.control is not None:
+        overrides['video.control'] = arguments.control
+    if arguments.views is not None:
+        views = [view.strip() for view in arguments.views.split(',') if view.strip()]
+        if not views:
+            raise ConfigError(f"--views '{arguments.views}' names no view; e.g. --views low,high")
+        overrides |= {'video.views': views, 'transformer.num_views': len(views)}
+    if arguments.object_mask is not None:
+        overrides['video.object_mask'] = arguments.object_mask == 'on'
+    return overrides | set_overrides(arguments.overrides)
+
+
+def set_overrides(items: list[str]) -> dict[str, Any]:
+    """Returns the overrides of `--set SECTION.KEY=VALUE` options.
+
+    Raises:
+        ConfigError: one has no value, or one that is not YAML.
+    """
+    import yaml
+
+    from mtv_world_ros.bounded_input import parse_yaml
+    from mtv_world_ros.errors import ConfigError
+
+    overrides: dict[str, Any] = {}
+    for item in items:
+        key, equals, value = item.partition('=')
+        if not equals:
+            raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
+        try:
+            overrides[key] = parse_yaml(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set '{item}': {value!r} is not a YAML value") from None
+    return overrides
+
+
+def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.training.dry_run import step_cost
+    from mtv_world_ros.model.actions import action_names
+    from mtv_world_ros.model.runtime import choose_dtype
+
+    dtype = choose_dtype(arguments.dtype, arguments.device)
+    video = config.video
+    robot = load_robot(robot_path(video.robot))
+    cost = step_cost(config, action_dim=len(action_names(video.control, robot)), dtype=dtype)
+    print(
+        f'control {video.control}, {len(video.views)} views of {1 + video.num_frames} frames of '
+        f'{video.width}x{video.height}, batch {config.optimizer.batch_size}, {dtype}'
+    )
+    print('per step, the transformer alone:', *cost.lines(), sep='\n')
+    return 0
+
+
+_SPLITS = ('val', 'test')
+
+
+def add_held_out(parser: argparse.ArgumentParser) -> None:
+    """Adds the options."""
+    parser.add_argument(
+        '--sample-every',
+        type=int,
+        default=0,
+        metavar='STEPS',
+        help='imagine and score held-out episodes, and keep the best as checkpoint-best; 0 = off',
+    )
+    parser.add_argument(
+        '--held-out',
+        type=Path,
+        metavar='DIR',
+        help="data set they are of; default: DATASET. Its split 'val', else 'test'",
+    )
+    parser.add_argument('--held-out-episodes', type=int, default=4, metavar='N')
+
+
+def held_out(
+    arguments: argparse.Namespace,
+    trained_on: Sequence[Path],
+    dtype: torch.dtype,
+    source: EpisodeSource,
+) -> HeldOut | None:
+    """Returns the scorer of held-out episodes; None if it is off.
+
+    Raises:
+        ConfigError: there are no held-out episodes, or they are trained on.
+    """
+    if not arguments.sample_every:
+        return None
+    from mtv_world_ros.assembly import asked_describer
+    from mtv_world_ros.lab.training.training_run import HeldOut, spread
+
+    paths = spread(_paths(arguments), arguments.held_out_episodes)
+    both = {path.resolve() for path in paths} & {path.resolve() for path in trained_on}
+    if both:
+        raise ConfigError(
+            f"'{min(both)}' and {len(both) - 1} more would be trained on and held out; give "
+            '--held-out another folder, or --split train'
+        )
+    judge = make_judge(
+        paths,
+        arguments.out / 'held_out',
+        arguments.device,
+        dtype,
+        base=arguments.init,
+        source=source,
+        segmenter=arguments.segmenter,
+        describer=asked_describer(arguments.describer),
+    )
+    return HeldOut(judge, arguments.sample_every)
+
+
+def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
+    from mtv_world_ros.data.splits import select
+
+    dataset = arguments.held_out or arguments.dataset
+    for split in _SPLITS:
+        selection = select(dataset, default=split)
+        if selection.split == split:
+            return selection.paths
+    if arguments.held_out is None:
+        raise ConfigError(
+            f"--sample-every needs held-out episodes, '{dataset}' has no split val or test; give "
+            '--held-out DIR'
+        )
+    return selection.paths
+
+
+def make_judge(
+    paths: Sequence[Path],
+    out: Path,
+    device: str,
+    dtype: torch.dtype,
+    base: str | None = None,
+    source: EpisodeSource | None = None,
+    segmenter: str = 'auto',
+    describer: Describer | None = None,
+) -> Judge:
+    """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
+
+    Args:
+        paths: of the episodes.
+        out: gets a folder per step, with `metrics.json` and an MP4 per episode.
+        device: where to imagine.
+        dtype: of the model.
+        base: checkpoint that adapters are used on.
+        source: how the episodes are read; None = they are this package's own.
+        segmenter: what finds the objects.
+        describer: what names them; None = the episodes, else their instructions.
+    """
+    import torch
+
+    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
+    from mtv_world_ros.lab.evaluation.results import load_rollout, rollout_path
+    from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.lab.training.training_run import Judged
+    from mtv_world_ros.model.lora import ADAPTER
+
+    def judge(checkpoint: Path, step: int) -> Judged:
+        folder = out / f'{step:07d}'
+        is_adapter = (checkpoint / ADAPTER).is_file()
+        pipeline = load_pipeline(
+            base if is_adapter and base else checkpoint,
+            adapter=checkpoint if is_adapter else None,
+            device=device,
+            dtype=str(dtype).removeprefix('torch.'),
+            num_threads=torch.get_num_threads(),  # keep the training's threads
+            segmenter=segmenter,
+        )
+        summary = evaluate(
+            pipeline,
+            paths,
+            folder,
+            EvaluationConfig(actions=('true',), ceiling=False, source=source or EpisodeSource()),
+            describer=describer,
+            show_progress=False,
+        )
+        for result in summary.results:
+            show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)
+        shutil.rmtree(folder / 'episodes')
+        by_view = {None: '', **{view: f'_{view}' for view in pipeline.spec.views}}
+        numbers = {}
+        for view, suffix in by_view.items():
+            estimates = summary.estimates(view)
+            for name in ('j_moving', 'j_copy_moving'):
+                value = estimates[name].value if name in estimates else math.nan
+                if math.isfinite(value):
+                    numbers[name + suffix] = round(value, 4)
+        return Judged(score=numbers.get('j_moving', math.nan), numbers=numbers)
+
+    return judge
+
+
+def show(rollout: StoredRollout, path: Path) -> None:
+    """Writes an MP4: recorded, trajectory video and imagined side by side, views below."""
+    import numpy as np
+
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.rendering.video import encode_video
+
+    columns = [rollout.real, rollout.trajectory, rollout.imagined]
+    rows = np.concatenate(columns, axis=3)  # (V, T, H, 3 * W, 3)
+    frames = np.concatenate(list(rows), axis=1)
+    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
+    write_whole(path.with_name(f'{path.name}.mp4'), encode_video(even, rollout.fps))

@@ -1,0 +1,133 @@
+"""How well success estimates agree with what really happened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
+from mtv_world_ros.success.verdict import verdict
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """The estimate at the end of an episode.
+
+    Attributes:
+        probability: NaN = abstained.
+        outcome: `success`, `failure` or `unknown`.
+    """
+
+    probability: float
+    outcome: str
+
+
+#: equally wide bins of the calibration error
+NUM_BINS = 10
+#: those of the reliability chart
+NUM_CHART_BINS = 5
+
+
+def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
+    """Returns counts and scores of the estimates; None = unknown.
+
+    The false-success rate is the share of real failures that were called a success. It and the
+    accuracies are of those with a `verdict`, the others of those with a probability.
+    """
+    known = [item for item in judgements if item.outcome in ('success', 'failure')]
+    probability = np.array([item.probability for item in known])
+    real = np.array([item.outcome == 'success' for item in known], bool)
+    said = np.array([verdict(item.probability) for item in known])
+    called, decided, judged = said == 1, np.isfinite(said), np.isfinite(probability)
+    hit, avoided = _mean(called[real & decided]), _mean(~called[~real & decided])
+    balanced = None if hit is None or avoided is None else (hit + avoided) / 2
+    abstained, estimates, outcomes = ~decided, probability[judged], real[judged]
+    return {
+        'num_outcomes_known': len(known),
+        'num_abstained': int(abstained.sum()),
+        'abstention_rate': _mean(abstained),
+        'real_success_rate': _mean(real),
+        'estimated_success_rate': _mean(estimates),
+        'accuracy': _mean((called == real)[decided]),
+        'balanced_accuracy': balanced,
+        'brier': _mean((estimates - outcomes) ** 2),
+        'ece': expected_calibration_error(estimates, outcomes) if len(estimates) else None,
+        'auroc': area_under_roc(estimates, outcomes),
+        'false_success_rate': _mean(called[~real & decided]),
+    }
+
+
+def expected_calibration_error(
+    probability: FloatArray, real: BoolArray, num_bins: int = NUM_BINS
+) -> float:
+    """Returns how far what was said is from what came true, over bins of what was said.
+
+    Bins weigh by how many (N,) estimates lie in them (Guo et al., 2017); what was said is the
+    probability of success, not of the likelier outcome.
+    """
+    place = np.minimum((probability * num_bins).astype(int), num_bins - 1)
+    gaps = [
+        (place == k).mean() * abs(probability[place == k].mean() - real[place == k].mean())
+        for k in range(num_bins)
+        if (place == k).any()
+    ]
+    return float(sum(gaps))
+
+
+def area_under_roc(probability: FloatArray, real: BoolArray) -> float | None:
+    """Returns how often a success was given more than a failure, ties half; None without both."""
+    gained, lost = probability[real], probability[~real]
+    if not len(gained) or not len(lost):
+        return None
+    above = (gained[:, None] > lost).mean()
+    return float(above + (gained[:, None] == lost).mean() / 2)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bin:
+    """Estimates of about the same probability, and how often they came true.
+
+    Attributes:
+        middle: of the probabilities that belong here.
+        said: mean probability.
+        came_true: share.
+        interval: of that share.
+        count: how many.
+    """
+
+    middle: float
+    said: float
+    came_true: float
+    interval: tuple[float, float]
+    count: int
+
+
+def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
+    """Returns the bins that hold an estimate of known outcome; empty = there is none."""
+    judged = [
+        item
+        for item in judgements
+        if item.outcome in ('success', 'failure') and np.isfinite(item.probability)
+    ]
+    said = np.array([item.probability for item in judged])
+    true = np.array([item.outcome == 'success' for item in judged], bool)
+    place = np.minimum((said * NUM_CHART_BINS).astype(int), NUM_CHART_BINS - 1)
+    return [
+        Bin(
+            middle=(k + 0.5) / NUM_CHART_BINS,
+            said=float(said[place == k].mean()),
+            came_true=float(true[place == k].mean()),
+            interval=wilson(int(true[place == k].sum()), int((place == k).sum())),
+            count=int((place == k).sum()),
+        )
+        for k in range(NUM_CHART_BINS)
+        if (place == k).any()
+    ]

@@ -1,0 +1,136 @@
+"""What scores are compared with: other actions, the held first frame, the round trip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.data.recording import Recording
+from mtv_world_ros.data_types import (
+    ByteArray,
+    FloatArray,
+    History,
+    JointTrajectory,
+    WorldModelSpec,
+)
+from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.geometry.robot.mirror import mirrored
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.evaluation.imagined_stretches import Stretch
+from mtv_world_ros.pipeline import WorldModel
+
+#: true: the recorded ones; shuffled: another episode's; zero: the joints stay where they are at
+#: the start of the rollout; mirrored: each arm does what the other did, mirrored at x = 0
+ACTIONS = ('true', 'shuffled', 'zero', 'mirrored')
+#: sends (V, 1 + T, H, W, 3) uint8 RGB frames through the autoencoder; returns the last T
+Reconstruct = Callable[[ByteArray], ByteArray]
+
+
+def check_actions(actions: Sequence[str]) -> None:
+    """Raises ConfigError unless all are of `ACTIONS` and the true ones are among them."""
+    for name in actions:
+        if name not in ACTIONS:
+            raise ConfigError(
+                f"actions '{name}'{nearest(name, ACTIONS)} is not one of {', '.join(ACTIONS)}"
+            )
+    if 'true' not in actions:
+        raise ConfigError(
+            f"actions are {', '.join(actions) or 'empty'}; 'true' must be among them, since the "
+            'others are compared with it'
+        )
+
+
+def with_actions(
+    name: str,
+    recording: Recording,
+    stretch: Stretch,
+    donor: Recording | None,
+    robot: RobotModel,
+) -> Recording | None:
+    """Returns the episode whose commands are executed; None without an episode to lend them.
+
+    Args:
+        name: of `ACTIONS`.
+        recording: the episode that is imagined.
+        stretch: the part of it that is imagined.
+        donor: lends its commands for `shuffled`.
+        robot: of the episode.
+
+    Raises:
+        RobotError: `mirrored`, and the robot has no mirror image.
+    """
+    commands = recording.commands
+    if name == 'shuffled':
+        return donor
+    if name == 'zero':
+        held = np.repeat(recording.positions[stretch.start][None], len(commands.times), axis=0)
+        return _commanding(recording, held)
+    if name == 'mirrored':
+        return _commanding(recording, mirrored(robot, commands.positions))
+    return recording
+
+
+def _commanding(recording: Recording, positions: FloatArray) -> Recording:
+    commands = recording.commands
+    other = JointTrajectory(
+        joint_names=commands.joint_names, times=commands.times, positions=positions
+    )
+    return replace(recording, commands=other)
+
+
+class PersistenceWorldModel:
+    """Predicts that nothing ever changes: repeats the start frame."""
+
+    def __init__(self, spec: WorldModelSpec) -> None:
+        self.spec = spec
+
+    def predict(
+        self,
+        start_frame: ByteArray,
+        trajectory_frames: ByteArray,
+        *,
+        positions: FloatArray,
+        seed: int,
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+        history: History | None = None,
+    ) -> ByteArray:
+        """Returns the start frame T times; see `pipeline.WorldModel.predict`."""
+        del positions, seed, num_inference_steps, should_stop, history
+        num_frames = trajectory_frames.shape[1] - 1
+        return np.repeat(start_frame[:, None], num_frames, axis=1)
+
+
+def round_trip(world_model: WorldModel) -> Reconstruct | None:
+    """Returns the round trip through a world model's autoencoder; None if it has none.
+
+    The frames go through in chunks, each after the real frame before it and the last one filled
+    up with its last frame, so that the autoencoder sees what it sees in the model.
+    """
+    autoencoder = getattr(world_model, 'autoencoder', None)
+    if autoencoder is None:
+        return None
+    length = world_model.spec.num_frames
+
+    def reconstruct(frames: ByteArray) -> ByteArray:
+        starts = range(0, frames.shape[1] - 1, length)
+        chunks = [_through(autoencoder, frames[:, k : k + length + 1], length) for k in starts]
+        return np.concatenate(chunks, axis=1)
+
+    return reconstruct
+
+
+def _through(autoencoder: Any, frames: ByteArray, length: int) -> ByteArray:
+    import torch
+
+    from mtv_world_ros.model.conditioning import decode_frames, encode_chunk
+
+    num_frames = frames.shape[1] - 1
+    rest = np.repeat(frames[:, -1:], length - num_frames, axis=1)
+    chunk = torch.from_numpy(np.concatenate([frames, rest], axis=1))[None].to(autoencoder.device)
+    with torch.inference_mode():
+        back = decode_frames(autoencoder, encode_chunk(autoencoder, chunk))
+    return back[0, :, :num_frames].cpu().numpy()

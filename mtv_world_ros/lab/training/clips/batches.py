@@ -1,0 +1,346 @@
+"""Training batches by step and clip number, the same in any process, prepared in forked workers.
+
+Shape letters: B batch, V views, T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, fields, replace
+import multiprocessing
+import os
+from threading import Thread
+import time
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mtv_world_ros.data.recording import chunk_of, clip_starts, cut_clip, Recording
+from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
+from mtv_world_ros.lab.training.clips.past import (
+    draw_past,
+    history_before,
+    history_of_lead,
+    Lead,
+    lead_before,
+    Past,
+)
+from mtv_world_ros.lab.training.training_config import TrainingConfig
+from mtv_world_ros.model.actions import ActionEncoding, collate
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Clips with their trajectory videos.
+
+    Attributes:
+        frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
+        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
+        object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
+        actions: what `ActionEncoding` gives, where they are not drawn.
+        anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
+            history; see `past.py`.
+        history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
+        history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
+        leads: B entries: the preceding chunks of clips that start from the model's own
+            prediction, None for other clips; empty = no such clip.
+        step: of the training, from 0.
+        numbers: of its clips within the step's whole batch, which processes and accumulation
+            split; each clip's noise depends on its own.
+    """
+
+    frames: Tensor
+    start_frame: Tensor
+    trajectory: Tensor | None
+    object_ids: Tensor | None
+    actions: Tensor | None = None
+    anchor: Tensor | None = None
+    history: Tensor | None = None
+    history_sigmas: Tensor | None = None
+    leads: tuple[Lead | None, ...] = ()
+    step: int = 0
+    numbers: Sequence[int] = ()
+
+    def parts(self, count: int) -> Iterator[Batch]:
+        """Yields its clips in `count` batches of nearly equal size."""
+        size = len(self.numbers)
+        for index in range(count):
+            chosen = slice(size * index // count, size * (index + 1) // count)
+            values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'step'}
+            held = {name: v if v is None else v[chosen] for name, v in values.items()}
+            yield replace(self, **held)
+
+
+class _Sample(NamedTuple):
+    """One clip of a batch."""
+
+    frames: ByteArray
+    start_frame: ByteArray
+    trajectory: ByteArray | None
+    object_ids: ByteArray | None
+    actions: np.ndarray | None
+    lead: Lead | None
+    past: Past | None
+
+
+class BatchSource:
+    """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
+
+    Args:
+        recordings: where clips come from.
+        config: views and times of clips, how they are drawn and disturbed, clips per step.
+        robot: of the recordings.
+        segmenter: finds the objects of the first frames.
+        seed: of choice and disturbances.
+        actions: how positions become actions, where they are not drawn.
+        numbers: the clips of a step that this process makes; None: all.
+        workers: processes that make them; 0 = a thread of this one.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        config: TrainingConfig,
+        *,
+        robot: RobotModel,
+        segmenter: Segmenter,
+        seed: int,
+        actions: ActionEncoding | None = None,
+        numbers: Sequence[int] | None = None,
+        workers: int = 0,
+    ) -> None:
+        self._numbers = range(config.optimizer.batch_size) if numbers is None else numbers
+        spec, stride_s = config.spec, config.video.clip_stride_s
+        whole = [(r, _spaced(r, clip_starts(r, spec), stride_s)) for r in recordings]
+        self._starts = [(r, starts) for r, starts in whole if len(starts)]
+        if not self._starts:
+            raise TrainingError(
+                f'none of {len(recordings)} episodes is long enough for a clip of '
+                f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s); '
+                'record longer ones or lower video.num_frames'
+            )
+        self.controls = ControlMaker(
+            robot=robot,
+            segmenter=segmenter,
+            rendering=config.rendering,
+            object_mask=config.video.object_mask,
+            actions=actions,
+        )
+        self._spec, self._augment, self._seed = spec, config.augment, seed
+        self._self_rollout, self._history = config.self_rollout, config.history
+        self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._workers = ClipWorkers(self._clip, workers) if workers else None
+        self._ahead: tuple[int, Future[Batch]] | None = None
+
+    @property
+    def starts(self) -> list[tuple[Recording, np.ndarray]]:
+        """The recordings that clips are cut from, with the frames that they start from."""
+        return self._starts
+
+    @property
+    def num_clips(self) -> int:
+        """Clips that can be cut."""
+        return sum(len(starts) for _, starts in self._starts)
+
+    def batch(self, step: int) -> Batch:
+        """Returns the batch of a step, and starts preparing the next one."""
+        if self._ahead is not None and self._ahead[0] == step:
+            result = self._ahead[1].result()
+        else:
+            result = self._make(step)
+        self._ahead = (step + 1, self._pool.submit(self._make, step + 1))
+        return result
+
+    def close(self) -> None:
+        """Stops preparing."""
+        self._pool.shutdown(cancel_futures=True)
+        if self._workers is not None:
+            self._workers.close()
+
+    def _make(self, step: int) -> Batch:
+        if self._workers is None:
+            samples = [self._clip(step, number) for number in self._numbers]
+        else:
+            samples = self._workers.clips(step, self._numbers)
+        encoded = [s.actions for s in samples if s.actions is not None]
+        return Batch(
+            step=step,
+            numbers=self._numbers,
+            frames=torch.from_numpy(np.stack([s.frames for s in samples])),
+            start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
+            trajectory=_stack([s.trajectory for s in samples]),
+            object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
+            actions=torch.from_numpy(collate(encoded)) if encoded else None,
+            leads=tuple(s.lead for s in samples),
+            **pasts([s.past for s in samples]),
+        )
+
+    def _clip(self, step: int, number: int) -> _Sample:
+        return self._sample(np.random.default_rng((self._seed, step, number)), step)
+
+    def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
+        recording, starts = self._choose(rng)
+        start = int(starts[rng.integers(len(starts))])
+        lead = lead_before(recording, start, self._spec, self._self_rollout, step, rng)
+        if lead is None:
+            clip = cut_clip(recording, start, self._spec)
+        else:
+            clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        begun = self._augment.begun_share
+        if lead is None and begun and rng.random() < begun:
+            clip = clip.begun
+        past = self._past(recording, start, lead, rng)
+        names = recording.names
+        if rng.random() < self._augment.name_dropout:
+            names = tuple(name for name in names if rng.random() < 0.5)
+        trajectory, actions = self.controls.make(clip, names)
+        frames = clip.frames
+        if rng.random() < self._augment.colour_permutation:
+            colours = rng.permutation(3)
+            frames = frames[..., colours]
+            past = past and Past(past.anchor[..., colours], past.frames[..., colours], past.sigma)
+            lead = lead and replace(lead, colours=tuple(colours.tolist()))
+        start = frames[:, 0]
+        if rng.random() < self._augment.start_noise:
+            start = _disturb(start, self._augment.start_noise_std, rng)
+        whole = np.ascontiguousarray(frames)
+        lead = lead and replace(lead, names=names)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead, past)
+
+    def _past(
+        self, recording: Recording, start: int, lead: Lead | None, rng: np.random.Generator
+    ) -> Past | None:
+        """Anchor and history of the clip, in models that take them."""
+        if not self._history.on:  # nothing is drawn: runs without history keep their clips
+            return None
+        if lead is None:
+            history = history_before(recording, start, self._spec, self._history, rng)
+        else:
+            history = history_of_lead(lead, self._history)
+        return draw_past(history, self._history, rng)
+
+    def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
+        """Draws an episode with the starts of its clips; failed ones with the configured share."""
+        share = self._augment.failure_share
+        pool = self._starts
+        if share is not None and self._failed and rng.random() < share:
+            pool = self._failed
+        return pool[rng.integers(len(pool))]
+
+
+def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
+    """Returns fields of a batch: anchors and histories of its clips."""
+    known = [past for past in given if past is not None]
+    if not known:
+        return {}
+    return {
+        'anchor': torch.from_numpy(np.stack([past.anchor for past in known])),
+        'history': torch.from_numpy(np.stack([past.frames for past in known])),
+        'history_sigmas': torch.tensor([past.sigma for past in known]),
+    }
+
+
+def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
+    """Starts that are at least a stride [s] apart."""
+    kept: list[int] = []
+    for start in starts:
+        if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
+            kept.append(int(start))
+    return np.array(kept, dtype=int)
+
+
+def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
+    """Zero ids in place of missing ones, if another clip has some."""
+    known = next((part for part in ids if part is not None), None)
+    if known is None:
+        return list(ids)
+    return [np.zeros_like(known) if part is None else part for part in ids]
+
+
+def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:
+    """Stacked tensor of a batch; None if a clip has none."""
+    found = [part for part in parts if part is not None]
+    return torch.from_numpy(np.stack(found)) if len(found) == len(parts) else None
+
+
+def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:
+    """Blur and noise of random strength, like a frame the model predicted itself."""
+    blurred = np.stack([cv2.blur(frame, (3, 3)) for frame in frames]).astype(np.float32)
+    share = rng.random() * 0.7
+    mixed = (1 - share) * frames + share * blurred
+    mixed = mixed + rng.normal(0, 255 * noise_std * rng.random(), mixed.shape)
+    return mixed.round().clip(0, 255).astype(np.uint8)
+
+
+#: makes the clip of a step and a number
+MakeClip = Callable[[int, int], Any]
+
+_make_clip: MakeClip | None = None
+
+
+class ClipWorkers:
+    """Makes clips in worker processes, forked so that they share the recordings.
+
+    Args:
+        make_clip: its results are sent between processes; it must not use a GPU.
+        count: processes.
+    """
+
+    def __init__(self, make_clip: MakeClip, count: int) -> None:
+        self._pool = ProcessPoolExecutor(
+            count,
+            mp_context=multiprocessing.get_context('fork'),  # nothing is copied or pickled
+            initializer=_begin,
+            initargs=(make_clip, os.getpid()),
+        )
+
+    def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
+        """Returns the clips of a step.
+
+        Raises:
+            TrainingError: a process was killed.
+        """
+        try:
+            return list(self._pool.map(_run, [step] * len(numbers), numbers))
+        except BrokenProcessPool as error:
+            raise TrainingError(
+                f'a process that prepares clips was killed at step {step}, perhaps for memory '
+                '(see dmesg); the last saved state is whole: run the same command again, with '
+                'fewer --data-workers if there is too little memory'
+            ) from error
+
+    def close(self) -> None:
+        """Ends the processes."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _begin(make_clip: MakeClip, parent: int) -> None:
+    global _make_clip
+    _make_clip = make_clip
+    # thread pools do not survive a fork, and the processes are the parallelism
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """Ends this worker when the training process was killed."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def _run(step: int, number: int) -> Any:
+    assert _make_clip is not None
+    return _make_clip(step, number)

@@ -1,0 +1,430 @@
+"""Latents of a training's clips, encoded once into a cache, and batches from it.
+
+Shape letters: B batch, V views, C latent channels, F latent frames, h w latent size, N tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import shutil
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mtv_world_ros.data.recording import commanded, cut_clip, Recording
+from mtv_world_ros.data_types import WorldModelSpec
+from mtv_world_ros.errors import ConfigError, TrainingError
+from mtv_world_ros.files import content_digest
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.base import Base
+from mtv_world_ros.lab.training.clips.batches import Batch, BatchSource, pasts
+from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
+from mtv_world_ros.lab.training.clips.past import draw_past, history_before
+from mtv_world_ros.lab.training.distributed import Processes
+from mtv_world_ros.lab.training.encoding import encode_batch, EncodedBatch, Encoders
+from mtv_world_ros.lab.training.latent_cache.latent_store import digest_of, LatentCache
+from mtv_world_ros.lab.training.objective import pixel_weights, pooled_weights
+from mtv_world_ros.lab.training.training_config import (
+    HistoryConfig,
+    ObjectiveConfig,
+    TrainingConfig,
+)
+from mtv_world_ros.model.actions import collate, TRAJECTORY_VIDEO
+from mtv_world_ros.model.conditioning import Conditioning, start_slot
+
+#: to be increased when the stored data or their computation change
+_VERSION = 1
+#: kinds of pixels with extra weight, in the order of a cache's `shares`
+WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
+_NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
+#: stale clips that a note names
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CachedClip:
+    """A clip that a cache holds or will hold.
+
+    Attributes:
+        recording: its episode.
+        start: recorded frame that it starts from.
+        key: in the cache.
+    """
+
+    recording: Recording
+    start: int
+    key: str
+
+    @property
+    def label(self) -> str:
+        """Its name, independent of its content."""
+        return f'{self.recording.path.name} from frame {self.start}'
+
+
+def settings_of(
+    config: TrainingConfig, base: Path, robot: RobotModel, segmenter: str, dtype: torch.dtype
+) -> dict[str, Any]:
+    """Returns everything that the latents of all clips depend on, as plain values.
+
+    Args:
+        config: the preset.
+        base: checkpoint whose encoders are used.
+        robot: its kinematics place what trajectory videos show.
+        segmenter: its name.
+        dtype: of the encoders and of what is kept.
+    """
+    video = config.video.model_dump()
+    names = ('views', 'fps', 'num_frames', 'width', 'height')
+    settings = {
+        'version': _VERSION,
+        **{f'video.{name}': video[name] for name in names},
+        'autoencoder': content_digest(base / 'autoencoder')[:16],
+        'dtype': str(dtype),
+        **{f'history.{k}': v for k, v in config.history.model_dump().items()},
+        'trajectory_video': config.video.control == TRAJECTORY_VIDEO,
+    }
+    if (base / 'image_encoder').is_dir():
+        settings['image_encoder'] = content_digest(base / 'image_encoder')[:16]
+    if settings['trajectory_video']:
+        settings |= {f'rendering.{k}': v for k, v in config.rendering.model_dump().items()}
+        settings |= {'robot': _robot_digest(robot), 'video.object_mask': video['object_mask']}
+        settings['segmenter'] = segmenter if video['object_mask'] else None
+    return settings
+
+
+def _robot_digest(robot: RobotModel) -> str:
+    """Changes with the robot's kinematics, tools and grippers."""
+    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    rows = np.random.default_rng(0).uniform(lower, upper, (8, len(lower)))
+    poses, openings = robot.tool_poses(rows), robot.gripper_openings(rows)
+    numbers = [np.round(part, 6).tolist() for part in (poses, openings)]
+    return digest_of(robot.name, robot.joint_names, *numbers)[:16]
+
+
+def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[CachedClip]:
+    """Returns the clips of recordings, keyed by the content of their episode's files and names.
+
+    Args:
+        recordings: each with the frames that its clips start from.
+    """
+    clips = []
+    for recording, starts in recordings:
+        content = content_digest(recording.path)
+        if recording.described:
+            content = digest_of(content, *recording.described)
+        clips += [
+            CachedClip(recording=recording, start=int(s), key=digest_of(content, int(s)))
+            for s in starts
+        ]
+    return clips
+
+
+def read_clip(
+    clip: CachedClip, spec: WorldModelSpec, controls: ControlMaker, history: HistoryConfig
+) -> Batch:
+    """Returns a clip as it was recorded, as a batch of one.
+
+    Its anchor and history are drawn once, by its start.
+    """
+    cut = cut_clip(clip.recording, clip.start, spec)
+    trajectory, actions = controls.make(cut, clip.recording.names)
+    parts = (cut.frames, cut.frames[:, 0], trajectory, cut.object_ids)
+    frames, start, drawn, ids = (
+        None if part is None else torch.from_numpy(np.array(part))[None] for part in parts
+    )
+    assert frames is not None and start is not None
+    past = None
+    if history.on:
+        rng = np.random.default_rng((_VERSION, clip.start))
+        before = history_before(clip.recording, clip.start, spec, history, rng)
+        past = draw_past(before, history, rng)
+    return Batch(
+        frames=frames,
+        start_frame=start,
+        trajectory=drawn,
+        object_ids=ids,
+        actions=None if actions is None else torch.from_numpy(collate([actions])),
+        **pasts([past]),  # type: ignore[arg-type]
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build:
+    """Progress of filling a cache: clips encoded, seconds since the first, bytes per clip."""
+
+    num_encoded: int
+    seconds: float
+    clip_bytes: int
+
+    @property
+    def clips_per_s(self) -> float:
+        """Encoded clips a second."""
+        return self.num_encoded / max(self.seconds, 1e-9)
+
+
+def fill(
+    cache: LatentCache,
+    clips: Sequence[CachedClip],
+    read: Callable[[CachedClip], Batch],
+    encoders: Encoders,
+    device: torch.device,
+    dtype: torch.dtype,
+) -> Iterator[Build]:
+    """Encodes the missing clips of a cache, and yields after each.
+
+    Args:
+        cache: of the settings that all of the other arguments follow from.
+        clips: all clips of the training.
+        read: gives a clip, undisturbed, as a batch of one.
+        encoders: on the device.
+        device: where to encode.
+        dtype: that latents are kept in.
+
+    Raises:
+        TrainingError: the disk is full, or will be before all clips are there.
+    """
+    missing = [clip for clip in clips if clip.key not in cache]
+    started = time.perf_counter()
+    for number, clip in enumerate(missing, start=1):
+        tensors = _encode(read(clip), encoders, device, dtype)
+        size = sum(tensor.nbytes for tensor in tensors.values())
+        if number == 1:
+            _check_space(cache.root, size, len(missing))
+        cache.add(clip.key, clip.label, tensors)
+        yield Build(num_encoded=number, seconds=time.perf_counter() - started, clip_bytes=size)
+    cache.flush()
+
+
+def _check_space(root: Path, clip_bytes: int, count: int) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    needed, free = clip_bytes * count, shutil.disk_usage(root).free
+    if needed > free:
+        raise TrainingError(
+            f"latents of {count} clips take {needed / 1e9:.1f} GB in '{root}', {free / 1e9:.1f} "
+            'GB are free there; give --latent-cache a folder on a larger disk, raise '
+            'video.clip_stride_s, or leave --latent-cache out and encode in every step'
+        )
+
+
+@torch.no_grad()
+def _encode(
+    batch: Batch, encoders: Encoders, device: torch.device, dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """The tensors of one clip, without the batch axis."""
+    encoded = encode_batch(encoders, batch, ObjectiveConfig(), device)
+    cond = encoded.conditioning
+    tensors = {'clean': encoded.clean, 'reference': cond.reference, 'image': cond.image}
+    tensors |= {'anchor': cond.anchor, 'history': cond.history}
+    if batch.trajectory is not None:
+        tensors['control'] = cond.control
+    held = {name: value[0].to(dtype) for name, value in tensors.items() if value is not None}
+    if cond.history_sigmas is not None:
+        held['history_sigma'] = cond.history_sigmas[0].float()
+    return held | {'shares': _shares(batch, encoded.clean.shape)[0]}
+
+
+def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
+    """(B, 3, V, F, h, w) uint8 shares of each latent that change, show an object, or lose one."""
+    parts = []
+    for name in WEIGHTS:
+        one = _NO_WEIGHTS.replace(**{name: 1.0})
+        weights = pixel_weights(batch.frames, batch.object_ids, one)
+        parts.append(pooled_weights(weights, shape)[:, :, 0] - 1)
+    return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)
+
+
+def cached(
+    source: BatchSource,
+    root: Path,
+    config: TrainingConfig,
+    base: Base | None,
+    *,
+    seed: int,
+    dtype: torch.dtype,
+    processes: Processes,
+) -> CachedSource:
+    """Encodes missing clips, reports what it did, and returns batches from the cache.
+
+    Args:
+        source: of the same clips, not cached; it is closed.
+        root: of caches.
+        config: the preset.
+        base: whose encoders are used.
+        seed: of the clips' order.
+        dtype: that latents are kept in.
+        processes: that train together.
+
+    Raises:
+        ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
+        TrainingError: the disk is full.
+    """
+    _check(config)
+    assert base is not None
+    source.close()
+    controls, spec = source.controls, config.spec
+    settings = settings_of(config, base.folder, controls.robot, controls.segmenter.name, dtype)
+    cache = LatentCache(root, settings)
+    clips = list_clips(source.starts)
+    for note in [*cache.notes, *_changed(cache, clips)]:
+        tqdm.write(f'latent cache: {note}')
+    steps = fill(
+        cache,
+        clips,
+        lambda clip: read_clip(clip, spec, controls, config.history),
+        base.encoders,
+        processes.device,
+        dtype,
+    )
+    held = sum(clip.key in cache for clip in clips)
+    made = 'none to encode'
+    for build in tqdm(steps, total=len(clips) - held, desc='encoding clips', unit='clip'):
+        made = (
+            f'{build.num_encoded} encoded in {build.seconds:.1f} s ({build.clips_per_s:.2f} '
+            f'clips/s, {build.clip_bytes / 1e6:.2f} MB each)'
+        )
+    tqdm.write(f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}")
+    return CachedSource(
+        cache,
+        clips,
+        objective=config.objective,
+        text=base.encoders.text,
+        batch_size=config.optimizer.batch_size,
+        seed=seed,
+        numbers=processes.share(config.optimizer.batch_size),
+        device=processes.device,
+        controls=controls,
+        spec=spec,
+    )
+
+
+def _check(config: TrainingConfig) -> None:
+    """Raises ConfigError if cached latents would differ from those of uncached training."""
+    if config.autoencoder.get('_class_name', 'SpaceToDepthAutoencoder') != 'AutoencoderKLWan':
+        raise ConfigError(
+            "--latent-cache is for presets with Wan's autoencoder; this one's only rearranges "
+            'pixels, which costs less than reading latents: leave --latent-cache out'
+        )
+    augment = config.augment
+    disturbed = {
+        'augment.start_noise': augment.start_noise,
+        'augment.colour_permutation': augment.colour_permutation,
+        'augment.failure_share': augment.failure_share,
+        'self_rollout.share': config.self_rollout.share,
+    }
+    for name, value in disturbed.items():
+        if value:
+            raise ConfigError(
+                f'{name} is {value}, but a latent cache holds every clip once, as it was '
+                f'recorded: set {name} to 0, or leave --latent-cache out'
+            )
+
+
+def _changed(cache: LatentCache, clips: list[CachedClip]) -> list[str]:
+    """A note on cached clips whose episodes have changed since."""
+    stale = cache.changed({clip.key: clip.label for clip in clips})
+    if not stale:
+        return []
+    named = ', '.join(stale[:_MOST_NAMED]) + (', ...' if len(stale) > _MOST_NAMED else '')
+    return [f'{len(stale)} clips are not used, their episodes have changed: {named}']
+
+
+class CachedSource:
+    """Batches from a cache: every clip once an epoch, in an order of its own each epoch.
+
+    Args:
+        cache: has all clips.
+        clips: of the training.
+        objective: pixel weights.
+        text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
+        batch_size: clips of a step, over all processes.
+        seed: of the order.
+        numbers: the clips of a step that this process takes; None: all.
+        device: where batches go.
+        controls: encodes actions that are not drawn.
+        spec: what the model takes and gives.
+    """
+
+    def __init__(
+        self,
+        cache: LatentCache,
+        clips: Sequence[CachedClip],
+        *,
+        objective: ObjectiveConfig,
+        text: Tensor | None,
+        batch_size: int,
+        seed: int,
+        numbers: Sequence[int] | None = None,
+        device: torch.device,
+        controls: ControlMaker,
+        spec: WorldModelSpec,
+    ) -> None:
+        self.controls = controls
+        self._cache, self._clips, self._objective = cache, clips, objective
+        self._text, self._device, self._spec = text, device, spec
+        self._batch_size, self._seed = batch_size, seed
+        self._numbers = range(batch_size) if numbers is None else numbers
+
+    @property
+    def num_clips(self) -> int:
+        """Clips of an epoch."""
+        return len(self._clips)
+
+    def batch(self, step: int) -> EncodedBatch:
+        """Returns the batch of a step."""
+        clips = [self._clip(step, number) for number in self._numbers]
+        rows = [self._cache.read(clip.key) for clip in clips]
+        held = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        held = {name: tensor.to(self._device) for name, tensor in held.items()}
+        clean, reference = held['clean'], held['reference']
+        control = held.get('control', torch.zeros_like(clean))
+        cond = Conditioning(
+            control=control,
+            start_control=control[:, :, :, 0],
+            start=start_slot(reference, clean.shape[3], includes_start=True),
+            reference=reference,
+            actions=self._encoded(clips),
+            text=self._repeated(self._text, len(rows)),
+            image=held.get('image'),
+            anchor=held.get('anchor'),
+            history=held.get('history'),
+            history_sigmas=held.get('history_sigma'),
+        )
+        return EncodedBatch(
+            step=step,
+            numbers=self._numbers,
+            clean=clean.float(),
+            conditioning=cond,
+            weights=self._weights(held['shares'], clean.shape),
+        )
+
+    def close(self) -> None:
+        """Does nothing: other sources have processes to end."""
+
+    def _clip(self, step: int, number: int) -> CachedClip:
+        epoch, place = divmod(step * self._batch_size + number, len(self._clips))
+        order = np.random.default_rng((self._seed, epoch)).permutation(len(self._clips))
+        return self._clips[order[place]]
+
+    def _encoded(self, clips: Sequence[CachedClip]) -> Tensor | None:
+        encoding = self.controls.actions
+        if encoding is None:
+            return None
+        times = np.arange(self._spec.num_frames + 1) / self._spec.fps
+        chunks = [commanded(clip.recording, clip.start, times) for clip in clips]
+        encoded = [encoding.encode(self.controls.robot, chunk) for chunk in chunks]
+        return torch.from_numpy(collate(encoded)).to(self._device)
+
+    def _repeated(self, text: Tensor | None, count: int) -> Tensor | None:
+        return None if text is None else text.to(self._device).expand(count, -1, -1)
+
+    def _weights(self, shares: Tensor, shape: Sequence[int]) -> Tensor:
+        weights = torch.ones_like(shares[:, 0], dtype=torch.float32)
+        for index, name in enumerate(WEIGHTS):
+            weights += getattr(self._objective, name) * shares[:, index].float() / 255
+        return weights.unsqueeze(2).expand(*shape)

@@ -1,0 +1,1 @@
+"""Nodes, recorder and player as processes."""

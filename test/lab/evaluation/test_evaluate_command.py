@@ -1,0 +1,58 @@
+import json
+
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.lab.cli.evaluate import Entry, parse_entries
+
+
+def test_rows_are_called_as_the_user_says_or_like_the_folder(tmp_path, monkeypatch):
+    folder = tmp_path / 'runs' / 'wide' / 'checkpoint'
+    folder.mkdir(parents=True)
+    (tmp_path / 'a=b').mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert parse_entries(['bundled', f'MTV-World={folder}', str(folder), 'a=b']) == [
+        Entry('bundled', 'bundled'),
+        Entry(str(folder), 'MTV-World', True),
+        Entry(str(folder), 'wide'),
+        Entry('a=b', 'a=b'),
+    ]
+
+
+def test_rows_that_are_called_alike_are_an_error():
+    with pytest.raises(ConfigError, match="two are called 'x'; name them: NAME=FOLDER"):
+        parse_entries(['one/x', 'two/x'])
+    with pytest.raises(ConfigError, match="one is called ''"):
+        parse_entries(['=one'])
+
+
+def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsys):
+    dataset = episodes[0].parent
+    out = tmp_path / 'out'
+    arguments = ['--steps', '1', '--episodes', '1', '--no-ceiling', '--actions', 'true']
+    command = ['evaluate', 'a=bundled', 'b c=bundled', str(dataset), '--out', str(out), *arguments]
+    assert main([*command, '--threads', '1']) == 0
+    printed = capsys.readouterr().out
+    assert '1 of 3 episodes, split all' in printed and '| b c ' in printed
+    metrics = json.loads((out / 'metrics.json').read_text())
+    assert metrics['num_episodes'] == {'a': 1, 'b c': 1}
+    first, second = (
+        json.loads((out / name / 'metrics.json').read_text()) for name in ('a', 'b_c')
+    )
+    assert first['views'] == second['views'] == metrics['methods']['a']['views']
+    assert first['provenance']['dataset'].endswith('1 of 3 episodes, split all')
+    assert (out / 'report.html').stat().st_size > 10_000
+
+
+def test_mistakes_are_told_in_a_line(episodes, tmp_path, capsys):
+    dataset, out = str(episodes[0].parent), str(tmp_path)
+    for options, words in (
+        (['--actions', 'shuffled'], "'true' must be among them"),
+        (['--quality', 'psrn'], "quality 'psrn' is not one of psnr, ssim, lpips"),
+        (['--split', 'test'], "split 'test' is not one of"),
+        (['--fid-weights', '/none.pth'], "fid_weights '/none.pth' does not exist"),
+        (['--workers', '0'], 'workers is 0'),
+    ):
+        assert main(['evaluate', 'bundled', dataset, '--out', out, *options]) == 1
+        assert words in capsys.readouterr().err

@@ -1,0 +1,159 @@
+"""Every step of docs/your_robot.md, in its order, on a robot that `config/` does not know.
+
+The recordings are a sqlite3 bag with TF, the robot's description, JPEG and YUV images and no
+commands. Where rclpy is installed, the node and those who talk to it run too.
+"""
+
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+
+from bags import record
+from crane import FPS, load, make_cameras, make_positions
+import pytest
+from test_import_bag import MAPPING
+from test_own_checkpoint import TINY
+import yaml
+
+from mtv_world_ros.cli import main
+
+PAGE = Path(__file__).resolve().parents[3] / 'docs' / 'your_robot.md'
+#: names on the page, and those of the test's robot
+NAMES = {'my_robot': 'crane', 'first_bag': 'wave', 'front,side': 'door,palm'}
+#: keep the commands small
+SMALL = {
+    'train': ['--threads', '1', *(word for item in TINY for word in ('--set', item))],
+    'evaluate': ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report'],
+    'imagine': ['--max-chunks', '2', '--threads', '1'],
+}
+#: a busy machine takes long to start a node, and to hand it images
+PATIENT = ['--wait-timeout', '300', '--answer-timeout', '300']
+CALM = ['-p', 'num_threads:=1', '-p', 'max_image_age_s:=60.0', '-p', 'max_joint_state_age_s:=60.0']
+POLICY = """
+import numpy as np
+from mtv_world_ros.data_types import JointTrajectory
+
+
+class Nod:
+    name = 'nod'
+
+    def reset(self, *, seed):
+        pass
+
+    def act(self, observation, instruction):
+        times = np.array([0.2, 0.4])
+        positions = np.tile(observation.positions, (2, 1))
+        positions[:, 4] += 0.05
+        return JointTrajectory(
+            joint_names=('yaw', 'shoulder', 'elbow', 'roll', 'nod', 'jaw_left'), times=times,
+            positions=positions,
+        )
+"""
+#: exit status of `doctor`: the camera on the hand cannot be checked
+STATUS = {'doctor': 3}
+
+
+def lines() -> list[list[str]]:
+    """Words of the page's `mtv-world` lines, one after the other."""
+    text = PAGE.read_text()
+    for name, own in NAMES.items():
+        text = text.replace(name, own)
+    blocks = [part.split('```')[0] for part in text.split('```bash\n')[1:]]
+    return [shlex.split(line) for block in blocks for line in block.splitlines() if line]
+
+
+@pytest.fixture(scope='module')
+def desk(tmp_path_factory):
+    """Folder with the robot's URDF and meshes, its bags, and their mapping."""
+    folder = tmp_path_factory.mktemp('desk')
+    robot, cameras = load(folder), make_cameras()
+    del cameras['window']
+    bag = folder / 'recordings' / 'wave'
+    bag.parent.mkdir()
+    record(bag, robot, cameras, make_positions(4.0, fps=FPS), sqlite=True)
+    shutil.move(folder / 'crane' / 'crane.urdf', folder / 'crane.urdf')
+    (folder / 'crane' / 'crane.yaml').unlink()
+    (folder / 'my_bags.yaml').write_text(yaml.safe_dump(MAPPING))
+    (folder / 'nodding.py').write_text(POLICY)
+    policy = {'kind': 'python', 'factory': 'nodding:Nod'}
+    (folder / 'my_policy.yaml').write_text(yaml.safe_dump(policy))
+    return folder
+
+
+class Node:
+    """The page's line that starts the node, as a process; stopped by SIGINT."""
+
+    def __init__(self, words, log):
+        start = 'from mtv_world_ros.ros import run_world_model; run_world_model()'
+        self.log = log
+        with log.open('w') as out:
+            self._process = subprocess.Popen(
+                [sys.executable, '-c', start, *words[1:], *CALM],
+                stdout=out, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+
+    def stop(self):
+        """Returns the exit status."""
+        self._process.send_signal(signal.SIGINT)
+        return self._process.wait(60)
+
+
+def run_in_process(words):
+    """Runs a command that talks to the node from a process of its own; returns what it said."""
+    command = [sys.executable, '-m', 'mtv_world_ros.cli', *words[1:], *SMALL.get(words[1], [])]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, f'{words}: {done.stdout}{done.stderr}'
+    return done.stdout + done.stderr
+
+
+@pytest.fixture
+def at_the_desk(desk, monkeypatch):
+    """Commands run there, and find the policy's module."""
+    monkeypatch.chdir(desk)
+    monkeypatch.syspath_prepend(desk)
+    packages = [str(desk), str(PAGE.parents[1]), os.environ.get('PYTHONPATH', '')]
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(filter(None, packages)))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    return desk
+
+
+def of_ros(words):
+    return words[0] == 'world_model' or words[1] == 'imagine' or '--lock-step' in words
+
+
+def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
+    done = []
+    for words in (words for words in lines() if not of_ros(words)):
+        command = words[1]
+        status = main([*words[1:], *SMALL.get(command, [])])
+        said = capsys.readouterr()
+        assert status == STATUS.get(command, 0), f'{words}: {said.out}{said.err}'
+        done.append(command)
+    assert done == ['robot', 'import-bag', 'doctor', 'train', 'evaluate', 'replay']
+    assert (at_the_desk / 'out' / 'mine' / 'metrics.json').is_file()
+
+
+@pytest.mark.skipif(find_spec('rclpy') is None, reason='rclpy is not installed')
+def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk, capfd):
+    """Goes on from what the test above has trained."""
+    if not (at_the_desk / 'runs' / 'mine' / 'checkpoint').is_dir():
+        pytest.skip('the first half of the page was not run')
+    serve, play, *imagine = [words for words in lines() if of_ros(words)]
+    node = Node(serve, at_the_desk / 'node.log')
+    try:
+        said = run_in_process([*play, *PATIENT])
+    finally:
+        status = node.stop()
+    assert status == 0 and ' done' in said and 'rejected' not in said, said + node.log.read_text()
+    assert 'robot crane' in node.log.read_text()
+    for words, out in zip(imagine, ('mine_repeated', 'mine_imagined'), strict=True):
+        status = main([*words[1:], *SMALL['imagine']])
+        said = ''.join(capfd.readouterr())
+        assert status == 0 and 'max_chunks' in said, f'{words}: {said}'
+        assert any((at_the_desk / 'out' / out).glob('episode_00000/*.mcap'))

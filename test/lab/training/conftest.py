@@ -1,0 +1,52 @@
+"""The bundled episode and a preset small enough to train in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sources import make_source
+
+from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+
+TINY = {
+    'transformer.num_attention_heads': 2,
+    'transformer.attention_head_dim': 12,
+    'transformer.ffn_dim': 32,
+    'transformer.num_layers': 1,
+    'transformer.stem_widths': [8, 16, 16],
+    'transformer.frames_per_token': 2,
+    'transformer.freq_dim': 16,
+    'video.num_frames': 2,
+    'video.width': 48,
+    'video.height': 40,
+    'optimizer.batch_size': 1,
+    'optimizer.warmup_steps': 1,
+    'optimizer.steps': 4,
+    'optimizer.learning_rate': 2e-3,
+}
+
+
+@pytest.fixture(scope='session')
+def episode() -> Path:
+    return share_path('resource', 'demo_episode')
+
+
+@pytest.fixture(scope='session')
+def tiny() -> TrainingConfig:
+    return load_training_config('small', TINY)
+
+
+@pytest.fixture(scope='session')
+def recording(episode: Path, tiny: TrainingConfig, robot: RobotModel) -> Recording:
+    return load_recording(episode, tiny.spec, robot)
+
+
+@pytest.fixture
+def source(recording: Recording, tiny: TrainingConfig, robot: RobotModel):
+    batches = make_source([recording], tiny, robot)
+    yield batches
+    batches.close()

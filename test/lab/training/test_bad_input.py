@@ -1,0 +1,142 @@
+"""Episodes that cannot be used are counted by reason; a full disk leaves what was saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import resource
+import signal
+
+import numpy as np
+import pytest
+from sources import make_source
+import torch
+
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagMessage, iter_messages
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.recording import Recording
+from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.clips.batches import BatchSource
+from mtv_world_ros.lab.training.resume import DiskError
+from mtv_world_ros.lab.training.trainer import Trainer
+from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
+from mtv_world_ros.lab.training.training_run import load_recordings, train
+from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+
+Change = Callable[[BagMessage], list[bytes]]
+
+
+def rewrite(episode: Path, path: Path, change: Change) -> None:
+    """Copies a bag with some messages left out or replaced."""
+    with BagWriter(path) as writer:
+        for message in iter_messages(episode):
+            for data in change(message):
+                writer.write_raw(message.topic, message.msgtype, message.stamp_ns, data)
+    (path / 'calibration.yaml').write_bytes((episode / 'calibration.yaml').read_bytes())
+
+
+def without(topic: str) -> Change:
+    return lambda message: [] if message.topic == topic else [message.data]
+
+
+def moving_camera(message: BagMessage) -> list[bytes]:
+    if message.topic != '/low/camera_info':
+        return [message.data]
+    info = messages.deserialize(message.msgtype, message.data)
+    info.k = info.k + np.array([5.0, *[0.0] * 8])
+    return [message.data, messages.serialize(message.msgtype, info)]
+
+
+def other_robot(message: BagMessage) -> list[bytes]:
+    if message.topic not in ('/joint_states', '/joint_trajectory'):
+        return [message.data]
+    content = messages.deserialize(message.msgtype, message.data)
+    names = 'name' if message.topic == '/joint_states' else 'joint_names'
+    setattr(content, names, [f'panda_joint{i}' for i, _ in enumerate(getattr(content, names))])
+    return [messages.serialize(message.msgtype, content)]
+
+
+def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
+    episode: Path,
+    tiny: TrainingConfig,
+    robot: RobotModel,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    data = tmp_path / 'data'
+    rewrite(episode, data / 'good', lambda message: [message.data])
+    for name in ('stateless_a', 'stateless_b'):
+        rewrite(episode, data / name, without('/joint_states'))
+    rewrite(episode, data / 'viewless', without('/high/image_raw/compressed'))
+    rewrite(episode, data / 'other_robot', other_robot)
+    rewrite(episode, data / 'moved', moving_camera)
+    out = tmp_path / 'run'
+    run = TrainingRun(config=tiny, dataset=data, out=out)
+    train(run, robot=robot, segmenter=ColourSegmenter())
+    reasons = {Path(k).name: v for k, v in json.loads((out / 'skipped.json').read_text()).items()}
+    assert sorted(reasons) == ['moved', 'other_robot', 'stateless_a', 'stateless_b', 'viewless']
+    assert 'joint_states' in reasons['stateless_a']
+    assert "'high'" in reasons['viewless']
+    assert 'panda_joint0' in reasons['other_robot']
+    assert '/low/camera_info' in reasons['moved'] and 'changes' in reasons['moved']
+    printed = capsys.readouterr()
+    lines = [line for line in (printed.out + printed.err).splitlines() if 'left out:' in line]
+    assert len(lines) == 4
+    assert 'left out: 2 x ' in lines[0] and 'joint_states' in lines[0]
+    for name in reasons:
+        (data / name).rename(tmp_path / name)
+    rewrite(episode, tmp_path / 'only' / 'bad', without('/joint_states'))
+    with pytest.raises(TrainingError, match='no usable episode: 1 x .*joint_states'):
+        train(run.replace(dataset=tmp_path / 'only'), robot=robot, segmenter=ColourSegmenter())
+    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
+    with pytest.raises(TrainingError, match=said):
+        load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
+
+
+def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
+) -> None:
+    """Files may not grow beyond a limit here, which fails at the same calls as a full disk."""
+    trainer = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    reports = trainer.run(
+        source, save_every=1, on_save=lambda _: trainer.export(tmp_path / 'checkpoint')
+    )
+    for _ in range(2):  # the second call saves what the first one did
+        next(reports)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        with pytest.raises(DiskError, match='whole: free some space and run the same command'):
+            next(reports)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['checkpoint', 'state']
+    resumed = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    assert resumed.load_state() and resumed.step == 1
+    assert load_checkpoint(tmp_path / 'checkpoint').card.trained_on['steps'] == 1
+
+
+def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
+    recording: Recording, tiny: TrainingConfig, robot: RobotModel, source: BatchSource
+) -> None:
+    workers = make_source([recording], tiny, robot, workers=2)
+    for step in range(3):
+        expected, found = source.batch(step), workers.batch(step)
+        assert torch.equal(found.start_frame, expected.start_frame)
+        assert torch.equal(found.trajectory, expected.trajectory)
+    (first, *_) = multiprocessing.active_children()
+    os.kill(first.pid, signal.SIGKILL)
+    first.join(10)
+    with pytest.raises(TrainingError, match='killed at step .*the last saved state is whole'):
+        for step in range(3, 6):  # one batch was prepared before
+            workers.batch(step)
+    workers.close()

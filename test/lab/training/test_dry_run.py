@@ -1,0 +1,91 @@
+"""What a step takes: counted on shapes, against a step that is really computed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.lab.training.dry_run import step_cost
+from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+
+
+@pytest.mark.parametrize('control', ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens'])
+def test_counts_what_a_real_step_does(control: str) -> None:
+    config = _tiny(control)
+    fake = step_cost(config, action_dim=14, dtype=torch.float32)
+    real = step_cost(config, action_dim=14, dtype=torch.float32, fake=False)
+    assert fake == real
+    more = {} if control == 'trajectory_video' else {'control': control, 'action_dim': 14}
+    model = MultiViewWanTransformer(**config.transformer, **more)
+    assert fake.parameters == fake.trainable == sum(p.numel() for p in model.parameters())
+    # float32 weights twice; averaged weights, Adam's two moments, gradients twice
+    assert fake.weight_bytes + fake.training_bytes == fake.parameters * 4 * (2 + 5)
+
+
+def _tiny(control: str) -> TrainingConfig:
+    return load_training_config(
+        'small',
+        {
+            'transformer.num_attention_heads': 2,
+            'transformer.attention_head_dim': 12,
+            'transformer.num_layers': 1,
+            'transformer.stem_widths': [8, 16, 16],
+            'transformer.freq_dim': 16,
+            'video.width': 48,
+            'video.height': 40,
+            'video.control': control,
+        },
+    )
+
+
+@pytest.mark.parametrize('rank', [0, 8])
+def test_operations_are_those_of_the_products(rank: int) -> None:
+    """Of a patch model: every product of matrices in the published block, counted by hand."""
+    config = load_training_config(
+        'wan-1.3b',
+        {
+            'transformer.num_layers': 1,
+            'video.width': 64,
+            'video.height': 32,
+            'video.num_frames': 8,
+            'optimizer.batch_size': 1,
+            'optimizer.gradient_checkpointing': False,
+            'lora.rank': rank,
+        },
+    )
+    cost = step_cost(config, action_dim=14, dtype=torch.bfloat16)
+    dim, ffn, text, image = 1536, 8960, 512, 2 * 257
+    grid = 3 * 4 * 8  # latent frames, height, width of a view
+    kept = 2 * grid // 4
+    history = 2 * 2 * (4 * 8) // 4  # the last five frames are two latent ones
+    reference = 2 * (4 * 8) // 4
+    tokens = history + reference + kept
+    block = tokens * dim * (4 * dim + 2 * dim + 2 * ffn)  # self, query and output, feed forward
+    block += 2 * (text + image) * dim * dim  # keys and values of the context
+    block += 2 * tokens * dim * (tokens + text + image)  # attention: weights, values
+    embedded = reference * 4 * 16 * dim + (history + kept) * 4 * 48 * dim + kept * dim * 64
+    text_embedder = text * (4096 * dim + dim * dim)
+    image_embedder = image * (1280 * 1280 + 1280 * dim)
+    time = 2 * (256 * dim + dim * dim + dim * 6 * dim)  # of the video and of the history
+    # an adapter's factors: to `rank` numbers and back, of tokens and of the text
+    factors = tokens * rank * (6 * 2 * dim + 2 * (dim + ffn)) + 2 * text * rank * 2 * dim
+    expected = 2 * (block + embedded + text_embedder + image_embedder + time + factors)
+    assert cost.forward_flop == expected
+    if rank:
+        trained = 8 * rank * 2 * dim + 2 * rank * (dim + ffn)
+        trained += dim * (4 * 16 + 1) + dim * (4 * 48 + 1) + 2 * dim  # phi, patches, views
+        assert cost.trainable == trained
+        # bfloat16 weights and gradients; float32 ones, averages and Adam's moments of the trained
+        assert cost.weight_bytes == 2 * cost.parameters + 4 * trained
+        assert cost.training_bytes == (4 * 4 + 2) * trained
+
+
+def test_the_command_prints_it_and_trains_nothing(capsys: pytest.CaptureFixture) -> None:
+    smaller = ['--set', 'transformer.num_layers=1', '--set', 'video.num_frames=4']
+    assert main(['train', '--dry-run', '--control', 'policy2vec', *smaller]) == 0
+    printed = capsys.readouterr().out
+    assert 'control policy2vec, 2 views of 5 frames of 96x72' in printed
+    for word in ('parameters', 'trainable', 'TFLOP', 'memory', 'activations'):
+        assert word in printed

@@ -1,0 +1,64 @@
+"""A training that is killed again and again ends as the undisturbed one."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from safetensors.torch import load_file
+import torch
+import yaml
+
+from mtv_world_ros.lab.training.trainer import Trainer
+from mtv_world_ros.lab.training.training_config import TrainingConfig
+
+SCRIPT = Path(__file__).with_name('train_killed.py')
+ROOT = Path(__file__).parents[3]
+
+
+def test_kill_9_changes_neither_curve_nor_weights(
+    tiny: TrainingConfig, episode: Path, tmp_path: Path
+) -> None:
+    config = tiny.replace(optimizer=tiny.optimizer.replace(steps=40))
+    preset = tmp_path / 'preset.yaml'
+    preset.write_text(yaml.safe_dump(json.loads(json.dumps(config.model_dump()))))
+    started = subprocess.run(
+        [sys.executable, str(SCRIPT), str(tmp_path), str(episode.parent), str(preset)],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert started.returncode == 0, started.stderr
+    kills = json.loads((tmp_path / 'kills.json').read_text())
+    assert len(kills) >= 3 and any('state.partial' in told for told in kills), kills
+    curves, tensors = [], []
+    for name in ('whole', 'killed'):
+        rows = [json.loads(line) for line in (tmp_path / name / 'log.jsonl').open()]
+        curves.append([(row['step'], row['loss'], row['grad_norm']) for row in rows])
+        weights = tmp_path / name / 'checkpoint' / 'transformer'
+        tensors.append(load_file(tmp_path / name / 'state' / 'state.safetensors'))
+        tensors[-1] |= load_file(weights / 'diffusion_pytorch_model.safetensors')
+    assert curves[0] == curves[1]
+    assert [step for step, *_ in curves[0]] == [10, 20, 30, 40]
+    assert all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[0])
+
+
+def test_a_kill_between_the_two_renames_leaves_the_old_state(
+    tiny: TrainingConfig, tmp_path: Path
+) -> None:
+    def trainer() -> Trainer:
+        return Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+
+    first = trainer()
+    first.step = 7
+    first.save_state()
+    (tmp_path / 'state').rename(tmp_path / 'state.old')
+    (tmp_path / 'state.partial').mkdir()
+    resumed = trainer()
+    assert resumed.load_state() and resumed.step == 7
+    resumed.save_state()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['state']

@@ -1,0 +1,91 @@
+"""Trains once undisturbed and once with kills; processes are forked, so that torch loads once.
+
+    python train_killed.py OUT EPISODES PRESET
+
+OUT gets `whole/`, `killed/` and `kills.json`: when each kill came.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import random
+import signal
+import sys
+import time
+
+import torch
+
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
+from mtv_world_ros.lab.training.training_run import train
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+
+_KILLS = 4
+
+
+def start(out: Path, episodes: Path, preset: Path) -> int:
+    """Trains in a process of its own and returns its id."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        torch.set_num_threads(1)
+        robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+        config = load_training_config(preset)
+        run = TrainingRun(config=config, dataset=episodes, out=out, save_every=3)
+        train(run, robot=robot, segmenter=ColourSegmenter())
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def finished(child: int) -> bool:
+    """Whether a process ended, which it must have done well."""
+    done, status = os.waitpid(child, os.WNOHANG)
+    assert not done or status == 0, status
+    return bool(done)
+
+
+def written_at(out: Path) -> int:
+    """When the state was written [ns]; 0 = there is none now, as between a save's two renames."""
+    try:
+        return (out / 'state' / 'state.json').stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
+def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
+    """Kills a process some seconds after it began to step, or then while it writes its state."""
+    before = written_at(out)
+    while written_at(out) in (0, before):
+        if finished(child):
+            return None
+        time.sleep(0.001)
+    time.sleep(after)
+    while saving and not (out / 'state.partial').exists():
+        if finished(child):
+            return None
+    if finished(child):
+        return None
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return f'{"saving" if saving else "anywhere"}: {sorted(p.name for p in out.iterdir())}'
+
+
+if __name__ == '__main__':
+    folder, bags, file = (Path(argument) for argument in sys.argv[1:])
+    random.seed(0)
+    kills = []
+    for number in range(_KILLS):
+        process = start(folder / 'killed', bags, file)
+        moment = random.random() * 0.1
+        told = kill(process, folder / 'killed', saving=number % 2 == 1, after=moment)
+        kills += [told] if told else []
+    for name in ('killed', 'whole'):
+        process = start(folder / name, bags, file)
+        assert os.waitpid(process, 0)[1] == 0
+    (folder / 'kills.json').write_text(json.dumps(kills))
