@@ -13,6 +13,13 @@ from setuptools import find_packages, setup
 PACKAGE = 'mtv_world_ros'
 SHARE = f'share/{PACKAGE}'
 MARKER = f'resource/{PACKAGE}'
+#: modules of commands on each floor
+GROUND_COMMANDS = ('imagine', 'view')
+LAB_COMMANDS = (
+    'calibrate', 'datasets', 'demo', 'distill', 'evaluate', 'fit_contact', 'import_weights',
+    'own_robot', 'train', 'train_motion',
+)  # fmt: skip
+BENCH_COMMANDS = ('collect', 'rank')
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:
@@ -102,6 +109,19 @@ setup(
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
             'world_model = mtv_world_ros.ros:run_world_model',
+        ],
+        # A module of commands adds them to the parser: `add(subparsers)`.
+        'mtv_world.commands': [
+            *(f'{name} = {PACKAGE}.cli.{name}' for name in GROUND_COMMANDS),
+            *(f'{name} = {PACKAGE}.lab.cli.{name}' for name in LAB_COMMANDS),
+            *(f'{name} = {PACKAGE}.bench.cli.{name}' for name in BENCH_COMMANDS),
+        ],
+        # Policy kinds that the simulator makes.
+        'mtv_world.policies': [f'scripted = {PACKAGE}.bench.expert.policy_kind'],
+        # Folders whose rollouts `mtv-world view` shows.
+        'mtv_world.rollouts': [
+            f'ranking = {PACKAGE}.bench.ranking.shown_rollouts',
+            f'evaluation = {PACKAGE}.lab.evaluation.shown_rollouts',
         ],
     },
     zip_safe=True,

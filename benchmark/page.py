@@ -40,11 +40,7 @@ DESCRIBES = {
     'found_again': ('mtv_world_ros/geometry/solids.py',),
     'forward_kinematics': ('mtv_world_ros/geometry',),
     'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),
-    'learned_policies': (
-        'mtv_world_ros/bench/ranking',
-        'mtv_world_ros/policies',
-        'mtv_world_ros/bench',
-    ),
+    'learned_policies': ('mtv_world_ros/bench', 'mtv_world_ros/policies'),
     'long_rollouts': ('mtv_world_ros/model',),
     'outcome_sensitivity': ('mtv_world_ros/bench',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),

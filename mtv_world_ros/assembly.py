@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.entry_points import policy_kind
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
@@ -292,7 +293,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     """
     config = policy_settings(name, robot)
     if isinstance(config, ScriptedPolicySettings):
-        return _scripted(config, robot)
+        return policy_kind(config.kind).policy_maker(config, robot)
     if isinstance(config, RecordedPolicySettings):
         return partial(_recorded, config, robot)
     made = config.make()
@@ -305,34 +306,13 @@ def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
-    from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
-
     if str(name).startswith('expert'):
         config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
     else:
         config = load_policy_config(bundled('policies', name, 'policy'), robot)
     if isinstance(config, ScriptedPolicySettings):
-        parse_variant(config.variant)
+        policy_kind(config.kind).check(config)
     return config
-
-
-def _scripted(settings: ScriptedPolicySettings, robot: RobotModel) -> PolicyMaker:
-    from mtv_world_ros.bench.expert.expert import Expert
-    from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
-
-    variant = settings.variant
-    expert = Expert(robot)
-
-    def make(origin: EpisodeOrigin) -> Policy:
-        task, scene_seed = origin.task, origin.scene_seed
-        if not task or scene_seed < 0:
-            raise PolicyError(
-                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
-                "'scene_seed' to those of the recorded episode"
-            )
-        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
-
-    return make
 
 
 def _recorded(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import errno
 import os
 import shlex
@@ -11,13 +11,31 @@ import signal
 import sys
 from types import ModuleType
 
-from mtv_world_ros.errors import MtvWorldError, nearest, TrainingInterrupted
+from mtv_world_ros.entry_points import COMMANDS, load, registered
+from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted
 from mtv_world_ros.signals import ended_by_signals, stopped_by_sigterm
 
 #: of the extra `evaluate`, which several commands need
 _EVALUATE_PACKAGES = ('matplotlib', 'scipy')
 _FULL = '; make room and run the command again'
 _READ_ONLY = '; choose another folder'
+#: modules of commands as `--help` shows them; those of other packages come last
+_ORDER = (
+    'demo',
+    'imagine',
+    'collect',
+    'train',
+    'train_motion',
+    'fit_contact',
+    'distill',
+    'evaluate',
+    'rank',
+    'calibrate',
+    'view',
+    'own_robot',
+    'datasets',
+    'import_weights',
+)
 _ADVICE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -39,41 +57,20 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _commands() -> tuple[ModuleType, ...]:
-    """The modules of the commands, in the order of `--help`; their imports take a moment."""
-    from mtv_world_ros.cli import (
-        calibrate,
-        collect,
-        datasets,
-        demo,
-        distill,
-        evaluate,
-        fit_contact,
-        imagine,
-        import_weights,
-        own_robot,
-        rank,
-        train,
-        train_motion,
-        view,
-    )
+def _commands() -> Iterable[ModuleType]:
+    """The modules of the commands, in the order of `--help`; their imports take a moment.
 
-    return (
-        demo,
-        imagine,
-        collect,
-        train,
-        train_motion,
-        fit_contact,
-        distill,
-        evaluate,
-        rank,
-        calibrate,
-        view,
-        own_robot,
-        datasets,
-        import_weights,
-    )
+    Raises:
+        ConfigError: none is registered, or one cannot be imported.
+    """
+    found = registered(COMMANDS)
+    if not found:
+        raise ConfigError(
+            'the installed mtv_world_ros registers no commands; install it again: make, or '
+            'pip install --no-deps --no-build-isolation -e .'
+        )
+    others = sorted(found.keys() - set(_ORDER))
+    return [load(found[name]) for name in (*_ORDER, *others) if name in found]
 
 
 class _Version(argparse.Action):
@@ -107,8 +104,11 @@ def main(argv: list[str] | None = None) -> int:
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
-    with ended_by_signals('mtv-world'):
-        arguments = _parsed(sys.argv[1:] if argv is None else argv)
+    try:
+        with ended_by_signals('mtv-world'):
+            arguments = _parsed(sys.argv[1:] if argv is None else argv)
+    except ConfigError as error:  # of the installation
+        return _said(str(error), 1)
     try:
         with stopped_by_sigterm():
             return arguments.handler(arguments)

@@ -130,28 +130,6 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
 
 
-def add_physics(parser: argparse.ArgumentParser) -> None:
-    """Adds `--physics`."""
-    parser.add_argument(
-        '--physics',
-        default='nominal',
-        metavar='NAME',
-        help="what is true in the simulator, of config/physics.yaml: 'nominal', which flatters, "
-        'or a shift such as bold or delay_100ms; the world model is told nothing of it',
-    )
-
-
-def physics_text(name: str) -> str:
-    """Returns what is true, for pages.
-
-    Raises:
-        SimulatorError: unknown name.
-    """
-    from mtv_world_ros.bench.world.physics import physics_named
-
-    return f'{name}: {physics_named(name).text}'
-
-
 def add_overwrite(parser: argparse.ArgumentParser) -> None:
     """Adds `--overwrite`."""
     parser.add_argument(

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, parse_variant, refuse_kinds
 from mtv_world_ros.data.episode_reader import read_info
+from mtv_world_ros.entry_points import policy_kind
 
 #: key of an episode's metadata
 POLICY = 'policy'
+#: kind of policies, and what their names begin with
+_SCRIPTED, _EXPERT = 'scripted', 'expert'
 
 
 def recorded_policy(path: Path) -> str:
@@ -19,18 +21,23 @@ def recorded_policy(path: Path) -> str:
         EpisodeError: the episode's metadata cannot be used.
     """
     name = read_info(path).metadata.get(POLICY, '')
-    return name if name.split('-')[0] == EXPERT else ''
+    return name if name.split('-')[0] == _EXPERT else ''
 
 
 def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
     """Returns the fault kinds of episodes of scripted policies.
 
     Raises:
+        ConfigError: the simulator, which knows scripted policies, is not installed.
         EpisodeError: the metadata of an episode cannot be used.
         PolicyError: a policy has an unknown fault.
     """
     named = {Path(path): recorded_policy(path) for path in paths}
-    return {path: parse_variant(policy).kinds for path, policy in named.items() if policy}
+    scripted = {path: policy for path, policy in named.items() if policy}
+    if not scripted:
+        return {}
+    kind = policy_kind(_SCRIPTED)
+    return {path: kind.fault_kinds(policy) for path, policy in scripted.items()}
 
 
 def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
@@ -41,7 +48,10 @@ def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
         what: they are not for, in words.
 
     Raises:
+        ConfigError: the simulator, which knows scripted policies, is not installed.
         EpisodeError: the metadata of an episode cannot be used.
         PolicyError: names the policies and their kinds.
     """
-    refuse_kinds(sorted({recorded_policy(path) for path in paths} - {''}), 'test', what)
+    named = sorted({recorded_policy(path) for path in paths} - {''})
+    if named:
+        policy_kind(_SCRIPTED).refuse_test_kinds(named, what)

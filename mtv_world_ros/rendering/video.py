@@ -16,7 +16,6 @@ from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.prediction import Prediction
 
 #: kinds of frames, in the order of rows and columns
 KINDS = ('real', 'trajectory', 'imagined')
@@ -59,24 +58,6 @@ class Comparison:
     def frames(self, kind: str) -> ByteArray:
         """Returns the (V, T, H, W, 3) frames of one of `KINDS`."""
         return {'real': self.real, 'trajectory': self.trajectory, 'imagined': self.imagined}[kind]
-
-
-def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:
-    """Returns a rollout's chunks beside (V, T, H, W, 3) recorded frames at the same times."""
-    videos = [chunk.video for chunk in chunks]
-    return Comparison(
-        views=videos[0].views,
-        times=np.concatenate([video.times for video in videos]),
-        real=real,
-        trajectory=np.concatenate(
-            [
-                chunk.trajectory_video.frames[:, 1 : 1 + video.frames.shape[1]]
-                for chunk, video in zip(chunks, videos, strict=True)
-            ],
-            axis=1,
-        ),
-        imagined=np.concatenate([video.frames for video in videos], axis=1),
-    )
 
 
 def contact_sheet(

@@ -10,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.lab.evaluation.results import StoredRollout
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 from mtv_world_ros.viewing.streams import KINDS, Streams
 

@@ -4,24 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
+from typing import Any
 
-from mtv_world_ros.bench.ranking.both_worlds import FRAMES
-from mtv_world_ros.bench.ranking.rollout_cards import (
-    rollout_file,
-    told,
-    verdict,
-    when_they_part,
-    worst_first,
-)
-from mtv_world_ros.bench.ranking.rollout_jobs import Result
-from mtv_world_ros.bench.ranking.run_jobs import read_results
-from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
-from mtv_world_ros.lab.evaluation.results import EpisodeResult, load_rollout, StoredRollout
-
-#: of a ranking's and an evaluation's folder
-RANKING, EVALUATION = 'ranking.json', 'metrics.json'
+from mtv_world_ros.data.stored_rollout import StoredRollout
+from mtv_world_ros.entry_points import load, registered, ROLLOUTS
+from mtv_world_ros.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,58 +30,30 @@ class ScoredRollout:
 
 
 def is_scored(folder: Path) -> bool:
-    """Returns whether a folder is that of an evaluation or a ranking."""
-    return any((folder / name).is_file() for name in (RANKING, EVALUATION))
+    """Returns whether a folder holds rollouts that an installed package knows how to show."""
+    return _reader(folder) is not None
 
 
 def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
-    """Yields the first rollouts of an evaluation, or the worst ones of a ranking, up to `count`.
+    """Yields rollouts of an evaluation or a ranking, up to `count`; the ranking's worst first.
 
     Raises:
-        ConfigError: the folder holds neither.
+        ConfigError: the folder holds neither, or its reader cannot be imported.
         EpisodeError: frames cannot be read.
     """
-    if (folder / RANKING).is_file():
-        chosen = [r for r in worst_first(read_results(folder)) if _path(folder, r).is_file()]
-        yield from (_ranked(folder, result) for result in chosen[:count])
-        return
-    for evaluated in read_evaluations(folder):
-        label = evaluated.metrics.get('label') or folder.name
-        for name in sorted(evaluated.results)[:count]:
-            rollout = evaluated.rollout(name)
-            if rollout is not None:
-                yield _evaluated(f'{label}/{name}', rollout, evaluated.results[name])
+    reader = _reader(folder)
+    if reader is None:
+        raise ConfigError(f"'{folder}' is neither an evaluation nor a ranking")
+    yield from reader.scored_rollouts(folder, count)
 
 
-def _path(folder: Path, result: Result) -> Path:
-    return rollout_file(folder, result, FRAMES)
-
-
-def _ranked(folder: Path, result: Result) -> ScoredRollout:
-    course, estimates = result.course, {}
-    words = [(0.0, f'{result.policy}: {verdict(result)}')]
-    if course is not None:
-        estimates = {
-            'imagined': tuple(zip(course.ends, course.imagined, strict=True)),
-            'simulator': tuple(zip(course.ends, course.seen, strict=True)),
-        }
-        words += [(time, f'{what} part') for time, what in when_they_part(course)]
-    rollout = load_rollout(_path(folder, result))
-    last = float(rollout.times[-1])
-    words.append((last, f'imagined {told(result.imagined)}: {"; ".join(result.imagined.reasons)}'))
-    name = f'{result.policy}/{result.task}_{result.index}'
-    return ScoredRollout(name=name, rollout=rollout, estimates=estimates, words=tuple(words))
-
-
-def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:
-    last, said = float(rollout.times[-1]), result.probability
-    text = f'success {said:.2f}' if isfinite(said) else 'abstains'
-    return ScoredRollout(
-        name=name,
-        rollout=rollout,
-        estimates={'imagined': ((last, said),)} if isfinite(said) else {},
-        words=(
-            (0.0, f'{result.task}: recorded {result.outcome}'),
-            (last, f'{text}: {"; ".join(result.reasons)}'),
-        ),
-    )
+def _reader(folder: Path) -> Any:
+    """The registered module that reads such a folder; None = there is none."""
+    if not folder.is_dir():
+        return None
+    # a ranking's folder is one first
+    for _, entry in sorted(registered(ROLLOUTS).items(), reverse=True):
+        module = load(entry)
+        if (folder / module.FILE).is_file():
+            return module
+    return None

@@ -278,7 +278,7 @@ def check_python(words: Sequence[str]) -> bool:
 
 def _script_sources(script: Path) -> str:
     """The script and what its shared options come from."""
-    shared = [*script.parent.glob('*.py'), *(ROOT / 'mtv_world_ros' / 'cli').glob('*.py')]
+    shared = [*script.parent.glob('*.py'), *(ROOT / 'mtv_world_ros').glob('**/cli/*.py')]
     own = script.read_text()
     return own + '\n'.join(
         path.read_text() for path in shared if re.search(rf'from \S*{path.stem} import', own)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_physics, names
+from mtv_world_ros.bench.cli.physics_option import add_physics
+from mtv_world_ros.cli.shared_options import names
 
 
 def add(commands: argparse._SubParsersAction) -> None:

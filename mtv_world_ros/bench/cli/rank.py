@@ -10,17 +10,16 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.bench.cli.physics_option import add_physics, physics_text
 from mtv_world_ros.cli.shared_options import (
     add_checkpoint,
     add_describer,
     add_dtype,
     add_model_options,
     add_overwrite,
-    add_physics,
     add_segmenter,
     add_serving,
     check_model,
-    physics_text,
     pipeline_choices,
     provenance,
     threads_of_workers,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     from mtv_world_ros.data.bag_mapping import EpisodeSource
-    from mtv_world_ros.lab.evaluation.results import StoredRollout
+    from mtv_world_ros.data.stored_rollout import StoredRollout
     from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
     from mtv_world_ros.lab.training.training_run import HeldOut, Judge
     from mtv_world_ros.vision.describers.describer import Describer
@@ -372,8 +372,9 @@ def make_judge(
 
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.data.stored_rollout import load_rollout
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-    from mtv_world_ros.lab.evaluation.results import load_rollout, rollout_path
+    from mtv_world_ros.lab.evaluation.results import rollout_path
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
     from mtv_world_ros.lab.training.training_run import Judged
     from mtv_world_ros.model.lora import ADAPTER

@@ -12,6 +12,7 @@ import time
 import numpy as np
 
 from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.data.stored_rollout import join, save_rollout, StoredRollout
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.lab.evaluation.imagined_stretches import (
@@ -33,14 +34,7 @@ from mtv_world_ros.lab.evaluation.metrics.scores import (
     Truth,
 )
 from mtv_world_ros.lab.evaluation.references import Reconstruct, with_actions
-from mtv_world_ros.lab.evaluation.results import (
-    EpisodeResult,
-    join,
-    rollout_path,
-    save_rollout,
-    stored_stretch,
-    StoredRollout,
-)
+from mtv_world_ros.lab.evaluation.results import EpisodeResult, rollout_path, stored_stretch
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction

@@ -4,17 +4,17 @@ import json
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.lab.evaluation import results
-from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.lab.evaluation.results import (
+from mtv_world_ros.data import stored_rollout
+from mtv_world_ros.data.stored_rollout import (
     join,
     load_rollout,
     MAX_SIDE,
-    rollout_path,
     save_rollout,
     StoredRollout,
 )
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.lab.evaluation.results import rollout_path
 
 VIDEOS = ('real', 'trajectory', 'imagined')
 
@@ -80,7 +80,7 @@ def test_large_frames_are_shrunk_with_their_masks(tmp_path):
 
 
 def test_long_episodes_are_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr(results, 'MAX_FRAMES', 4)
+    monkeypatch.setattr(stored_rollout, 'MAX_FRAMES', 4)
     save_rollout(tmp_path / 'x.npz', rollout(frames=6))
     read = load_rollout(tmp_path / 'x.npz')
     assert read.imagined.shape[1] == len(read.times) == read.j.shape[2] == 4

@@ -7,14 +7,9 @@ import pytest
 
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
+from mtv_world_ros.lab.evaluation.results import compare
 from mtv_world_ros.rendering.images import write_png
-from mtv_world_ros.rendering.video import (
-    compare,
-    Comparison,
-    contact_sheet,
-    side_by_side,
-    write_video,
-)
+from mtv_world_ros.rendering.video import Comparison, contact_sheet, side_by_side, write_video
 
 
 @pytest.fixture

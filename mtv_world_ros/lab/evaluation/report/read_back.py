@@ -10,14 +10,10 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.data.stored_rollout import load_rollout, StoredRollout
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.evaluation.metrics.scores import episode_means
-from mtv_world_ros.lab.evaluation.results import (
-    EpisodeResult,
-    load_rollout,
-    rollout_path,
-    StoredRollout,
-)
+from mtv_world_ros.lab.evaluation.results import EpisodeResult, rollout_path
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 _NEEDED = {'name', 'provenance', 'model', 'views', 'overall', 'tasks', 'failed', 'success'}

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import BoolArray, ByteArray
-from mtv_world_ros.lab.evaluation.results import StoredRollout
 from mtv_world_ros.rendering.video import Comparison, contact_sheet, encode_video, side_by_side
 from mtv_world_ros.vision.jaccard import mean_of_known
 

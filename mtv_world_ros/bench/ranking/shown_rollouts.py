@@ -1,0 +1,53 @@
+"""Rollouts of a ranking, the worst first, for the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from mtv_world_ros.bench.ranking.both_worlds import FRAMES
+from mtv_world_ros.bench.ranking.rollout_cards import (
+    rollout_file,
+    told,
+    verdict,
+    when_they_part,
+    worst_first,
+)
+from mtv_world_ros.bench.ranking.rollout_jobs import Result
+from mtv_world_ros.bench.ranking.run_jobs import read_results
+from mtv_world_ros.data.stored_rollout import load_rollout
+from mtv_world_ros.viewing.scored_rollout import ScoredRollout
+
+#: says that a folder is a ranking's
+FILE = 'ranking.json'
+
+
+def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
+    """Yields the worst rollouts of a ranking whose frames were kept, up to `count`.
+
+    Raises:
+        ConfigError: the folder is no ranking's.
+        EpisodeError: frames cannot be read.
+    """
+    chosen = [r for r in worst_first(read_results(folder)) if _path(folder, r).is_file()]
+    yield from (_ranked(folder, result) for result in chosen[:count])
+
+
+def _path(folder: Path, result: Result) -> Path:
+    return rollout_file(folder, result, FRAMES)
+
+
+def _ranked(folder: Path, result: Result) -> ScoredRollout:
+    course, estimates = result.course, {}
+    words = [(0.0, f'{result.policy}: {verdict(result)}')]
+    if course is not None:
+        estimates = {
+            'imagined': tuple(zip(course.ends, course.imagined, strict=True)),
+            'simulator': tuple(zip(course.ends, course.seen, strict=True)),
+        }
+        words += [(time, f'{what} part') for time, what in when_they_part(course)]
+    rollout = load_rollout(_path(folder, result))
+    last = float(rollout.times[-1])
+    words.append((last, f'imagined {told(result.imagined)}: {"; ".join(result.imagined.reasons)}'))
+    name = f'{result.policy}/{result.task}_{result.index}'
+    return ScoredRollout(name=name, rollout=rollout, estimates=estimates, words=tuple(words))
