@@ -30,6 +30,7 @@ _ORDER = (
     'distill',
     'evaluate',
     'rank',
+    'faults',
     'calibrate',
     'view',
     'own_robot',

@@ -197,7 +197,7 @@ class EpisodeMaker:
             extra['zero_shot'] = job.zero_shot
         policy = self._policy(job, seed)
         if policy is not None:
-            extra['policy'] = policy.name
+            extra |= {'policy': policy.name, 'fault_split': ','.join(policy.splits)}
         try:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:

@@ -3,7 +3,12 @@ from math import isnan, nan
 import numpy as np
 import pytest
 
-from mtv_world_ros.bench.expert.faults.catalogue import FAULTS, kinds_of, parse_variant
+from mtv_world_ros.bench.expert.faults.catalogue import (
+    FAULTS,
+    kinds_of,
+    parse_variant,
+    policies_of,
+)
 from mtv_world_ros.bench.ranking.flip_sheet import flip_sheet
 from mtv_world_ros.bench.ranking.optimism import (
     area_interval,
@@ -16,13 +21,12 @@ from mtv_world_ros.bench.ranking.optimism import (
     read_last_frames,
 )
 from mtv_world_ros.bench.ranking.optimism_tables import optimism_tables
-from mtv_world_ros.bench.ranking.policy_sets import POLICY_SETS
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
 
 
 @pytest.mark.parametrize('split', ['train', 'calibrate', 'test'])
 def test_a_policy_set_covers_its_split_and_no_other(split):
-    names = POLICY_SETS[split]
+    names = policies_of(split)
     kinds = {kind for name in names for kind in parse_variant(name).kinds}
     assert kinds == set(kinds_of(split))
     assert len(names) >= 13 and names[0] == 'expert' and len(set(names)) == len(names)

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mtv_world_ros.bench.expert.faults.drawn import drawn_names, drawn_values, is_drawn
 from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.files import share_path
@@ -77,9 +78,19 @@ def _read() -> dict[str, FaultKind]:
     return kinds
 
 
+class _Catalogue(dict[str, FaultKind]):
+    """Kinds by name; drawn ones are made when they are asked for."""
+
+    def __missing__(self, name: str) -> FaultKind:
+        if not is_drawn(name):
+            raise KeyError(name)
+        return FaultKind(**drawn_values(name))
+
+
 #: kinds by name
-FAULTS: Mapping[str, FaultKind] = _read()
+FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
 _NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, *fault.aliases)}
+_ALL = f"the {len(FAULTS)} kinds that 'mtv-world faults' prints"
 
 
 def kind_named(name: str) -> str:
@@ -88,36 +99,43 @@ def kind_named(name: str) -> str:
     Raises:
         PolicyError: no such kind; the text names the nearest known one.
     """
+    if is_drawn(name):
+        return name
     if name not in _NAMES:
         raise PolicyError(
             f"unknown fault kind '{name}'{nearest(name, _NAMES)}; known are the splits "
-            f'{", ".join(SPLITS)} and the kinds {", ".join(FAULTS)}'
+            f'{", ".join(SPLITS)} and {_ALL}'
         )
     return _NAMES[name]
 
 
 def kinds_named(text: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a split, or of a comma-separated list.
+    """Returns the fault kinds of a split, or of a comma-separated list, as they are called there.
 
     Raises:
         PolicyError: no such split or kind; the text names the nearest known one.
     """
     names = tuple(name.strip() for name in text.split(',') if name.strip())
-    if not names or names[0] in SPLITS:
+    if not names or names[0] in SPLITS or ':' in text:
         return kinds_of(text.strip())
-    return tuple(map(kind_named, names))
+    for name in names:
+        kind_named(name)
+    return names
 
 
 def kinds_of(split: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a split.
+    """Returns the fault kinds of a split, or of `drawn:SEED`.
 
     Raises:
         PolicyError: no such split.
     """
+    word, _, seed = split.partition(':')
+    if word == 'drawn' and seed.isdecimal() and len(seed) < 10:
+        return drawn_names(int(seed))
     if split not in SPLITS:
         raise PolicyError(
             f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
-            f'{", ".join(SPLITS)}'
+            f'{", ".join(SPLITS)} and drawn:SEED'
         )
     return tuple(name for name, kind in FAULTS.items() if kind.split == split)
 
@@ -141,8 +159,7 @@ class PolicyVariant:
     @classmethod
     def of(cls, sizes: Mapping[str, float]) -> PolicyVariant:
         """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
-        order = {kind: number for number, kind in enumerate(FAULTS)}
-        names = sorted(sizes, key=lambda name: order[kind_named(name)])
+        names = in_order(sizes)
         given = ((name, float(sizes[name])) for name in names)
         return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].none))
 
@@ -171,6 +188,12 @@ class PolicyVariant:
         return '-'.join([EXPERT, *(f'{name}-{size:g}' for name, size in self.sizes)])
 
 
+def in_order(names: Iterable[str]) -> list[str]:
+    """Returns names of kinds in the order of the catalogue; drawn kinds follow."""
+    order = {kind: number for number, kind in enumerate(FAULTS)}
+    return sorted(names, key=lambda name: (order.get(kind_named(name), len(order)), name))
+
+
 def parse_variant(text: str) -> PolicyVariant:
     """Returns the variant of a name: `expert`, then any of its faults, each with its size.
 
@@ -178,20 +201,20 @@ def parse_variant(text: str) -> PolicyVariant:
         PolicyError: no such name, a fault twice or without a size, a size out of range.
     """
     name = text.strip()
-    if not re.fullmatch(rf'{EXPERT}(-[a-z_]+-\d*\.?\d+)*', name):
+    if not re.fullmatch(rf'{EXPERT}(-[a-z][a-z_0-9]*-\d*\.?\d+)*', name):
         raise PolicyError(
             f"'{text}' is no scripted policy{_near(name)}; they are called '{EXPERT}', followed "
             f"by faults with their sizes, like '{EXPERT}-joint_noise-0.02' or "
-            f"'{EXPERT}-gripper_delay-0.3-grasp_missed-0.5'; faults are {', '.join(FAULTS)}"
+            f"'{EXPERT}-gripper_delay-0.3-grasp_missed-0.5'; {_ALL}"
         )
     sizes: dict[str, float] = {}
-    for fault, size in re.findall(r'-([a-z_]+)-([\d.]+)', name):
-        if fault not in _NAMES:
+    for fault, size in re.findall(r'-([a-z][a-z_0-9]*)-([\d.]+)', name):
+        if fault not in _NAMES and not is_drawn(fault):
             raise PolicyError(
                 f"policy '{text}': unknown fault '{fault}'{nearest(fault, _NAMES)}; known are "
-                f'{", ".join(FAULTS)}'
+                f'{_ALL}'
             )
-        if _NAMES[fault] in map(kind_named, sizes):
+        if kind_named(fault) in map(kind_named, sizes):
             raise PolicyError(f"policy '{text}': fault '{fault}' is given twice")
         sizes[fault] = float(size)
     PolicyVariant(tuple(sizes.items()))  # sizes that mean no fault are checked, too
@@ -216,7 +239,11 @@ def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVarian
 
 
 def policies_of(split: str) -> tuple[str, ...]:
-    """Returns the policies of a ranking: the expert, and kinds of a split in their sizes."""
+    """Returns the policies of a ranking: the expert, and kinds of a split in their sizes.
+
+    Raises:
+        PolicyError: no such split.
+    """
     faults = ((kind, size) for kind in kinds_of(split) for size in FAULTS[kind].ranked)
     return (EXPERT, *(PolicyVariant.of({kind: size}).name for kind, size in faults))
 

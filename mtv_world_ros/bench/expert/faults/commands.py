@@ -194,7 +194,7 @@ def jump(
     c: Commands, size: float, rng: Rng, *, between: Sequence[float], back: bool, seconds: float
 ) -> FloatArray:
     """Once, between shares of the plan, it jumps ahead or back [s], within some seconds."""
-    at = int(float(_own(rng).uniform(*between)) * len(c.positions))
+    at = int(float(_own(rng).uniform(between[0], between[1])) * len(c.positions))
     to = max(at - c.num(size), 0) if back else at + c.num(size)
     rest = _blended(c.positions[at - 1], c.positions[to:], c.num(seconds))
     return np.concatenate([c.positions[:at], rest])

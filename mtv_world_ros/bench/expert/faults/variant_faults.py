@@ -113,13 +113,14 @@ def with_faults(
     commands = Commands(np.array(plan.positions), float(plan.times[1] - plan.times[0]), robot)
     order = list(COMMANDS)
     steps = [
-        (order.index(name), size, options)
+        (order.index(name), size * options.get('scale', 1.0), options)
         for kind, size in variant.faults
         for step in FAULTS[kind].commands
         for name, options in step.items()
     ]
     for number, size, options in sorted(steps, key=lambda step: step[0]):
-        commands = commands.at(COMMANDS[order[number]](commands, size, rng, **options))
+        given = {key: value for key, value in options.items() if key != 'scale'}
+        commands = commands.at(COMMANDS[order[number]](commands, size, rng, **given))
     return JointTrajectory(
         joint_names=plan.joint_names,
         times=commands.times,
