@@ -16,7 +16,7 @@ MARKER = f'resource/{PACKAGE}'
 #: modules of commands on each floor
 GROUND_COMMANDS = ('imagine', 'view')
 LAB_COMMANDS = (
-    'calibrate', 'datasets', 'demo', 'distill', 'evaluate', 'fit_contact', 'import_weights',
+    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'import_weights',
     'own_robot', 'train', 'train_motion',
 )  # fmt: skip
 BENCH_COMMANDS = ('collect', 'faults', 'rank')
@@ -57,6 +57,7 @@ setup(
         'lz4>=4.3',
         'mcap>=1.6',
         'mcap-ros2-support>=0.6',
+        'mujoco>=4.0,<5',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pin>=4.1,<5',
@@ -88,8 +89,8 @@ setup(
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
         # `mtv-world rank --ray`: rollouts on a Ray cluster; pulls no torch.
         'rank': ['ray>=2.60,<3'],
-        # The simulator; it also needs an OpenGL library, see docs/installation.md.
-        'sim': ['mujoco>=4.0,<5'],
+        # The simulator needs nothing more but an OpenGL library, see docs/installation.md.
+        'sim': [],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
         'ros': [
             f'{name}; sys_platform == "linux" and platform_machine == "x86_64"'

@@ -28,31 +28,19 @@ from mtv_world_ros.files import content_digest
 ROOT = Path(__file__).resolve().parents[1]
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
-    'batching': ('mtv_world_ros/model',),
     'camera_calibration': ('mtv_world_ros/lab/inspection',),
-    'collect': ('mtv_world_ros/bench',),
     'control_representations': ('mtv_world_ros/lab/training', 'mtv_world_ros/model'),
-    'denoising_steps': ('mtv_world_ros/model/sampler.py',),
     'doctor': ('mtv_world_ros/lab/inspection',),
-    'distillation': ('mtv_world_ros/lab/training', 'mtv_world_ros/model'),
-    'evaluation': ('mtv_world_ros/lab/evaluation',),
     'foresight': ('mtv_world_ros/ros',),
-    'found_again': ('mtv_world_ros/geometry/solids.py',),
-    'forward_kinematics': ('mtv_world_ros/geometry',),
     'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),
     'learned_policies': ('mtv_world_ros/bench', 'mtv_world_ros/policies'),
-    'long_rollouts': ('mtv_world_ros/model',),
     'outcome_sensitivity': ('mtv_world_ros/bench',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
     'ros_overhead': ('mtv_world_ros/ros',),
-    'ros_publishing': ('mtv_world_ros/ros',),
-    'recorder_faults': ('mtv_world_ros/ros/bags', 'mtv_world_ros/data/bag'),
     'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
-    'self_rollout': ('mtv_world_ros/lab/training',),
     'serving': ('mtv_world_ros/model',),
     'sim_tasks': ('mtv_world_ros/bench',),
-    'task_agreement': ('mtv_world_ros/success', 'mtv_world_ros/bench'),
     'training_speed': ('mtv_world_ros/lab/training',),
     'trajectory_video': ('mtv_world_ros/rendering',),
     'wan': ('mtv_world_ros/model',),
@@ -60,9 +48,12 @@ DESCRIBES = {
 }
 #: kinds of pages whose numbers are a checkpoint's; by default the bundled one's
 OF_A_CHECKPOINT = (
-    'batching', 'denoising_steps', 'evaluation', 'foresight', 'learned_policies',
-    'policy_in_the_loop', 'ros_overhead', 'serving',
-)  # fmt: skip
+    'foresight',
+    'learned_policies',
+    'policy_in_the_loop',
+    'ros_overhead',
+    'serving',
+)
 _MADE = re.compile(
     r'^Made at commit `(\w+)(\+?)`, (?:no checkpoint|(\w+) checkpoint `(\w+)`)\. '
     r'Describes: (.+)\.$',

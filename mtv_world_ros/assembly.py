@@ -14,6 +14,7 @@ from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.parallel import threads_each
 from mtv_world_ros.pipeline import Pipeline, WorldModel
@@ -36,6 +37,7 @@ from mtv_world_ros.success.calibration import (
 )
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
+from mtv_world_ros.vision.camera_check import CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, InstructionDescriber
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -110,6 +112,7 @@ def load_pipeline(
     calibrated: bool = True,
     adapter: Path | None = None,
     foresight: bool = True,
+    camera_check: bool = True,
 ) -> Pipeline:
     """Loads a checkpoint and puts the main path together around it.
 
@@ -131,12 +134,14 @@ def load_pipeline(
         adapter: LoRA adapter to use in place of the checkpoint's own.
         foresight: foresee where objects go, where the checkpoint can; False = the paper's way:
             trails and first masks alone are drawn, and pictures alone decide.
+        camera_check: compare the first pictures of an episode with the arm's outline, correct
+            small errors of the calibration and refuse a verdict on large ones.
 
     Raises:
         CheckpointError, ConfigError, RobotError: see their messages.
     """
+    from mtv_world_ros.foresight.loading import load_foresight
     from mtv_world_ros.model.checkpoint import load_checkpoint
-    from mtv_world_ros.model.object_motion.predictor import load_predictor
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
     from mtv_world_ros.model.serving.serving_options import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -149,9 +154,9 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
-    motion = None  # its helpers start while the world model is loaded
+    motion = None
     if foresight and loaded.object_motion is not None:
-        motion = load_predictor(loaded.object_motion, model, num_threads or threads_each(1))
+        motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
@@ -170,6 +175,7 @@ def load_pipeline(
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
         object_motion=motion,
+        camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
     )
 
 
@@ -185,6 +191,7 @@ def assemble(
     calibration: Calibration | None = None,
     horizon: HorizonCurve | None = None,
     object_motion: ObjectMotionModel | None = None,
+    camera_checker: CameraChecker | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
     segmenter = segmenter or assemble_segmenter()
@@ -203,6 +210,7 @@ def assemble(
         describer=describer,
         horizon=horizon,
         object_motion=object_motion,
+        camera_checker=camera_checker,
     )
 
 

@@ -26,7 +26,7 @@ import zlib
 import numpy as np
 import yaml
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import CheckpointError, ConfigError
 
 PREFIX = 'MTV_WORLD_MAX_'
 #: plain YAML values may be numbers, whose digits cost quadratic time
@@ -224,6 +224,33 @@ def _array(data: bytes) -> np.ndarray:
         raise ValueError(f'an array of shape {shape} and type {dtype} in {len(data)} bytes')
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def check_finite(tensor: Any, name: str, file: Path) -> None:
+    """Checks that a tensor of torch holds finite numbers: what others give would be believed.
+
+    Raises:
+        CheckpointError: it does not.
+    """
+    if not tensor.is_floating_point() or tensor.numel() == 0:
+        return
+    # one value that is not finite is felt by the sum, which takes half the time of looking at
+    # each; a sum alone may be too large, and formats of 8 bits have none
+    values = tensor.float() if tensor.element_size() < 2 else tensor
+    if math.isfinite(float(values.sum())):
+        return
+    wrong = int((~values.isfinite()).sum())
+    if wrong:
+        raise CheckpointError(
+            f"tensor '{name}' of '{file}' holds {wrong} of {tensor.numel()} values that are no "
+            'finite numbers; copy the file again, or train or export it anew'
+        )
+
+
+def check_weights(model: Any, folder: Path) -> None:
+    """Checks the tensors of a module of torch; see `check_finite`."""
+    for name, tensor in model.state_dict().items():
+        check_finite(tensor, name, folder)
 
 
 def parse_yaml(text: str | bytes) -> Any:

@@ -6,7 +6,8 @@ Defaults, ranges and descriptions stand in its fields and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 import re
 from typing import Annotated, Any, ClassVar, Self, TYPE_CHECKING, TypeVar
@@ -56,9 +57,26 @@ def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidato
 #: a YAML list
 ListOf = Annotated[tuple[Item, ...], Strict(False)]
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[float, float], Strict(False), expected('a list of 2 numbers')]
+#: [m]; what is further away is a mistake of the unit, or worse
+Metres = Annotated[float, Field(ge=-100, le=100)]
 Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]
+
+
+#: no length, time, count or weight in any unit that files use is larger; seeds and stamps are
+_VAST = 1e10
+
+
+def _vast(value: Any) -> Iterator[float]:
+    """Yields the numbers with a fraction that are beyond `_VAST`, in lists and maps as well."""
+    if isinstance(value, float) and abs(value) > _VAST:
+        yield value
+    elif isinstance(value, Mapping):
+        yield from chain.from_iterable(map(_vast, value.values()))
+    elif isinstance(value, tuple | list):
+        yield from chain.from_iterable(map(_vast, value))
 
 
 class Schema(BaseModel):
@@ -97,6 +115,16 @@ class Schema(BaseModel):
                     f"unknown key '{key}'{nearest(str(key), known)}; known are {', '.join(known)}"
                 )
         return values
+
+    @model_validator(mode='after')
+    def _has_no_vast_number(self) -> Self:
+        for name in type(self).model_fields:
+            found = next(_vast(getattr(self, name)), None)
+            if found is not None:
+                raise ValueError(
+                    f"'{name}' holds {found:g}; no number here is beyond {_VAST:g} either way"
+                )
+        return self
 
     def replace(self, **changes: Any) -> Self:
         """Returns a copy with changed values.

@@ -25,6 +25,8 @@ ByteArray = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
 
 #: distortion models of sensor_msgs/CameraInfo and how many coefficients OpenCV reads for each
+#: of a camera from the link that carries it [m]
+FARTHEST_M = 1000.0
 DISTORTION_MODELS = {
     'none': (0,),
     'plumb_bob': (4, 5),
@@ -103,6 +105,11 @@ class CameraModel:
                     f"camera '{self.view}' has {name} {getattr(self, name).tolist()}; every value "
                     'must be finite'
                 )
+        if (np.abs(self.T_mount_camera[:3, 3]) > FARTHEST_M).any():
+            raise CalibrationError(
+                f"camera '{self.view}' is at {self.T_mount_camera[:3, 3].tolist()} m from "
+                f"'{self.mount_link}'; no camera is further away than {FARTHEST_M:g} m"
+            )
         if not (np.isfinite(self.K).all() and self.K[0, 0] > 0 and self.K[1, 1] > 0):
             raise CalibrationError(
                 f"camera '{self.view}' is not calibrated: K = {self.K.tolist()}; fx and fy must "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from math import ceil
 from types import MappingProxyType
@@ -24,32 +24,31 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import RolloutPreempted
-from mtv_world_ros.geometry.camera import camera_poses, tools_in_view
-from mtv_world_ros.geometry.object_motion import (
-    FoundObjects,
-    ObjectMotionModel,
-    TrackedObjects,
-)
+from mtv_world_ros.foresight.episode_objects import Majority, ObjectForesight
+from mtv_world_ros.geometry.camera import tools_in_view
+from mtv_world_ros.geometry.chunk_plan import ChunkPlan
+from mtv_world_ros.geometry.object_motion import ObjectMotionModel
+from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.prediction import mean_of_seeds, Prediction, StageClock
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
-from mtv_world_ros.rollout_state import ChunkPlan, fit_observation, RolloutState
+from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
+from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
-from mtv_world_ros.success.foreseen import foreseen_of, ForeseenMotions
+from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
+from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
 SEED_STEP = 1_000_003
-#: objects are foreseen so far at once, before the first chunk of it is imagined [s]
-_FORESEEN_S = 12.0
 #: of an estimate for which the model was shown no motion
 _UNSEEN = 'no view shows a tool at any time'
 
@@ -113,6 +112,7 @@ class Pipeline:
         horizon: how J falls with the horizon, where it was measured.
         object_motion: where objects go, for models whose trajectory videos show that; None = the
             trajectory video shows them where they were.
+        camera_checker: compares the first pictures with the arm's outline; None = nothing does.
     """
 
     robot: RobotModel
@@ -125,6 +125,7 @@ class Pipeline:
     describer: Describer | None = None
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
+    camera_checker: CameraChecker | None = None
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -133,10 +134,11 @@ class Pipeline:
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
         """Returns the same for a robot of the same joints and tools, e.g. a calibrated one."""
-        motion = self.object_motion
+        motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
             robot=robot,
+            camera_checker=None if checker is None else checker.with_robot(robot),
             object_motion=None if motion is None else motion.with_robot(robot),
         )
 
@@ -163,8 +165,12 @@ class Pipeline:
         Raises:
             ObservationError: the views are not the model's.
         """
+        checker = self.camera_checker
+        check = CameraCheck() if checker is None else checker.check(observation)
+        observation = check.corrected_observation(observation)
         return ImaginedEpisode(
             pipeline=self,
+            camera_check=check,
             instruction=instruction,
             objects=objects,
             seed=seed,
@@ -172,7 +178,17 @@ class Pipeline:
             num_inference_steps=num_inference_steps,
             limit_tolerance=limit_tolerance,
             should_stop=should_stop,
-            _rollouts=(RolloutState.at(observation, self.spec),),
+            _rollouts=(RolloutState.at(observation, self.spec, self._objects_in(observation)),),
+        )
+
+    def _objects_in(self, observation: Observation) -> ObjectForesight:
+        """The objects of an episode that begins at an observation."""
+        return ObjectForesight(
+            model=self.object_motion if self.rendering.object_motion else None,
+            segmenter=self.segmenter,
+            robot=self.robot,
+            first=observation,
+            source=observation,
         )
 
     def draw(
@@ -230,6 +246,7 @@ class ImaginedEpisode:
         limit_tolerance: joints may exceed their limits by this [rad or m].
         should_stop: asked between denoising steps and between chunks.
         num_chunks: imagined so far.
+        camera_check: what the first pictures say about the cameras, which are corrected by it.
     """
 
     pipeline: Pipeline
@@ -241,9 +258,9 @@ class ImaginedEpisode:
     limit_tolerance: float
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
+    camera_check: CameraCheck = CameraCheck()
     _rollouts: tuple[RolloutState, ...]
     _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     @property
     def observation(self) -> Observation:
@@ -263,7 +280,7 @@ class ImaginedEpisode:
             self._described[self.instruction] = name_objects(
                 self.instruction,
                 describer=self.pipeline.describer,
-                first_frame=lambda: self._rollouts[0].first.frames[0],
+                first_frame=lambda: self._rollouts[0].objects.first.frames[0],
             )
         return self._described[self.instruction]
 
@@ -282,15 +299,14 @@ class ImaginedEpisode:
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
-        plans = self._plan_chunks(trajectory)
-        for plan in plans:
+        for plan in self._plan_chunks(trajectory):
             if plan.chunk:
                 self._check_stop()
             # rollouts of further seeds branch off from the first one
             states = (self._rollouts + self._rollouts[:1] * self.num_seeds)[: self.num_seeds]
             seeds = (self.seed + self.num_chunks + SEED_STEP * r for r in range(self.num_seeds))
             made = [
-                self._imagine_chunk(state, plans[plan.chunk :], seed)
+                self._imagine_chunk(state, plan, seed)
                 for state, seed in zip(states, seeds, strict=True)
             ]
             self._rollouts = tuple(state for _, state in made)
@@ -318,9 +334,14 @@ class ImaginedEpisode:
         masks = self._follow_masks(state, start_masks, frames)
         success, memory = self._judge(state, positions, start_masks, masks, is_real=True)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
-        state = state.after(frames, positions[-1], stamp_ns, spec.num_history, memory)
+        state = state.after(
+            frames, positions[-1], stamp_ns, spec.num_history, memory, state.objects
+        )
+        if cameras is not None:
+            cameras = self.camera_check.corrected(cameras)
         last = replace(state.observation, cameras=cameras or state.observation.cameras)
-        self._rollouts = (replace(state, observation=last, num_imagined=0, source=last),)
+        objects = state.objects.branch(last)
+        self._rollouts = (replace(state, observation=last, num_imagined=0, objects=objects),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
 
     def branch(self, observation: Observation) -> ImaginedEpisode:
@@ -333,15 +354,17 @@ class ImaginedEpisode:
         Raises:
             ObservationError: the views are not the model's.
         """
-        state, before = RolloutState.at(observation, self.pipeline.spec), self._rollouts[0]
-        state = replace(state, memory=before.memory, first=before.first)
-        return replace(self, _rollouts=(state,))
+        observation = self.camera_check.corrected_observation(observation)
+        before = self._rollouts[0]
+        objects = before.objects.branch(observation)
+        state = RolloutState.at(observation, self.pipeline.spec, objects)
+        return replace(self, _rollouts=(replace(state, memory=before.memory),))
 
     def _plan_chunks(self, trajectory: JointTrajectory) -> list[ChunkPlan]:
         """The trajectory on the model's clock, cut into chunks."""
         robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
         trajectory = match_joints(trajectory, robot, start.positions)
-        check_positions(robot, trajectory.positions, tolerance=self.limit_tolerance)
+        check_plan(robot, trajectory, start.positions, tolerance=self.limit_tolerance)
         total = max(1, ceil(float(trajectory.times[-1]) * spec.fps - 1e-6))
         num_chunks = ceil(total / spec.num_frames)
         times = np.arange(num_chunks * spec.num_frames + 1) / spec.fps
@@ -365,22 +388,30 @@ class ImaginedEpisode:
             raise RolloutPreempted('stopped between two chunks')
 
     def _imagine_chunk(
-        self, state: RolloutState, plans: Sequence[ChunkPlan], seed: int
+        self, state: RolloutState, plan: ChunkPlan, seed: int
     ) -> tuple[Prediction, RolloutState]:
         """One chunk of one rollout, stage by stage, and where the rollout stands then.
 
         Args:
             state: where it stands.
-            plans: what is left of the trajectory, the chunk first.
+            plan: the chunk.
             seed: of the noise.
         """
-        plan = plans[0]
         pipeline, start, clock = self.pipeline, state.observation, StageClock()
         num_steps = self.num_inference_steps or pipeline.spec.num_inference_steps
         shown = [tools_in_view(c, pipeline.robot, plan.positions) for c in start.cameras]
         start_masks = self._find_start_masks(state)
         clock.lap('start masks')
-        pictures, ahead = self._move_objects(state, plans, start_masks)
+        objects = state.objects.foresee(
+            plan,
+            start,
+            self.names,
+            start_masks,
+            self._majority(state),
+            state.is_begun,
+            self.should_stop,
+        )
+        pictures = objects.pictures(plan, start)
         clock.lap('object motion')
         control = pipeline.draw(start.cameras, plan.positions, plan.times, start_masks, pictures)
         clock.lap('trajectory video')
@@ -397,14 +428,15 @@ class ImaginedEpisode:
         masks = self._follow_masks(state, start_masks, frames)
         clock.lap('masks')
         positions = plan.positions[: plan.num_frames + 1]
-        success, memory = self._judge(state, positions, start_masks, masks, *ahead[:1])
-        if not any(shown):
-            success = replace(success, reasons=(*success.reasons, _UNSEEN))
+        foreseen = objects.motions(plan, state.is_begun)
+        success, memory = self._judge(state, positions, start_masks, masks, foreseen)
+        unseen = () if any(shown) else (_UNSEEN,)
+        success = replace(success, reasons=(*success.reasons, *objects.reasons, *unseen))
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
         state = state.after(
-            frames, positions[-1], stamp_ns, pipeline.spec.num_history, memory, ahead
+            frames, positions[-1], stamp_ns, pipeline.spec.num_history, memory, objects
         )
         prediction = Prediction(
             start=start,
@@ -427,98 +459,6 @@ class ImaginedEpisode:
         )
         return prediction, state
 
-    def _move_objects(
-        self, state: RolloutState, plans: Sequence[ChunkPlan], start_masks: ObjectMasks
-    ) -> tuple[ByteArray | None, tuple[FoundObjects, ...]]:
-        """Pictures (V, 1 + T, H, W, 4) of the objects on their way, and the objects after a plan.
-
-        None where the model is not shown them. The objects are those after each of the `plans`,
-        or of the first ones of them.
-        """
-        pipeline, plan = self.pipeline, plans[0]
-        if pipeline.object_motion is None or not pipeline.rendering.object_motion:
-            return None, ()
-        poses = self._camera_poses(plan.positions, state.observation.cameras)
-        ahead = state.ahead
-        if plan.chunk == 0 or not ahead or ahead[0].names != self.names:
-            objects = state.objects
-            if objects is None or objects.names != self.names:
-                objects = self._find_objects(state, start_masks)
-            plans = plans[: ceil(_FORESEEN_S / float(plan.times[-1] - plan.times[0]))]
-            ahead = objects.foresee(self._commands(plans, objects.tracked))
-            shown = ahead[-1].medoid(self._believed(state, plans[-1], ahead[-1]))
-            shows = [objects.shown, *[shown] * len(ahead)]
-            ahead = tuple(
-                replace(part, shown=shown, shown_before=before)
-                for part, before in zip(ahead, shows, strict=False)
-            )
-        times = plan.times - plan.times[0]
-        return ahead[0].pictures(times, state.observation.cameras, poses), ahead
-
-    def _commands(
-        self, plans: Sequence[ChunkPlan], objects: TrackedObjects
-    ) -> Iterator[FloatArray]:
-        """The joints of plans, as finely as objects are tracked."""
-        for number, plan in enumerate(plans):
-            if number:
-                self._check_stop()
-            yield plan.fine_positions(objects.step_s, objects.commands_a_step)
-
-    def _find_objects(self, state: RolloutState, start_masks: ObjectMasks) -> FoundObjects:
-        """The named objects where the rollout stands."""
-        # at its own size the real frame shows better where they are; where the names have
-        # changed only an imagined frame shows where they are now
-        source = state.source if state.objects is None else state.observation
-        if source is state.first:
-            return self._find_whole(source, start_masks)
-        frames, masks = state.observation.frames, start_masks.masks[:, :, 0]
-        if state.objects is not None:
-            return self._found(source, frames, masks)
-        return self._found(source, frames, masks, self._find_whole(state.first))
-
-    def _find_whole(
-        self, first: Observation, start_masks: ObjectMasks | None = None
-    ) -> FoundObjects:
-        """The named objects in the episode's first real frame, in which they count as whole."""
-        if self.names not in self._whole:
-            frames = fit_observation(first, self.pipeline.spec).frames
-            if start_masks is None:
-                start_masks = self.pipeline.segmenter.segment(frames[:, None], self.names)
-            found = self._found(first, frames, start_masks.masks[:, :, 0])
-            self._whole[self.names] = replace(found, is_whole=True)
-        return self._whole[self.names]
-
-    def _found(
-        self,
-        source: Observation,
-        frames: ByteArray,
-        masks: BoolArray,
-        whole: FoundObjects | None = None,
-    ) -> FoundObjects:
-        """Objects of masks (V, O, H, W) in frames (V, H, W, 3), of the model's size.
-
-        Args:
-            source: the same frames as large as there are.
-            frames: they.
-            masks: in them.
-            whole: the same objects when nothing hid them; None = now.
-        """
-        model, names = self.pipeline.object_motion, self.names
-        assert model is not None
-        sharp = self.pipeline.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]
-        poses = self._camera_poses(source.positions[None], source.cameras)[:, 0]
-        given = names, sharp, source.cameras, list(poses)
-        if whole is None:
-            return FoundObjects.at(names, frames, masks, poses, model.find(*given))
-        tracked, same, hidden = model.find_again(whole.tracked, *given)
-        found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
-        return replace(found, is_whole=bool(same.all()))
-
-    def _camera_poses(self, positions: FloatArray, cameras: Sequence[CameraModel]) -> FloatArray:
-        """(V, N, 4, 4) T_base_camera of V cameras at positions (N, J)."""
-        robot = self.pipeline.robot
-        return np.stack([camera_poses(camera, robot, positions) for camera in cameras])
-
     def _find_start_masks(self, state: RolloutState) -> ObjectMasks:
         """Masks of the frame that a chunk starts from (T = 1)."""
         return self.pipeline.segmenter.segment(state.observation.frames[:, None], self.names)
@@ -540,47 +480,24 @@ class ImaginedEpisode:
         positions: FloatArray,
         start_masks: ObjectMasks,
         masks: ObjectMasks,
-        objects: FoundObjects | None = None,
+        foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
     ) -> Judged:
-        """The estimate after a chunk with joints at (1 + T, J), and what it remembers.
-
-        `objects` are those at the end of the whole chunk, of which T frames may be left; of real
-        frames there are none.
-        """
-        pipeline = self.pipeline
-        footage = footage_of(
-            pipeline.robot, state.observation.cameras, positions, start_masks, masks
-        )
-        num_left = pipeline.spec.num_frames - footage.num_frames
-        foreseen = None if objects is None else self._foreseen(state, objects, num_left)
-        return pipeline.estimator.estimate(
+        """The estimate after a chunk with joints at (1 + T, J), and what it remembers."""
+        pipeline, cameras = self.pipeline, state.observation.cameras
+        footage = footage_of(pipeline.robot, cameras, positions, start_masks, masks)
+        judged = pipeline.estimator.estimate(
             footage, self.instruction, state.memory, foreseen, is_real=is_real
         )
+        check = self.camera_check
+        return judged._replace(estimate=doubted(judged.estimate, check.notes, check.refusal))
 
-    def _foreseen(
-        self, state: RolloutState, objects: FoundObjects, num_left: int
-    ) -> ForeseenMotions | None:
-        """Motions until the end of a chunk without its last frames; None = they do not count."""
-        # where the rollout began earlier, objects may have been found half hidden, or in a grip
-        begun = state.memory is None or state.memory.num_frames == 1 + state.num_imagined
-        if not begun and not objects.is_whole:
-            return None
-        left_s = num_left / self.pipeline.spec.fps
-        num = len(objects.motions[0].points) - round(left_s / objects.tracked.step_s)
-        return foreseen_of(self.pipeline.robot, objects, num, is_begun=begun)
+    def _majority(self, state: RolloutState) -> Majority:
+        """Says which futures end as most do, so that pictures and the estimate say the same."""
 
-    def _believed(
-        self, state: RolloutState, plan: ChunkPlan, objects: FoundObjects
-    ) -> BoolArray | None:
-        """Which motions (K,) end a plan as the most of them do; None = they do not tell.
+        def as_most(motions: ForeseenMotions) -> BoolArray | None:
+            ends = self.pipeline.estimator.foresee(motions, self.instruction, state.memory)
+            return None if ends is None else ends.as_most
 
-        So pictures and the estimate say the same.
-        """
-        num_left = len(plan.times) - 1 - plan.num_frames
-        foreseen = self._foreseen(state, objects, num_left)
-        if foreseen is None:
-            return None
-        ends = self.pipeline.estimator.foresee(foreseen, self.instruction, state.memory)
-        return None if ends is None else ends.as_most
+        return as_most

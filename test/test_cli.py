@@ -38,6 +38,14 @@ def test_help_does_not_load_the_model(tmp_path: Path) -> None:
         assert command in done.stdout.decode()
 
 
+def test_a_command_that_left_says_where_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(['distill', 'bundled', 'data/sim', '--out', 'x'])
+    said = capsys.readouterr().err
+    assert end.value.code == 2
+    assert "'distill' is no longer a command" in said and 'version 0.1.0 has it' in said
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [

@@ -27,7 +27,6 @@ _ORDER = (
     'train',
     'train_motion',
     'fit_contact',
-    'distill',
     'evaluate',
     'rank',
     'faults',
@@ -37,6 +36,8 @@ _ORDER = (
     'datasets',
     'import_weights',
 )
+#: commands that left, and the last version that has them
+_REMOVED = {'distill': '0.1.0'}
 _ADVICE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -87,6 +88,11 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     if words and not words[0].startswith('-') and words[0] not in commands.choices:
         known = list(commands.choices)
+        if words[0] in _REMOVED:
+            parser.error(
+                f"'{words[0]}' is no longer a command: no measurement showed its worth; version "
+                f'{_REMOVED[words[0]]} has it. Commands are {", ".join(known)}'
+            )
         parser.error(
             f"there is no command '{words[0]}'{nearest(words[0], known)}; commands are "
             f'{", ".join(known)}'

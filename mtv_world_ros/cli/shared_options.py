@@ -15,7 +15,17 @@ if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
 
 #: options that are arguments of `load_pipeline`
-_CHOICES = ('robot', 'task', 'device', 'dtype', 'segmenter', 'serving', 'adapter', 'foresight')
+_CHOICES = (
+    'robot',
+    'task',
+    'device',
+    'dtype',
+    'segmenter',
+    'serving',
+    'adapter',
+    'foresight',
+    'camera_check',
+)
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +41,12 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         action='store_false',
         help="the paper's way: trails and first masks are drawn, no object motion is foreseen, "
         'and pictures alone decide',
+    )
+    parser.add_argument(
+        '--no-camera-check',
+        dest='camera_check',
+        action='store_false',
+        help="do not compare the first pictures with the arm's outline, nor correct the cameras",
     )
     parser.add_argument(
         '--steps',

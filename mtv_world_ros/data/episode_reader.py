@@ -45,12 +45,14 @@ from mtv_world_ros.data.episode import (
     parse_info,
     Track,
 )
+from mtv_world_ros.data.joint_plans import complete_plans, following, join_streams, read_plan
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.camera import scaled, unknown_camera, with_camera_info
+from mtv_world_ros.geometry.camera import unknown_camera, with_camera_info
+from mtv_world_ros.geometry.image_window import ImageWindow, WHOLE, window_of, windowed_camera
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 __all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
@@ -367,12 +369,30 @@ class _EpisodeReader:
         good: Stamped = []
         for stamp, message in self._take(topic, messages.JOINT_TRAJECTORY):
             try:
-                parsed = messages.parse_joint_trajectory(message)
-                names = self._renamed(parsed.joint_names)
-                good.append((stamp, replace(parsed, joint_names=names)))
+                plan = read_plan(message)
+                good.append((stamp, replace(plan, joint_names=self._renamed(plan.joint_names))))
             except MtvWorldError as error:
                 self._refuse(topic, error)
-        return in_order(topic, good, self.warnings)
+        return self._whole_plans(topic, in_order(topic, good, self.warnings), states)
+
+    def _whole_plans(self, topic: str, plans: Stamped, states: JointStates | None) -> Stamped:
+        """Plans of all joints of the robot; those of one point are joined."""
+        chunk_s = self.mapping.chunk_s
+        plans, count = join_streams(plans, chunk_s)
+        if count:
+            self._warn_once(
+                f"'{topic}': {count} trajectories of one point are a stream of commands and were "
+                f'joined into plans of {chunk_s:g} s'
+            )
+        if self.robot is None or self.mapping.tools:
+            return plans
+        whole = complete_plans(plans, states, self.robot, chunk_s)
+        if whole.taken:
+            self._warn_once(
+                f"'{topic}': trajectories leave out joints {', '.join(whole.taken)}; their "
+                'measured positions stand in for commands'
+            )
+        return whole.plans
 
     def _object_poses(self, num_objects: int) -> ObjectPoses | None:
         topic = self.topics.object_poses
@@ -423,9 +443,8 @@ class _EpisodeReader:
             elif not calibration:
                 known[view] = self._moving(known[view], images[view])
             is_given = tree is None and view not in self.unknown
-            camera = self._with_intrinsics(known[view], view, names, is_given=is_given)
-            height, width = images[view].frames[0].shape[:2]
-            cameras[view] = scaled(camera, width, height)
+            size = (images[view].frames[0].shape[1], images[view].frames[0].shape[0])
+            cameras[view] = self._at_images(known[view], view, names, size, is_given=is_given)
         return cameras
 
     def _moving(self, camera: CameraModel, track: Track) -> CameraModel:
@@ -507,14 +526,20 @@ class _EpisodeReader:
         given = row.camera_info if row else ''
         return self.mapping.topic(given) if given else names.camera_info
 
-    def _with_intrinsics(
-        self, camera: CameraModel, view: str, names: ViewTopics, *, is_given: bool
+    def _at_images(
+        self,
+        camera: CameraModel,
+        view: str,
+        names: ViewTopics,
+        size: tuple[int, int],
+        *,
+        is_given: bool,
     ) -> CameraModel:
-        """The camera with the intrinsics of CameraInfo, where a file has not given others."""
+        """The camera for images of a size, by CameraInfo where a file has not given others."""
         topic = self._camera_info(view, names)
         infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
         if not infos:
-            return camera
+            return self._windowed(camera, size)
         rectified = '/image_rect' in names.image
         infos = [_rectified(info) for info in infos] if rectified else infos
         first = _intrinsics(infos[0])
@@ -524,7 +549,7 @@ class _EpisodeReader:
                     f"'{self.path}': '{topic}' changes at message {index}, from {first} to "
                     f'{_intrinsics(info)}; cut the episode there'
                 )
-        width, height, k, model, distortion = first
+        width, height, k, model, distortion, window = first
         informed = with_camera_info(
             camera,
             width=width,
@@ -533,15 +558,27 @@ class _EpisodeReader:
             distortion_model=model,
             distortion=distortion,
         )
-        given = scaled(camera, width, height)
-        apart = np.abs(given.K - informed.K)[:2] / informed.K[0, 0]
-        if not is_given or apart.max() < _SAME_K:
-            return informed
+        seen = self._windowed(informed, size, window)
+        if not is_given:
+            return seen
+        is_full = (camera.width, camera.height) == (width, height)
+        given = self._windowed(camera, size, window if is_full else WHOLE)
+        apart = np.abs(given.K - seen.K)[:2] / seen.K[0, 0]
+        if apart.max() < _SAME_K:
+            return seen
         self._warn_once(
             f"view '{view}': the calibration file has fx, fy, cx, cy = {_four(given.K)} px, "
-            f"CameraInfo {_four(informed.K)} px; the file's are used"
+            f"CameraInfo {_four(seen.K)} px; the file's are used"
         )
         return given
+
+    def _windowed(
+        self, camera: CameraModel, size: tuple[int, int], window: ImageWindow = WHOLE
+    ) -> CameraModel:
+        sized, note = windowed_camera(camera, *size, window)
+        if note:
+            self._warn_once(note)
+        return sized
 
     def _refuse(self, topic: str, error: MtvWorldError) -> None:
         self.refused.setdefault(topic, []).append(str(error))
@@ -576,9 +613,11 @@ def _four(K: FloatArray) -> str:
     return ', '.join(f'{v:.1f}' for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
-def _intrinsics(info: Any) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...]]:
+def _intrinsics(
+    info: Any,
+) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...], ImageWindow]:
     k, d = tuple(info.k.tolist()), tuple(info.d.tolist())
-    return info.width, info.height, k, info.distortion_model, d
+    return info.width, info.height, k, info.distortion_model, d, window_of(info)
 
 
 def _rectified(info: Any) -> Any:
@@ -765,35 +804,6 @@ def in_order(
         repeated = len(given) - len(kept)
         warnings.append(f"'{topic}': {repeated} stamps came twice; the later message was kept")
     return list(kept.items())
-
-
-def following(states: JointStates, chunk_s: float, start_ns: int) -> Stamped:
-    """Positions as commands: each is reached at its own stamp.
-
-    Args:
-        states: positions over time.
-        chunk_s: length of a trajectory [s].
-        start_ns: where the first trajectory starts: none can be played before there are images.
-
-    Returns:
-        (start stamp [ns], trajectory), each of which ends where the next one starts.
-    """
-    stamps = states.stamps_ns
-    seconds = (stamps - stamps[0]) * 1e-9
-    chunks: Stamped = []
-    first = int(np.searchsorted(stamps, start_ns))
-    while first < len(stamps) - 1:
-        last = int(np.searchsorted(seconds, seconds[first] + chunk_s))
-        last = min(max(last, first + 1), len(stamps) - 1)
-        part = slice(first + 1, last + 1)
-        trajectory = JointTrajectory(
-            joint_names=states.joint_names,
-            times=np.asarray(seconds[part] - seconds[first], np.float64),
-            positions=states.positions[part],
-        )
-        chunks.append((int(stamps[first]), trajectory))
-        first = last
-    return chunks
 
 
 def merge_joint_states(

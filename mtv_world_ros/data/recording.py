@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from mtv_world_ros.bounded_input import parse_json, read_arrays
-from mtv_world_ros.data.bag_mapping import EpisodeSource
+from mtv_world_ros.data.bag_mapping import BagMapping, EpisodeSource
 from mtv_world_ros.data.episode import Episode, MASKS_BY, Track
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.joint_plans import complete_plans
 from mtv_world_ros.data_types import (
     ByteArray,
     CameraModel,
@@ -305,8 +306,9 @@ def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
 
 
 def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:
-    """Returns what was commanded in the robot's joint order; see `stitch`."""
-    matched = [(s, match_joints(t, robot, None)) for s, t in episode.trajectories]
+    """Returns what was commanded in the robot's joint order; see `stitch`, `complete_plans`."""
+    whole = complete_plans(episode.trajectories, episode.joint_states, robot, BagMapping().chunk_s)
+    matched = [(s, match_joints(t, robot, None)) for s, t in whole.plans]
     return stitch(matched, origin_ns)
 
 

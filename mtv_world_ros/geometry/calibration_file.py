@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Strict
+from pydantic import AfterValidator, BeforeValidator, Field, Strict
 import yaml
 
-from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, validated, wrong
+from mtv_world_ros.config import expected, ListOf, Metres, read_yaml, Schema, validated, wrong
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.files import write_whole
@@ -41,7 +41,19 @@ def _rigid(value: Any) -> FloatArray:
     return T
 
 
-_Pixels = Annotated[int, Strict(False), expected('a whole number')]
+def _no_truth(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise wrong('a whole number')
+    return value
+
+
+_Pixels = Annotated[
+    int,
+    Strict(False),
+    Field(ge=1, le=100_000),
+    expected('a whole number from 1 to 100000'),
+    BeforeValidator(_no_truth),
+]
 
 
 class _View(Schema):
@@ -56,7 +68,7 @@ class _View(Schema):
     distortion: ListOf[float] = ()
     mount_link: str
     T_mount_camera: Annotated[Any, AfterValidator(_rigid)] = None
-    position: ListOf[float] = ()
+    position: ListOf[Metres] = ()
     quaternion_xyzw: ListOf[float] = ()
 
     def camera(self, view: str) -> CameraModel:
@@ -96,6 +108,8 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
     views = values.get('views') if isinstance(values, dict) else None
     if not isinstance(views, dict) or list(values) != ['views']:
         raise CalibrationError(f"'{path}' must hold 'views: {{<view>: {{...}}}}' and nothing else")
+    if not views:
+        raise CalibrationError(f"'{path}' has no view; give one for each camera under 'views'")
     return {str(view): _camera(str(view), row, f"'{path}' view '{view}'")
             for view, row in views.items()}  # fmt: skip
 

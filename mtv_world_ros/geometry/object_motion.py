@@ -5,7 +5,7 @@ V views, O objects, T frames, H W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -111,7 +111,14 @@ class TrackedObjects(Protocol):
         """(K, O, 3) their extents in each of the motions, upright [m]."""
         ...
 
-    def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What speaks against what is foreseen, in words."""
+        ...
+
+    def advance(
+        self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
+    ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one; the others, if any, are of places and sizes within
@@ -119,6 +126,10 @@ class TrackedObjects(Protocol):
 
         Args:
             positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            should_stop: asked all the time.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
         """
         ...
 
@@ -221,7 +232,7 @@ class FoundObjects:
         """
         found: list[FoundObjects] = []
         for positions in parts:
-            found.append((found[-1] if found else self)._then(positions))
+            found.append((found[-1] if found else self).after(positions))
         return tuple(found)
 
     def medoid(self, among: BoolArray | None = None) -> int:
@@ -254,8 +265,19 @@ class FoundObjects:
         shown = motion[np.minimum(rows, len(motion.points) - 1)]
         return moved_pictures(self.cuts, shown, cameras, self.poses, poses)
 
-    def _then(self, positions: FloatArray) -> FoundObjects:
-        motions, tracked = self.tracked.advance(positions)
+    def after(
+        self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
+    ) -> FoundObjects:
+        """Returns the objects after a part of a plan, which show the same motion as before.
+
+        Args:
+            positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced.
+            should_stop: asked all the time.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        motions, tracked = self.tracked.advance(positions, should_stop)
         positions = positions[:: self.tracked.commands_a_step]
         if self.positions is None:
             return replace(self, tracked=tracked, motions=motions, positions=positions)

@@ -15,7 +15,7 @@ from torch import nn, Tensor
 import torch.nn.functional as F
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.tensor_files import open_tensors
+from mtv_world_ros.model.tensor_files import read_tensors
 
 _CHANNELS = 16
 _WIDTH = 64
@@ -107,7 +107,7 @@ class TinyAutoencoder(nn.Module):
         with torch.device('meta'):
             made = cls()
         expected = made.state_dict()
-        tensors = {name: stored.read() for name, stored in open_tensors(file).items()}
+        tensors = read_tensors(file)
         for name in expected.keys() ^ tensors.keys():
             what = 'lacks' if name in expected else 'has an unknown tensor'
             raise CheckpointError(f"'{file}' {what} '{name}'; expected taew2_1 of TAEHV")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.config import expected, ListOf, Positive, Schema, validated
+from mtv_world_ros.config import expected, ListOf, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.actions import CONTROLS
@@ -27,6 +27,7 @@ class HistorySettings(Schema):
     num_frames: int = Field(
         default=0,
         ge=0,
+        le=10_000,
         description="N, frames before the chunk's start frame; 0 = no history tokens",
     )
     noise_level: Annotated[float, expected('at least 0 and below 1')] = Field(
@@ -63,8 +64,8 @@ def _known_control(name: str) -> str:
 
 
 def _some_steps(count: int) -> int:
-    if count < 1:
-        raise ValueError(f'num_inference_steps is {count}; it must be at least 1')
+    if not 1 <= count <= 1000:
+        raise ValueError(f'num_inference_steps is {count}; it must be at least 1, at most 1000')
     return count
 
 
@@ -72,10 +73,10 @@ class CheckpointCard(Schema):
     """Contents of `world_model.json`."""
 
     views: ListOf[str]
-    fps: Positive
-    num_frames: int
-    width: int
-    height: int
+    fps: float = Field(ge=0.01, le=1000, description='frames a second')
+    num_frames: int = Field(ge=1, le=10_000, description='of a chunk')
+    width: int = Field(ge=1, le=16_384, description='of a view [px]')
+    height: int = Field(ge=1, le=16_384, description='of a view [px]')
     robot: str
     control: Annotated[str, AfterValidator(_known_control)]
     object_mask: bool
@@ -83,7 +84,7 @@ class CheckpointCard(Schema):
     trained_on: dict[str, Any]
     prompt: str = Field(default='', description='instruction of models with text')
     negative_prompt: str = Field(default='', description='text that guidance leads away from')
-    guidance_scale: float = 1.0
+    guidance_scale: float = Field(default=1.0, ge=0, le=1000)
     num_inference_steps: Annotated[int, AfterValidator(_some_steps)] = Field(
         default=4, description='denoising steps that the model is made for'
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 import shutil
 from typing import Any, cast
@@ -17,7 +18,7 @@ from mtv_world_ros.model.card import CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.tensor_files import disk_errors, open_tensors, PICKLES
+from mtv_world_ros.model.tensor_files import disk_errors, PICKLES, read_tensors
 from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
 
 WEIGHTS = 'diffusion_pytorch_model'
@@ -154,7 +155,7 @@ def _load_autoencoder(folder: Path, dtype: torch.dtype) -> Autoencoder:
 
 def _fill(module: Any, folder: Path) -> None:
     """Replaces the module's meta tensors, which use no memory, by the stored ones."""
-    tensors = {name: stored.read() for name, stored in open_tensors(folder, WEIGHTS).items()}
+    tensors = read_tensors(folder, WEIGHTS)
     try:
         module.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
@@ -168,4 +169,7 @@ def _config(file: Path) -> dict[str, Any]:
         raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
     if not isinstance(values, dict):
         raise CheckpointError(f"'{file}' cannot be loaded: it must hold keys and values")
+    for key, value in values.items():
+        if isinstance(value, float) and not isfinite(value):
+            raise CheckpointError(f"'{file}' has {key} {value}; give a finite number")
     return values

@@ -11,6 +11,7 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
+from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
@@ -71,6 +72,7 @@ class TextEncoder:
             model = transformers.UMT5EncoderModel.from_pretrained(
                 encoder, dtype=self._dtype, local_files_only=True, use_safetensors=True
             )
+            check_weights(model, Path(encoder))
             return (
                 transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True),
                 model.to(device).eval(),
@@ -118,6 +120,7 @@ class ImageEncoder:
             )
         except (OSError, ValueError) as error:
             raise CheckpointError(f"'{folder}' cannot be loaded: {error}") from error
+        check_weights(model, folder)
         return cls(model.eval(), checkpoint)
 
     def to(self, device: torch.device, dtype: torch.dtype, *, stays: bool = True) -> ImageEncoder:

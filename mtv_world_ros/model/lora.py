@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.model.card import CheckpointCard
@@ -230,6 +230,8 @@ class Adapters:
             return {}
         try:
             whole = load_file(file)
+            for name, value in whole.items():
+                check_finite(value, name, file)
         except (OSError, SafetensorError) as error:
             raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
         for name, value in whole.items():

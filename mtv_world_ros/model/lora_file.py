@@ -13,7 +13,7 @@ from pydantic import Field
 from safetensors import safe_open, SafetensorError
 from torch import nn, Tensor
 
-from mtv_world_ros.bounded_input import parse_json, read_json
+from mtv_world_ros.bounded_input import check_finite, parse_json, read_json
 from mtv_world_ros.config import Count, Schema, validated
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
@@ -152,6 +152,8 @@ def _read(file: Path) -> tuple[dict[str, Tensor], LoraSettings | None]:
     try:
         with safe_open(file, framework='pt') as handle:
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+            for name, tensor in tensors.items():
+                check_finite(tensor, name, file)
             text = (handle.metadata() or {}).get(METADATA)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"LoRA '{file}' cannot be loaded: {error}") from error

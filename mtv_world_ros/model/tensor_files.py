@@ -16,7 +16,7 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
@@ -140,13 +140,28 @@ def _open_files(files: list[Path]) -> dict[str, StoredTensor]:
         for name in names:
             if name in tensors:
                 raise CheckpointError(f"tensor '{name}' is in '{file}' and in another shard")
-            tensors[name] = _stored(handle, name)
+            tensors[name] = _stored(handle, name, file)
     return tensors
 
 
-def _stored(handle: Any, name: str) -> StoredTensor:
+def _stored(handle: Any, name: str, file: Path) -> StoredTensor:
     part = handle.get_slice(name)
-    return StoredTensor(tuple(part.get_shape()), part.get_dtype(), lambda: handle.get_tensor(name))
+
+    def read() -> Tensor:
+        tensor: Tensor = handle.get_tensor(name)
+        check_finite(tensor, name, file)
+        return tensor
+
+    return StoredTensor(tuple(part.get_shape()), part.get_dtype(), read)
+
+
+def read_tensors(path: Path, stem: str = '') -> dict[str, Tensor]:
+    """Returns the tensors that `open_tensors` finds, all of them read.
+
+    Raises:
+        CheckpointError: as there, or one holds what is no number.
+    """
+    return {name: stored.read() for name, stored in open_tensors(path, stem).items()}
 
 
 @contextmanager

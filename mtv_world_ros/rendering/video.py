@@ -215,7 +215,8 @@ def encode_video(
             frames may then give another file.
     """
     rate = Fraction(fps).limit_denominator(1000)
-    options = {'crf': str(crf), 'preset': 'veryfast', 'threads': '1'}
+    # bf: frames in the order in which they are shown; Rerun 0.41 plays no others without ffmpeg
+    options = {'crf': str(crf), 'preset': 'veryfast', 'threads': '1', 'bf': '0'}
     if not full_colour:
         # with several threads, or with x264's macroblock tree, the same frames now and then gave
         # another file on a busy machine: 12 of 240 with the tree, 0 of 480 without it (PyAV 18);

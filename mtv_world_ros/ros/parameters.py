@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from textwrap import wrap
 from typing import Annotated, Any, get_args, get_origin, Literal
@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 import yaml
 
 from mtv_world_ros.config import ListOf, Model, Schema
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
 from mtv_world_ros.vision.segmenters.choose import SegmenterName
 
 Span = tuple[float, float]
@@ -49,6 +49,8 @@ def at_start(default: Any, text: str, within: Span | None = None) -> Any:
 
 
 _SECONDS = (0.001, 86400.0)
+#: services that change parameters
+_SET_SERVICES = ('set_parameters', 'set_parameters_atomically')
 
 
 class NodeSettings(Schema):
@@ -103,6 +105,11 @@ class Settings(NodeSettings):
         True,
         "Foresee where objects go, where the checkpoint can; false = the paper's way: trails and "
         'first masks are drawn, and pictures alone decide.',
+    )
+    camera_check: bool = at_start(
+        True,
+        "Compare the first pictures of an episode with the arm's outline, correct small errors of "
+        'the calibration for the episode, and give no verdict on large ones.',
     )
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
@@ -211,7 +218,79 @@ def declare(node: Node, kind: type[Schema]) -> None:
     """
     for name, field in kind.model_fields.items():
         _declare(node, name, field)
-    node.add_on_set_parameters_callback(partial(_check, kind))
+    node.add_on_set_parameters_callback(refusing(partial(_check, node, kind)))
+    for service in node.services:
+        if service.srv_name.rpartition('/')[2] in _SET_SERVICES:
+            service.callback = partial(_answered, service.callback)
+
+
+def refusing(
+    check: Callable[[list[Parameter]], None],
+) -> Callable[[list[Parameter]], SetParametersResult]:
+    """Returns the callback of a check that raises: whatever it raises is why it is refused."""
+
+    def called(changed: list[Parameter]) -> SetParametersResult:
+        try:
+            check(changed)
+        except MtvWorldError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:  # of a file system, a library: the node outlives it
+            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
+        return SetParametersResult(successful=True)
+
+    return called
+
+
+def _answered(serve: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+    """Answers calls that rclpy raises at, such as for a value of no known type."""
+    try:
+        return serve(request, response)
+    except Exception as error:
+        refused = SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
+        if hasattr(response, 'results'):
+            done = len(response.results)
+            response.results += [refused] * (len(request.parameters) - done)
+        else:
+            response.result = refused
+        return response
+
+
+def declare_one(
+    node: Node,
+    name: str,
+    default: Any,
+    described: ParameterDescriptor,
+    within: str = '',
+    *,
+    empty: Any = None,
+) -> Any:
+    """Declares one parameter and returns its value.
+
+    Args:
+        node: owner.
+        name: of the parameter.
+        default: its default, which says the type.
+        described: range and meaning.
+        within: range, in words.
+        empty: value that `[]` stands for, which rclpy takes as "not set"; None = it is refused.
+
+    Raises:
+        ConfigError: the value given at start-up is refused.
+    """
+    kind = type(default).__name__
+    given = node._parameter_overrides.get(name)  # rclpy has no public way to ask
+    is_unset = given is not None and given.type_ == Parameter.Type.NOT_SET
+    if is_unset and empty is None:
+        raise ConfigError(
+            f"parameter '{name}' is given without a value, or as []; it must be of type "
+            f'{kind}{within}, or be left out'
+        )
+    try:
+        return node.declare_parameter(
+            name, empty if is_unset else default, described, ignore_override=is_unset
+        ).value
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+        raise ConfigError(f"parameter '{name}' must be of type {kind}{within}: {error}") from error
 
 
 def refuse_unknown(node: Node) -> None:
@@ -302,13 +381,12 @@ def _declare(node: Node, name: str, field: FieldInfo) -> object:
     if node.has_parameter(name):  # a lifecycle node is configured again
         return node.get_parameter(name).value
     default = [''] if field.default == () else field.default  # ROS has no empty list
-    try:
-        value = node.declare_parameter(name, default, descriptor(field)).value
-    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        limits = span(field)
-        within = ' in [{:g}, {:g}]'.format(*limits) if limits else ''
-        kind = type(default).__name__
-        raise ConfigError(f"parameter '{name}' must be of type {kind}{within}: {error}") from error
+    limits = span(field)
+    within = ' in [{:g}, {:g}]'.format(*limits) if limits else ''
+    is_list = isinstance(default, list)
+    value = declare_one(
+        node, name, default, descriptor(field), within, empty=[''] if is_list else None
+    )
     refused = _refusal(name, field, value)
     if refused:
         raise ConfigError(f'parameter {refused}')
@@ -324,10 +402,17 @@ def _refusal(name: str, field: FieldInfo, value: object) -> str:
     return f"{name} is '{value}'{hint}; it must be one of {', '.join(valid)}"
 
 
-def _check(kind: type[Schema], parameters: list[Parameter]) -> SetParametersResult:
-    for one in parameters:
-        field = kind.model_fields.get(one.name)
-        refused = _refusal(one.name, field, one.value) if field else ''
+def _check(node: Node, kind: type[Schema], parameters: list[Parameter]) -> None:
+    """Refuses what the schema refuses: choices, ranges, numbers that are none.
+
+    Raises:
+        ConfigError: names the parameter and what would be valid.
+    """
+    changed = {one.name: one.value for one in parameters if one.name in kind.model_fields}
+    for name, value in changed.items():
+        refused = _refusal(name, kind.model_fields[name], value)
         if refused:
-            return SetParametersResult(successful=False, reason=refused)
-    return SetParametersResult(successful=True)
+            raise ConfigError(refused)
+    if changed:
+        present = {name: node.get_parameter(name).value for name in kind.model_fields}
+        kind(**present | changed)

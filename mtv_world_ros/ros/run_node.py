@@ -77,7 +77,11 @@ def run(
     _find_log_folder()
     heartbeat = share_path('config', 'fastdds_heartbeat.xml')
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(heartbeat))
-    rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
+    try:
+        rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
+    except RuntimeError as error:  # rclpy's own classes for this are private
+        sys.stderr.write(f'ConfigError: {_why_refused(error)}\n')
+        return 1
     node: AnyNode | None = None
     failure = ''
     try:
@@ -96,6 +100,17 @@ def run(
         _shut_down(node)
     sys.stderr.write(failure)  # the last line of a log is why the process ended
     return int(bool(failure))
+
+
+def _why_refused(error: Exception) -> str:
+    """What rclpy dislikes about the command line or a parameter file, and what is valid."""
+    said = str(error).partition('failed to initialize rcl: ')[2] or str(error)
+    hint = ''
+    if 'same type' in said:
+        hint = '; all items of a list must be of one type: write [1.0, 2.0], or ["a", "1"]'
+    elif 'parameter override' in said:
+        hint = '; expected -p NAME:=VALUE with VALUE in YAML, e.g. -p seed:=3'
+    return f'the arguments after --ros-args cannot be used: {said}{hint}'
 
 
 def _find_log_folder() -> None:

@@ -40,6 +40,13 @@ def test_the_readme_is_short():
     assert len((ROOT / 'README.md').read_text().split()) <= MOST_WORDS
 
 
+def test_results_are_few_and_short():
+    words = (ROOT / 'docs' / 'results.md').read_text().split()
+    tables = [line for line in (ROOT / 'docs' / 'results.md').open() if line.startswith('|--')]
+    assert len(words) <= 1000 and len(tables) == 1
+    assert len(list((ROOT / 'benchmark' / 'results').glob('*.md'))) <= 15
+
+
 def test_the_readme_and_the_results_page_have_the_same_table():
     marked = re.compile(r'<!-- unseen-faults: begin -->(.*)<!-- unseen-faults: end -->', re.S)
     tables = [marked.search((ROOT / n).read_text()) for n in ('README.md', 'docs/results.md')]

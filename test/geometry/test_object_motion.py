@@ -168,7 +168,9 @@ class Foreseen:
     def sizes(self) -> np.ndarray:
         return np.full((len(self.speeds), 1, 3), 0.05)
 
-    def advance(self, positions: np.ndarray) -> tuple[tuple[ObjectMotion, ...], Foreseen]:
+    def advance(
+        self, positions: np.ndarray, should_stop=None
+    ) -> tuple[tuple[ObjectMotion, ...], Foreseen]:
         steps = self.steps + np.arange(len(positions))
         turns = np.tile(np.eye(3), (len(steps), 1, 1, 1))
         motions = []

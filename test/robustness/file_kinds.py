@@ -21,12 +21,17 @@ import cv2
 from folder_kinds import answers, FOLDERS, parts, with_part
 from node_messages import DAMAGE, damaged, send
 import numpy as np
+import parameter_calls
+import wild_numbers
+from wild_numbers import judged, with_wild_number
+import wild_plans
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
-from mtv_world_ros.data.bag.messages import deserialize, parse_joint_trajectory, typestore
+from mtv_world_ros.data.bag.messages import deserialize, typestore
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.recover import recover
 from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -194,7 +199,7 @@ def _read_message(data: bytes, _: Path) -> Any:
     if data:
         message = deserialize(TYPES[data[0] % len(TYPES)], data[1:])
         if data[0] % len(TYPES) == 0:
-            parse_joint_trajectory(message)
+            read_plan(message)
 
 
 def _answers() -> list[bytes]:
@@ -422,6 +427,23 @@ def _read_network(data: bytes, folder: Path) -> Any:
     return load_network(folder / 'motion')
 
 
+def _network_weights() -> list[bytes]:
+    return [
+        share_path('resource', 'checkpoint', 'object_motion', 'model.safetensors').read_bytes()
+    ]
+
+
+def _read_network_weights(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.model.object_motion.predictor import load_network
+
+    (folder / 'other').mkdir(exist_ok=True)
+    shutil.copy(
+        share_path('resource', 'checkpoint', 'object_motion', 'config.json'), folder / 'other'
+    )
+    _file(folder / 'other' / 'model.safetensors', data)
+    return load_network(folder / 'other')
+
+
 def _responses() -> list[bytes]:
     folder = share_path('resource', 'checkpoint', 'object_motion')
     return [(folder / 'arm_response.json').read_bytes()]
@@ -479,6 +501,36 @@ KINDS = {
     'answer, pickle': Kind(_pickles, _read_pickle),
     'answer, language model': Kind(answers, _read_vlm_answer),
     'message, CDR': Kind(_messages, _read_message),
+    'contact, numbers': Kind(
+        _contacts, judged(_read_contact, wild_numbers.plausible_contact),
+        damage=with_wild_number),
+    'arm response, numbers': Kind(
+        _responses, judged(_read_response, wild_numbers.plausible_response),
+        damage=with_wild_number),
+    'robot, numbers': Kind(
+        _config('robots'), judged(_read_robot, wild_numbers.plausible_robot),
+        damage=with_wild_number),
+    'calibration, numbers': Kind(
+        _config('cameras'),
+        judged(lambda d, f: load_calibration(_file(f / 'c.yaml', d)),
+               wild_numbers.plausible_cameras),
+        damage=with_wild_number),
+    'checkpoint, numbers': Kind(
+        _checkpoint_parts, judged(_load_checkpoint, wild_numbers.plausible_checkpoint), 20.0,
+        with_wild_number, 0.1),
+    'task, numbers': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d)),
+                          damage=with_wild_number),
+    'policy, numbers': Kind(_config('policies'), _read_policy, damage=with_wild_number),
+    'preset, numbers': Kind(_config('models'), _read_preset, damage=with_wild_number),
+    'weights, numbers': Kind(
+        _weights, wild_numbers.no_survivors(_read_weights, wild_numbers.are_finite),
+        damage=wild_numbers.weights),
+    'object motion weights, numbers': Kind(
+        _network_weights,
+        wild_numbers.no_survivors(_read_network_weights, wild_numbers.are_finite),
+        damage=wild_numbers.weights),
+    'plan, imagined': Kind(
+        wild_plans.samples, wild_plans.imagine, 20.0, wild_plans.damaged, 0.1),
 }  # fmt: skip
 
 
@@ -514,3 +566,6 @@ if _is_installed('rclpy'):
         )
         for key in DAMAGE
     }
+    KINDS['parameter call'] = Kind(
+        parameter_calls.samples, parameter_calls.call, 10.0, parameter_calls.damaged
+    )

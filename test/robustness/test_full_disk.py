@@ -61,10 +61,6 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
         'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', 'stack_blocks_two',
         '--episodes', '1',
         '--max-chunks', '1', '--out', str(out / 'ranking'), *ONE_STEP],
-    'distill': lambda out: [
-        'distill', 'bundled', str(EPISODE.parent), '--out', str(out / 'student'), '--dtype',
-        'float32', '--threads', '1', '--set', 'optimizer.steps=2', '--set',
-        'optimizer.batch_size=1'],
     'demo': lambda out: ['demo', '--out', str(out / 'demo'), *ONE_STEP],
     'imagine': lambda out: [
         'imagine', '--episodes', str(EPISODE), '--out', str(out / 'imagined'), *ONE_STEP],

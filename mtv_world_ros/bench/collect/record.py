@@ -13,17 +13,15 @@ from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import PolicyVariant
 from mtv_world_ros.bench.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.bench.tasks.tasks import Task, task_named
-from mtv_world_ros.bench.world.physics import physics_named
-from mtv_world_ros.bench.world.randomize import draw_scene
+from mtv_world_ros.bench.world.recorded_scene import dump_scene, SCENE, scene_of
 from mtv_world_ros.bench.world.simulator import (
     CONTROL_PERIOD_S,
-    scene_generator,
     SimEpisode,
     SimObservation,
     situation_of,
 )
 from mtv_world_ros.bench.world.workcell import workcell_of
-from mtv_world_ros.data.episode import Episode, NOMINAL, PHYSICS
+from mtv_world_ros.data.episode import Episode, PHYSICS
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
@@ -259,7 +257,12 @@ def _stamp(time_s: float) -> int:
 
 
 def write_take(
-    path: Path, sim: SimEpisode, take: Take, seed: int, config: RecordConfig, **extra: str
+    path: Path,
+    sim: SimEpisode,
+    take: Take,
+    seed: int | None,
+    config: RecordConfig,
+    **extra: str,
 ) -> None:
     """Writes a take as a rosbag2 MCAP folder; it appears at `path` once it is complete.
 
@@ -267,7 +270,7 @@ def write_take(
         path: folder to make.
         sim: still holding the take's scene and task.
         take: what to write.
-        seed: the episode's seed.
+        seed: that draws its scene; None = none does.
         config: the one that `take` was made with.
         extra: further MCAP metadata.
     """
@@ -276,6 +279,7 @@ def write_take(
         'ever': str(take.ever).lower(),
         'final': str(take.final).lower(),
         PHYSICS: sim.physics,
+        SCENE: dump_scene(sim.scene),
         **extra,
     }
     with EpisodeWriter(
@@ -310,26 +314,17 @@ def write_take(
 def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
     """Returns where the objects of a simulated episode were, at every frame.
 
-    Sizes and goals are not recorded; they are those of the scene that the seed draws.
+    Sizes and goals are those of the scene, see `scene_of`.
 
     Raises:
-        EpisodeError: it holds no poses, or its seed draws a scene of other objects.
+        EpisodeError: it holds no poses, or its scene is not known.
     """
     info = episode.info
     states = episode.joint_states
-    if episode.object_poses is None or info.seed is None or states is None:
-        raise EpisodeError(
-            f"'{info.path}' has no object poses with a seed; only simulated ones do"
-        )
+    if episode.object_poses is None or states is None:
+        raise EpisodeError(f"'{info.path}' has no object poses; only simulated ones do")
+    scene = scene_of(episode, workcell_of(robot))
     task = task_named(info.task)
-    physics = physics_named(info.metadata.get(PHYSICS, NOMINAL))
-    workcell = physics.workcell(workcell_of(robot))
-    scene = draw_scene(task, scene_generator(info.seed), workcell)
-    names = tuple(item.name for item in scene.objects)
-    if names != info.objects:
-        raise EpisodeError(
-            f"'{info.path}' shows {list(info.objects)}, but its seed draws {list(names)}"
-        )
     stamps, poses = episode.object_poses
     rows = np.searchsorted(states.stamps_ns, stamps)
     openings = robot.gripper_openings(states.positions[rows])

@@ -277,11 +277,10 @@ class Expert:
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
             comes: list[tuple[FloatArray, int]] = []
             if wrong is not None and draws is not None and others:
-                home = self.workcell.home_tools[pick.arm]
-                times = self._timed(stops, home)
-                for visit in wrong.visits(stops, draws, self._rests(others[0]), times):
-                    stops, came, late = self._visit(others[0], visit, stops, times[0], pace)
-                    comes.append((came, late))
+                times = self._timed(stops, self.workcell.home_tools[pick.arm])
+                visits = wrong.visits(stops, draws, self._rests(others[0]), times)
+                waits, comes = self._visits(others[0], visits, pace)
+                stops = [replace(stops[0], seconds=times[0] + waits), *stops[1:]]
             rows = self._follow(pick.arm, stops, pace)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
             start = max(1, busy - overlap, free.get(pick.arm, 1))
@@ -414,21 +413,18 @@ class Expert:
         wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
         return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
 
-    def _visit(
-        self,
-        other: str,
-        visit: Visit,
-        stops: list[WayPoint],
-        first: float,
-        pace: tuple[float, float],
-    ) -> tuple[list[WayPoint], FloatArray, int]:
-        """Way points of a move, rows of another arm meanwhile, and how late these begin."""
-        rows, done = self._as_far_as_it_reaches(other, visit.ways, visit.share, pace)
-        takes = sum(self._timed(done[: visit.done], self.workcell.home_tools[other]))
-        late = visit.meets - takes
-        if visit.waits and late < 0:
-            stops = [replace(stops[0], seconds=first - late), *stops[1:]]
-        return stops, rows, self._late(late, pace)
+    def _visits(
+        self, other: str, visits: Sequence[Visit], pace: tuple[float, float]
+    ) -> tuple[float, list[tuple[FloatArray, int]]]:
+        """How long the first arm waits for another one [s], and rows of that and how late."""
+        waits, comes = 0.0, list[tuple[FloatArray, int]]()
+        for visit in visits:
+            rows, done = self._as_far_as_it_reaches(other, visit.ways, visit.share, pace)
+            takes = sum(self._timed(done[: visit.done], self.workcell.home_tools[other]))
+            late = visit.meets - takes + visit.is_timed * waits
+            waits = max(waits, -late) if visit.waits else waits
+            comes.append((rows, self._late(late, pace)))
+        return waits, comes
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
         """Rows before something begins, of a time before scaling [s]; none if it is too late."""

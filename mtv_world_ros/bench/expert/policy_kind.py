@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, refuse_kinds
-from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
+from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
@@ -29,6 +30,8 @@ def policy_maker(
     variant, expert = settings.variant, Expert(robot)
 
     def make(origin: EpisodeOrigin) -> Policy:
+        if origin.recording:
+            return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
         task, scene_seed = origin.task, origin.scene_seed
         if not task or scene_seed < 0:
             raise PolicyError(

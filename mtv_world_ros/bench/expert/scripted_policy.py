@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from mtv_world_ros.bench.shapes import SHAPES
 from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, START, Task, task_named
 from mtv_world_ros.bench.world.placement import goals_of
 from mtv_world_ros.bench.world.randomize import draw_scene, instruction_of, RandomizationConfig
+from mtv_world_ros.bench.world.recorded_scene import recorded_scene
 from mtv_world_ros.bench.world.scene import Place, Scene
 from mtv_world_ros.bench.world.simulator import scene_generator
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
@@ -258,6 +260,25 @@ def scripted_policy(
     variant, kind = parse_variant(name), task_named(task)
     scene = draw_scene(kind, scene_generator(seed), expert.workcell, randomization)
     return ScriptedPolicy(variant, expert, kind, scene, hold_s)
+
+
+def policy_of_recording(
+    name: str, recording: Path, expert: Expert, hold_s: float = HOLD_S
+) -> ScriptedPolicy:
+    """Returns the policy of a name, for the scene of a simulated episode.
+
+    Args:
+        name: as in `scripted_policy`.
+        recording: the episode's folder.
+        expert: plans.
+        hold_s: from the end of the plan to the end of the episode [s].
+
+    Raises:
+        PolicyError: no such policy.
+        EpisodeError: it is no simulated episode, or its scene is not known any more.
+    """
+    task, scene = recorded_scene(recording, expert.workcell)
+    return ScriptedPolicy(parse_variant(name), expert, task, scene, hold_s)
 
 
 def _velocities(plan: JointTrajectory, times: FloatArray) -> FloatArray:

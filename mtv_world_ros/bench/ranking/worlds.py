@@ -21,8 +21,8 @@ from mtv_world_ros.data_types import (
     Observation,
     SuccessEstimate,
 )
+from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints, resample
-from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.prediction import Prediction
@@ -218,7 +218,7 @@ class SimulatedWorld:
         before = self.observation
         matched = match_joints(answer, self._sim.robot, before.positions)
         # as in imagination
-        check_positions(self._sim.robot, matched.positions, tolerance=LIMIT_TOLERANCE)
+        check_plan(self._sim.robot, matched, before.positions)
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
         times = np.linspace(CONTROL_PERIOD_S, num * CONTROL_PERIOD_S, num)

@@ -250,30 +250,3 @@ def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:
         joint_names=list(trajectory.joint_names),
         points=points,
     )
-
-
-def parse_joint_trajectory(message: Any) -> JointTrajectory:
-    """Trajectory of a trajectory_msgs/JointTrajectory.
-
-    Raises:
-        TrajectoryError: it is empty, not finite, or its times do not increase.
-        EpisodeError: a point has another number of positions than there are joints.
-    """
-    num_joints = len(message.joint_names)
-    for index, point in enumerate(message.points):
-        counts = (len(point.positions), len(point.velocities) or num_joints)
-        if counts != (num_joints, num_joints):
-            raise EpisodeError(
-                f'joint trajectory: point {index} has {counts[0]} positions and {counts[1]} '
-                f'velocities for {num_joints} joints'
-            )
-    with_velocities = all(len(point.velocities) for point in message.points)
-    shape = (len(message.points), num_joints)
-    times = [p.time_from_start.sec + p.time_from_start.nanosec * 1e-9 for p in message.points]
-    rates = [point.velocities for point in message.points] if with_velocities else None
-    return JointTrajectory(
-        joint_names=tuple(message.joint_names),
-        times=np.array(times),
-        positions=np.array([point.positions for point in message.points]).reshape(shape),
-        velocities=None if rates is None else np.array(rates).reshape(shape),
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 import yaml
 
 from mtv_world_ros.bounded_input import read_text
-from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
+from mtv_world_ros.config import ListOf, Metres, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
@@ -21,11 +21,14 @@ from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
 from mtv_world_ros.geometry.robot.shape import find_mesh, write_convex_hull
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
+#: of a joint [rad or m]; many turns, no encoder counts
+Position = Annotated[float, Field(ge=-1000, le=1000)]
+
 
 class PoseEntry(Schema):
     """A pose, by default the identity."""
 
-    position: ListOf[float] = Field(default=(0, 0, 0), description='x, y, z [m]')
+    position: ListOf[Metres] = Field(default=(0, 0, 0), description='x, y, z [m]')
     quaternion_xyzw: ListOf[float] = (0, 0, 0, 1)
 
     @model_validator(mode='after')
@@ -42,8 +45,8 @@ class JointEntry(Schema):
     """A joint that moves between two limits [rad or m]."""
 
     joint: str
-    lower: float
-    upper: float
+    lower: Position
+    upper: Position
 
     @model_validator(mode='after')
     def _limits_are_in_order(self) -> Self:
@@ -55,10 +58,10 @@ class JointEntry(Schema):
 class DhEntry(JointEntry):
     """A row of a Denavit-Hartenberg table [m, rad]; its link is named `<joint>_link`."""
 
-    a: float
-    alpha: float
-    d: float
-    theta: float = 0.0
+    a: Metres
+    alpha: Position
+    d: Metres
+    theta: Position = 0.0
     type: Literal['revolute', 'prismatic'] = 'revolute'
 
 
@@ -80,8 +83,8 @@ class MimicEntry(Schema):
 
     joint: str
     source: str
-    multiplier: float = 1.0
-    offset: float = 0.0
+    multiplier: Position = 1.0
+    offset: Position = 0.0
 
 
 class ToolEntry(PoseEntry):
@@ -90,10 +93,10 @@ class ToolEntry(PoseEntry):
     arm: str
     link: str
     gripper_joint: str | None = None
-    gripper_closed: float = Field(default=0.0, description="the gripper joint's, [rad or m]")
-    gripper_open: float = Field(default=1.0, description="the gripper joint's, [rad or m]")
+    gripper_closed: Position = Field(default=0.0, description="the gripper joint's, [rad or m]")
+    gripper_open: Position = Field(default=1.0, description="the gripper joint's, [rad or m]")
     finger_travel_m: float | None = Field(
-        default=None, description='way of a finger from closed to open [m]'
+        default=None, ge=-1, le=1, description='way of a finger from closed to open [m]'
     )
 
 

@@ -15,7 +15,7 @@ from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot.file import read_urdf
-from mtv_world_ros.geometry.robot.model import Mimic
+from mtv_world_ros.geometry.robot.model import check_can_move, Mimic
 from mtv_world_ros.geometry.robot.shape import link_shapes
 from mtv_world_ros.geometry.transforms import quaternion
 
@@ -84,6 +84,13 @@ def guess_robot(urdf: Path) -> GuessedRobot:
     followers = {mimic.joint for mimic in mimics}
     leaders = {m.source for m in mimics if m.source not in used and m.source not in followers}
     joints = [n for n, j in _named_joints(model) if (n in used or n in leaders) and j.nv == 1]
+    for name, joint in _named_joints(model):
+        if name in joints and joint.nq == 1:
+            low, high = (
+                float(limit[joint.idx_q])
+                for limit in (model.lowerPositionLimit, model.upperPositionLimit)
+            )
+            check_can_move(name, low, high, f"'{urdf}'")
     left_out = [n for n, j in _named_joints(model) if j.nv == 1 and n not in {*joints, *followers}]
     if left_out:
         notes.append(f'joints that rest at zero, add those that are recorded: {left_out}')

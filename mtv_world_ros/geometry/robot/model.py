@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import nearest, RobotError, TrajectoryError
 from mtv_world_ros.geometry.transforms import inverse, is_rigid
 
@@ -17,6 +17,8 @@ from mtv_world_ros.geometry.transforms import inverse, is_rigid
 LIMIT_TOLERANCE = 1e-3
 
 
+#: of a joint, link or tool from what carries it [m]
+FARTHEST_M = 100.0
 #: travel of a finger where the robot's file does not say it [m]
 _TRAVEL_M = 0.04
 
@@ -112,6 +114,7 @@ class RobotModel:
         self.mimics = tuple(mimics)
         self.base_link = base_link
         self.mimics = tuple(mimics)
+        _check_places(name, model)
         self._frames = _link_frames(model)
         self._setters = [
             _Setter.of(self._joint(joint), column) for column, joint in enumerate(self.joint_names)
@@ -126,6 +129,12 @@ class RobotModel:
         ]
         for link in (base_link, *(tool.link for tool in self.tools)):
             self._frame(link)
+
+    @property
+    def slides(self) -> BoolArray:
+        """(J,) which of the commanded joints slide; the others turn."""
+        joints = (self._joint(name).shortname() for name in self.joint_names)
+        return np.array([name.startswith('JointModelP') for name in joints], np.bool_)
 
     @property
     def link_names(self) -> tuple[str, ...]:
@@ -252,6 +261,8 @@ class RobotModel:
                 f"joint '{self.joint_names[joint]}' of robot '{self.name}' has its lower limit "
                 f'{lower[joint]} above the upper one {upper[joint]}'
             )
+        for name, low, high in zip(self.joint_names, lower, upper, strict=True):
+            check_can_move(name, low, high, f"robot '{self.name}'")
         speeds = np.array([model.velocityLimit[joint.velocity] for joint in joints])
         for array in (lower, upper, speeds):
             array.flags.writeable = False
@@ -341,10 +352,37 @@ class _Setter:
         )
 
 
+def _check_places(name: str, model: pin.Model) -> None:
+    """Refuses a description in which something is nowhere, or out of all reach."""
+    joints = zip(list(model.names)[1:], list(model.jointPlacements)[1:], strict=True)
+    frames = ((frame.name, frame.placement) for frame in model.frames)
+    for part, place in [*joints, *frames]:
+        if not (np.abs(place.translation) <= FARTHEST_M).all():
+            raise RobotError(
+                f"'{part}' of robot '{name}' is at {place.translation.tolist()} m from what "
+                f'carries it; at most {FARTHEST_M:g} m are accepted'
+            )
+
+
 def _link_frames(model: pin.Model) -> dict[str, int]:
     """Links by name; joints have frames too, maybe of the same name."""
     kind = pin.FrameType.BODY
     return {frame.name: i for i, frame in enumerate(model.frames) if frame.type == kind}
+
+
+def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
+    """Refuses a joint whose limits are equal; a URDF without stops has 0 and 0.
+
+    Raises:
+        RobotError: what to write instead.
+    """
+    if lower == upper:
+        raise RobotError(
+            f"joint '{joint}' of {where} cannot move: its limits are {lower:g} and {upper:g}; a "
+            "URDF whose <limit> has no 'lower' and 'upper' means 0 and 0. Give both there, make "
+            "the joint type 'continuous' if it turns without stops, or leave it out of 'joints' "
+            "in the robot's YAML if it rests"
+        )
 
 
 def check_positions(

@@ -145,7 +145,7 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     missing: list[str] = []
     for kind in ('visual', 'collision'):
         try:
-            shapes = list(_shapes(link, kind, urdf))
+            shapes = list(shapes_of(link, kind, urdf))
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
@@ -154,7 +154,13 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     return [], missing
 
 
-def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+    """Yields the shapes of a link's elements of a kind, `visual` or `collision`.
+
+    Raises:
+        FileNotFoundError: a mesh is not there.
+        RobotError: see `load_shape`.
+    """
     for element in link.findall(kind):
         geometry = element.find('geometry')
         if geometry is None or len(geometry) == 0:
@@ -166,7 +172,7 @@ def _shapes(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkSh
             raise RobotError(
                 f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
             ) from error
-        pose = _origin(element.find('origin'))
+        pose = shape_origin(element.find('origin'))
         yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
 
 
@@ -265,7 +271,8 @@ def _outermost(points: FloatArray) -> FloatArray:
     return points[np.unique((points @ _directions(_DIRECTIONS).T).argmax(axis=0))]
 
 
-def _origin(element: ElementTree.Element | None) -> FloatArray:
+def shape_origin(element: ElementTree.Element | None) -> FloatArray:
+    """Returns the (4, 4) pose of an `<origin>`."""
     T = np.eye(4)
     if element is not None:
         T[:3, 3] = np.array(element.get('xyz', '0 0 0').split(), float)

@@ -79,7 +79,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what `train` and `distill` share: overrides, episodes, seed, device, saving."""
+    """Adds overrides, episodes, seed, device, saving."""
     parser.add_argument(
         '--set',
         action='append',

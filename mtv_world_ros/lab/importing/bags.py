@@ -288,8 +288,10 @@ def _commands(
     episode: Episode, robot: RobotModel, mapping: BagMapping
 ) -> list[tuple[int, JointTrajectory]]:
     if not episode.trajectories:
+        topic = mapping.topic(mapping.action)
+        reasons = [f' ({warning})' for warning in episode.warnings if f"'{topic}'" in warning]
         raise EpisodeError(
-            f"'{episode.info.path}' has no commands at '{mapping.topic(mapping.action)}'; name "
+            f"'{episode.info.path}' has no commands at '{topic}'{''.join(reasons)}; name "
             "their topic with --action or in the mapping's 'action', or set 'action: state' "
             '(--action state) to take the measured positions'
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, ValidationInfo
@@ -16,6 +16,7 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.image_window import windowed_camera
 from mtv_world_ros.geometry.robot.joint_columns import Unit, UNITS
 from mtv_world_ros.geometry.transforms import inverse, is_rigid, rotation
 
@@ -96,6 +97,20 @@ class CameraSource(Schema):
         return [path for key in _PATHS if (path := getattr(self.camera, key)) is not None]
 
 
+class CameraTrack(NamedTuple):
+    """A view's camera in an episode.
+
+    Attributes:
+        camera: at the images' size, posed as at the first row.
+        poses: (T, 4, 4) T_mount_camera [m] of the rows, where it moves.
+        note: how images of another size than the calibration's were taken; empty = they are not.
+    """
+
+    camera: CameraModel
+    poses: FloatArray | None = None
+    note: str = ''
+
+
 def camera_model(
     source: CameraSource,
     dataset: Path,
@@ -103,7 +118,7 @@ def camera_model(
     values: Mapping[str, FloatArray],
     size: tuple[int, int],
 ) -> CameraModel:
-    """Returns the view's camera for images of `size`.
+    """Returns the view's camera for images of `size`; see `camera_track`.
 
     Args:
         source: of the view.
@@ -115,7 +130,7 @@ def camera_model(
     Raises:
         CalibrationError: the parameters are missing or wrong, or change within the episode.
     """
-    return camera_track(source, dataset, episode_index, values, size)[0]
+    return camera_track(source, dataset, episode_index, values, size).camera
 
 
 def camera_track(
@@ -124,8 +139,8 @@ def camera_track(
     episode_index: int,
     values: Mapping[str, FloatArray],
     size: tuple[int, int],
-) -> tuple[CameraModel, FloatArray | None]:
-    """Returns `camera_model` and, of a camera that moves, (T, 4, 4) T_mount_camera of the rows."""
+) -> CameraTrack:
+    """Returns `camera_model`, and the poses of the rows of a camera that moves."""
     if source.calibration is not None:
         cameras = load_calibration(source.calibration)
         if source.view not in cameras:
@@ -133,7 +148,7 @@ def camera_track(
                 f"'{source.calibration}' has no view '{source.view}'"
                 f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
             )
-        return scaled(cameras[source.view], *size), None
+        return _sized(cameras[source.view], size)
     row = source.camera
     assert row is not None
     look_up = _Lookup(source, dataset, episode_index, values)
@@ -154,7 +169,24 @@ def camera_track(
         mount_link=row.mount_link,
         T_mount_camera=poses[0],
     )
-    return scaled(camera, *size), np.stack(poses) if row.moves else None
+    return _sized(camera, size, np.stack(poses) if row.moves else None)
+
+
+def _sized(
+    camera: CameraModel, size: tuple[int, int], poses: FloatArray | None = None
+) -> CameraTrack:
+    """The camera for images of a size; data sets may have stretched them, which is said."""
+    try:
+        sized, note = windowed_camera(camera, *size)
+    except CalibrationError:
+        sized = scaled(camera, *size)
+        note = (
+            f"view '{camera.view}': images of {size[0]}x{size[1]}, but its K is for "
+            f'{camera.width}x{camera.height}: taken as stretched, fx times '
+            f'{size[0] / camera.width:.4g} and fy times {size[1] / camera.height:.4g}; where they '
+            "were cropped, give the K of the cropped images, and their 'size'"
+        )
+    return CameraTrack(sized, poses, note)
 
 
 class _Lookup:

@@ -130,7 +130,7 @@ def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
     if chosen.outcome_feature:
         source.feature(chosen.outcome_feature)
     for view in chosen.views.values():
-        source.feature(view.feature, ('video', 'image'))
+        source.colour_feature(view.feature)
         for name in view.features():
             source.feature(name)
 
@@ -170,7 +170,7 @@ def convert_episode(
         for view, source in mapping.views.items()
     }
     first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
-    cameras, tracks = _cameras(dataset, entry, mapping, rows, first)
+    cameras, tracks, notes = _cameras(dataset, entry, mapping, rows, first)
     texts = _instructions(dataset, rows, mapping)
     with ExitStack() as stack:
         writer = EpisodeWriter(
@@ -209,7 +209,7 @@ def convert_episode(
             if k in commands:  # after what it starts from, so that the episode can be played
                 writer.write_trajectory(stamp_ns, commands[k])
         masks.finish()
-    return *odd, *jumps(commands.values(), mapping.robot)
+    return *odd, *notes, *jumps(commands.values(), mapping.robot)
 
 
 def _read_rows(
@@ -271,18 +271,20 @@ def _cameras(
     mapping: DatasetMapping,
     rows: dict[str, FloatArray],
     first: dict[str, ByteArray],
-) -> tuple[list[CameraModel], dict[str, FloatArray]]:
-    """The cameras at the first row, and the poses at all rows of those that move."""
-    cameras, tracks = [], {}
+) -> tuple[list[CameraModel], dict[str, FloatArray], list[str]]:
+    """The cameras at the first row, the poses at all rows of those that move, what is odd."""
+    cameras, tracks, notes = [], {}, []
     for view, source in mapping.views.items():
         height, width = first[view].shape[:2]
-        camera, track = camera_track(source, dataset.root, entry.index, rows, (width, height))
-        if track is not None:
-            tracks[view] = track
+        found = camera_track(source, dataset.root, entry.index, rows, (width, height))
+        camera = found.camera
+        if found.poses is not None:
+            tracks[view] = found.poses
+        notes += [found.note] if found.note else []
         resting = np.zeros((1, len(mapping.robot.joint_names)))
         camera_poses(camera, mapping.robot, resting)  # names a mount_link that is not there
         cameras.append(camera)
-    return cameras, tracks
+    return cameras, tracks, notes
 
 
 def _instructions(

@@ -21,6 +21,9 @@ from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest, ObservationError
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
+_PICTURES = ('video', 'image')
+#: bytes 24 and 25 of a PNG: 16 bits, grey
+_PNG_DEPTH = bytes([16, 0])
 _INFO = Path('meta/info.json')
 #: a video frame may be this share of the period away from its row
 _TIME_TOLERANCE = 0.25
@@ -110,6 +113,22 @@ class LeRobotDataset:
             )
         return self.features[name]
 
+    def colour_feature(self, name: str) -> dict[str, Any]:
+        """Returns what the dataset says about a camera's video or images.
+
+        Raises:
+            ConfigError: there is no such feature, or it is a depth map.
+        """
+        found = self.feature(name, _PICTURES)
+        if _is_depth_map(found):
+            cameras = {n: f for n, f in self.features.items() if f.get('dtype') in _PICTURES}
+            colours = [n for n, f in cameras.items() if not _is_depth_map(f)]
+            raise ConfigError(
+                f"'{self.root}': feature '{name}' is a depth map (is_depth_map), no picture of "
+                f'the scene; those are {", ".join(colours) or "none"}'
+            )
+        return found
+
     def column_names(self, feature: str) -> list[str]:
         """Names of a feature's columns, empty where it has none.
 
@@ -153,7 +172,7 @@ class LeRobotDataset:
         Raises:
             EpisodeError: a frame is missing or damaged.
         """
-        if self.feature(feature, ('video', 'image'))['dtype'] == 'image':
+        if self.feature(feature, _PICTURES)['dtype'] == 'image':
             yield from self._images(entry, feature)
             return
         part = entry.videos[feature]
@@ -260,6 +279,11 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': '{feature}' holds no image bytes, but {type(cell).__name__}"
             )
+        if data[:4] == b'\x89PNG' and data[24:26] == _PNG_DEPTH:
+            raise EpisodeError(
+                f"'{entry.data_file}': '{feature}' has 16-bit images of one channel, as of depth; "
+                'a view needs colours'
+            )
         layout = 'png' if data[:4] == b'\x89PNG' else 'jpeg'
         try:
             return compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
@@ -267,6 +291,13 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
             ) from error
+
+
+def _is_depth_map(feature: Mapping[str, Any]) -> bool:
+    """Whether a feature says so of itself, in any of the places where LeRobot has written it."""
+    places = (feature, feature.get('info'), feature.get('video_info'))
+    keys = ('is_depth_map', 'video.is_depth_map')
+    return any(bool(p.get(key)) for p in places if isinstance(p, Mapping) for key in keys)
 
 
 def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:

@@ -33,7 +33,8 @@ from mtv_world_ros.rendering.images import encode_png, resize_frames
 #: files of a folder at most
 _CHUNK = 1000
 _CODEC, _PIXELS = 'libx264', 'yuv420p'
-_CODEC_OPTIONS = {'crf': '18', 'g': '2'}
+#: bf: frames in the order in which they are shown; Rerun 0.41 plays no others without ffmpeg
+_CODEC_OPTIONS = {'crf': '18', 'g': '2', 'bf': '0'}
 _QUANTILES = {'q01': 0.01, 'q10': 0.1, 'q50': 0.5, 'q90': 0.9, 'q99': 0.99}
 #: frames of a video that its statistics are of, spread evenly
 _STATISTICS_FRAMES = 20

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 from diffusers.training_utils import EMAModel
 import torch
 from torch import nn, Tensor
@@ -71,17 +68,6 @@ class Weights:
             if worker.grad is not None:
                 master.grad += worker.grad
             worker.grad = None
-
-    @contextmanager
-    def lent(self) -> Iterator[MultiViewWanTransformer]:
-        """Yields the working copy with the averaged weights, which are those that will serve."""
-        with torch.no_grad():
-            for (worker, _), average in zip(self._pairs, self.ema.shadow_params, strict=True):
-                worker.copy_(average)
-        try:
-            yield self.worker
-        finally:
-            self.share()
 
     def averages(self) -> dict[str, Tensor]:
         """Returns the averaged float32 weights by name."""

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
 from mtv_world_ros.lab.training.averaged_weights import Weights
@@ -145,6 +145,8 @@ def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer)
     assert card is not None
     try:
         tensors = load_file(file)
+        for name, tensor in tensors.items():
+            check_finite(tensor, name, file)
         weights.load({k[7:]: v for k, v in tensors.items() if k.startswith('master.')})
         shadow = weights.ema.shadow_params
         weights.ema.shadow_params = [

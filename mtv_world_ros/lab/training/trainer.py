@@ -43,7 +43,6 @@ from mtv_world_ros.lab.training.resume import (
     save_state,
     STATE,
 )
-from mtv_world_ros.lab.training.self_rollout import SelfRollout
 from mtv_world_ros.lab.training.training_config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
 from mtv_world_ros.model.card import CheckpointCard, OPTIONAL_KEYS, ROBOT_FOLDER
@@ -227,22 +226,11 @@ class Trainer:
             TrainingError: the loss is not finite, the device is out of memory, a state cannot be
                 written, or another process is gone; the last saved state stays whole.
         """
-        rollout = SelfRollout(
-            source.controls,
-            self.encoders,
-            build_scheduler(self.config.scheduler),
-            num_inference_steps=self.config.self_rollout.steps,
-            seed=self.seed,
-            device=self.device,
-        )
         saved, stops = time.monotonic(), False
         while self.step < self.config.optimizer.steps and not stops:
             started = time.perf_counter()
             batch = source.batch(self.step)
             waited = time.perf_counter() - started
-            if isinstance(batch, Batch) and any(batch.leads):
-                with self.weights.lent() as transformer:
-                    batch = rollout.apply(batch, self.step, transformer)
             with memory_errors_named(self.device):
                 report = self.train_step(batch)
             self.step += 1

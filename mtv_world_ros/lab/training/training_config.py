@@ -151,24 +151,6 @@ class HistoryConfig(HistorySettings):
         return self
 
 
-class SelfRolloutConfig(Schema):
-    """Clips that start where the model's own rollout ended; see `self_rollout.py`."""
-
-    section: ClassVar = 'self_rollout'
-
-    share: Annotated[float, expected('in 0 .. 1')] = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description='probability of such a clip, if enough precedes it; 0 = off',
-    )
-    steps: Count = Field(default=1, description='denoising steps of the rollout')
-    max_chunks: Count = Field(
-        default=3, description='longest rollout; all lengths from 1 on are equally likely'
-    )
-    start_step: int = Field(default=0, description='first training step with such clips')
-
-
 class SamplingConfig(Schema):
     """How its checkpoints are sampled unless told otherwise."""
 
@@ -252,7 +234,6 @@ class TrainingConfig(Schema):
     objective: ObjectiveConfig = ObjectiveConfig()
     augment: AugmentConfig = AugmentConfig()
     history: HistoryConfig = HistoryConfig()
-    self_rollout: SelfRolloutConfig = SelfRolloutConfig()
     sampling: SamplingConfig = SamplingConfig()
     lora: LoraSettings = LoraSettings()
     optimizer: OptimizerConfig = OptimizerConfig()
@@ -283,7 +264,7 @@ class TrainingConfig(Schema):
 
 
 class TrainingRun(Schema):
-    """A training: what `mtv-world train` and `distill` are told."""
+    """A training: what `mtv-world train` is told."""
 
     section: ClassVar = ''
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import TrajectoryError
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.robot.model import RobotModel
 
@@ -35,9 +36,12 @@ _SUBSTEPS = 2
 _STIFFNESS, _DAMPING, _FRICTION, _SLOW = 5000.0, 100.0, 0.9, 0.02
 #: fingertips that are higher over the table do not get there within a period [m]
 _NEAR_M = 0.03
+#: joints that are faster have run away from their commands [rad/s or m/s]
+_WILD = 500.0
 #: of each joint
 NUMBERS = ('compliance', 'armature', 'damping', 'lead')
-_FLOOR = 'floor'
+_LARGEST = {'compliance': 10.0, 'armature': 1.0, 'damping': 1.0, 'lead': 1.0}
+_FLOOR, _HIGHEST_M = 'floor', 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +67,7 @@ class ArmResponse:
             joints with a compliance, which are those of a description with inertias.
 
     Raises:
-        ValueError: a number is not finite, or below 0.
+        ValueError: a number is not finite, below 0, or larger than that of any arm.
     """
 
     joint_names: tuple[str, ...]
@@ -76,10 +80,12 @@ class ArmResponse:
     def __post_init__(self) -> None:
         for name in NUMBERS:
             values = getattr(self, name)
-            if not (np.isfinite(values) & (values >= 0)).all():
-                raise ValueError(f'{name} is {values.tolist()}; give finite numbers from 0 on')
-        if self.floor is not None and not np.isfinite(self.floor):
-            raise ValueError(f'floor is {self.floor}; give a finite number')
+            if not ((values >= 0) & (values <= _LARGEST[name])).all():
+                raise ValueError(
+                    f'{name} is {values.tolist()}; give numbers from 0 to {_LARGEST[name]:g}'
+                )
+        if self.floor is not None and not abs(self.floor) <= _HIGHEST_M:
+            raise ValueError(f'floor is {self.floor}; give a height within {_HIGHEST_M:g} m of 0')
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], joint_names: Sequence[str]) -> ArmResponse:
@@ -87,7 +93,7 @@ class ArmResponse:
 
         Raises:
             KeyError: a joint or number is missing.
-            TypeError, ValueError: a value is no finite number from 0 on.
+            TypeError, ValueError: a value is no number of an arm.
         """
         rows = {name: [float(values[joint][name]) for joint in joint_names] for name in NUMBERS}
         arrays = {name: np.array(row) for name, row in rows.items()}
@@ -117,6 +123,9 @@ class ArmResponse:
             commands: in its joint order, `PERIOD_S` apart; the first row is where `state` is, or
                 where the joints rest.
             state: at the first row.
+
+        Raises:
+            TrajectoryError: the arms do not get to the commands, but faster and faster.
         """
         now = state or ArmState(
             positions=commands[0], velocities=np.zeros(commands.shape[1]), commands=commands[0]
@@ -140,6 +149,7 @@ class ArmResponse:
                 acceleration = solve @ force
                 positions = positions + h * velocities + h * h / 2 * acceleration
                 velocities = velocities + h * acceleration
+            _check_speeds(robot, velocities, command)
             last = command
             rows.append(positions)
         then = ArmState(positions=positions, velocities=velocities, commands=last)
@@ -155,6 +165,17 @@ class ArmResponse:
             return None
         jacobians = mechanics.fingertip_jacobians(positions, points)
         return _Tips(heights=heights[near], jacobians=jacobians[near], positions=positions)
+
+
+def _check_speeds(robot: RobotModel, velocities: FloatArray, command: FloatArray) -> None:
+    wild = ~(np.abs(velocities) < _WILD)
+    if wild.any():
+        joint = int(np.argmax(wild))
+        raise TrajectoryError(
+            f"the arms cannot follow the plan: joint '{robot.joint_names[joint]}' would move at "
+            f'{velocities[joint]:.4g} to get to {command[joint]:.4g}, and no arm at {_WILD:g} '
+            '(rad/s or m/s); plan slower motions'
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

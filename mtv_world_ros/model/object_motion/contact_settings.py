@@ -2,26 +2,55 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field
 
-from mtv_world_ros.config import Positive, Schema
+from mtv_world_ros.config import Metres, Schema
+
+Friction = Annotated[float, Field(ge=0.01, le=10)]
+Thickness = Annotated[float, Field(ge=1e-4, le=0.1)]
+
+
+class ContactSpread(Schema):
+    """How exactly what futures begin with is known: standard deviations."""
+
+    place_m: float = Field(default=0.001, ge=0, le=1, description='of where objects are [m]')
+    turn_rad: float = Field(default=0.02, ge=0, le=4, description='of how they are turned [rad]')
+    size: float = Field(default=0.015, ge=0, le=1, description='of their sizes, relative')
+    friction: float = Field(default=0.2, ge=0, le=3, description='of what rubs, relative')
+    weight: float = Field(default=0.3, ge=0, le=3, description='of densities, relative')
+    grip: float = Field(
+        default=0.2, ge=0, le=3, description='of the friction of fingers, relative'
+    )
+    force: float = Field(default=0.2, ge=0, le=3, description='of the force of fingers, relative')
+    zero_rad: float = Field(default=0.002, ge=0, le=1, description='of the zeros of joints [rad]')
+    delay_s: float = Field(
+        default=0.005, ge=0, le=1, description='of how late commands take effect [s]'
+    )
 
 
 class ContactSettings(Schema):
     """Numbers of contact, found in recorded episodes (`training/object_motion/contact_fit.py`)."""
 
-    finger_stiffness: Positive = Field(description='of each finger [N/m]')
-    finger_damping: Positive = Field(description='of each finger [N s/m]')
-    finger_mass_kg: Positive = Field(description='of its drive')
+    finger_stiffness: float = Field(ge=0.1, le=1e6, description='of each finger [N/m]')
+    finger_damping: float = Field(ge=1e-3, le=1e5, description='of each finger [N s/m]')
+    finger_mass_kg: float = Field(ge=1e-4, le=10, description='of its drive')
     fingers_swing: bool = Field(default=False, description='each for itself, as the hand moves')
-    pad_stiffness: Positive | None = Field(
-        default=None, description='with which finger tips give way [N/m]; None = they do not'
+    pad_stiffness: float | None = Field(
+        default=None,
+        ge=10,
+        le=1e7,
+        description='with which finger tips give way [N/m]; None = they do not',
     )
-    grip_friction: Positive = Field(description='of fingers on what they touch')
-    table_friction: Positive = Field(description='of all else')
-    density: Positive = Field(description='of objects [kg/m^3]')
-    tray_kg: Positive = Field(description='of a wide box without a lid')
-    rim_m: Positive = Field(default=0.01, description='thickness of the rim of plates and bowls')
-    wall_m: Positive = Field(default=0.005, description='of the walls of cups and of boxes')
-    table_m: float = Field(default=0.0, description='its height in the base frame [m]')
+    grip_friction: Friction = Field(description='of fingers on what they touch')
+    table_friction: Friction = Field(description='of all else')
+    density: float = Field(ge=10, le=25_000, description='of objects [kg/m^3]')
+    tray_kg: float = Field(ge=1e-3, le=100, description='of a wide box without a lid')
+    rim_m: Thickness = Field(default=0.01, description='thickness of the rim of plates and bowls')
+    wall_m: Thickness = Field(default=0.005, description='of the walls of cups and of boxes')
+    table_m: Metres = Field(default=0.0, description='its height in the base frame [m]')
+    spread: ContactSpread = Field(
+        default=ContactSpread(), description='how exactly all this is known'
+    )
     num_motions: int = Field(default=4, ge=1, le=64, description='the last ones disturbed')

@@ -303,7 +303,7 @@ class ObjectMotionNetwork(nn.Module):
         nn.init.constant_(self.scale.bias, -6.0)
 
     def widened(
-        self, width: int, hidden: int, *, yielding: bool = True, touching: bool = True
+        self, width: int, hidden: int, *, yielding: bool = True, touching: bool = False
     ) -> ObjectMotionNetwork:
         """Returns a wider one that computes the same at first, with fingertips and what is asked.
 

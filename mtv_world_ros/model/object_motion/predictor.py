@@ -11,8 +11,7 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 import torch
 from torch import Tensor
 
@@ -36,7 +35,7 @@ from mtv_world_ros.model.object_motion.network import (
     STEP_S,
 )
 from mtv_world_ros.model.object_motion.stacked import stacked
-from mtv_world_ros.model.tensor_files import disk_errors
+from mtv_world_ros.model.tensor_files import disk_errors, read_tensors
 
 if TYPE_CHECKING:
     from mtv_world_ros.geometry.solids import Solid
@@ -306,7 +305,14 @@ class TrackedObjects:
         sizes = np.broadcast_to(sizes, (1 + self.model.num_disturbed, *sizes.shape))
         return sizes if self.contact is None else np.concatenate([sizes, self.contact.sizes])
 
-    def advance(self, positions: FloatArray) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Nothing is doubted."""
+        return ()
+
+    def advance(
+        self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
+    ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one, the others are of disturbed places and sizes. Row 0
@@ -314,6 +320,7 @@ class TrackedObjects:
 
         Args:
             positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            should_stop: not asked.
         """
         known = np.asarray(np.isfinite(self.reference).all(-1))
         places, features = self.model.disturbed(
@@ -462,8 +469,8 @@ def load_network(folder: Path) -> ObjectMotionNetwork:
     """
     try:
         network = ObjectMotionNetwork(**read_json(folder / _CONFIG))
-        network.load_state_dict(load_file(folder / _WEIGHTS))
-    except (OSError, ValueError, TypeError, RuntimeError, SafetensorError) as error:
+        network.load_state_dict(read_tensors(folder / _WEIGHTS))
+    except (OSError, ValueError, TypeError, RuntimeError, CheckpointError) as error:
         raise CheckpointError(f"'{folder}' cannot be used: {error}; train it anew") from error
     return network
 

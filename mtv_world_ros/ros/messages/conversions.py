@@ -14,41 +14,20 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.ros.messages.rejection import bounded, Reason, rejected_as, Rejection
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns
+from mtv_world_ros.ros.messages.rejection import bounded, Reason, refused_plan, Rejection
+from mtv_world_ros.ros.messages.stamps import NANO
 
 
 def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
-    """Returns the trajectory; its times count from the message's stamp.
-
-    Velocities are kept where every point has them.
+    """Returns the trajectory, see `read_plan`.
 
     Raises:
-        Rejection: empty, names repeated, points of the wrong length, NaN, times not increasing.
+        Rejection: it cannot be used.
     """
-    names = list(message.joint_names)
-    if not names or not message.points:
-        raise Rejection(
-            Reason.TRAJECTORY_EMPTY,
-            f'the trajectory has {len(names)} joint names and {len(message.points)} points; it '
-            'needs at least one of each',
-        )
-    with bounded(Reason.TRAJECTORY_MALFORMED):
-        check_limit('joint_names', len(names), 'the trajectory')
-        check_limit('trajectory_points', len(message.points), 'the trajectory')
-    repeated = _repeated(names)
-    if repeated:
-        raise Rejection(Reason.JOINT_NAMES, f'joint names {repeated} occur more than once')
-    positions = _rows(message, 'positions')
-    velocities = None
-    if all(len(point.velocities) for point in message.points):
-        velocities = _rows(message, 'velocities')
-    times = np.array([to_ns(point.time_from_start) / NANO for point in message.points])
-    with rejected_as(Reason.TRAJECTORY_TIMES):
-        return JointTrajectory(
-            joint_names=tuple(names), times=times, positions=positions, velocities=velocities
-        )
+    with refused_plan():
+        return read_plan(message)
 
 
 def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
@@ -63,27 +42,6 @@ def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointT
         points.append(point)
     names = list(trajectory.joint_names)
     return JointTrajectoryMsg(header=header, joint_names=names, points=points)
-
-
-def _rows(message: JointTrajectoryMsg, field: str) -> FloatArray:
-    """One field of all points, (T, J), checked."""
-    names = list(message.joint_names)
-    rows = [getattr(point, field) for point in message.points]
-    for index, row in enumerate(rows):
-        if len(row) != len(names):
-            raise Rejection(
-                Reason.TRAJECTORY_MALFORMED,
-                f'point {index} has {len(row)} {field} for {len(names)} joints',
-            )
-    values = np.array(rows, np.float64)
-    if not np.isfinite(values).all():
-        point, joint = np.argwhere(~np.isfinite(values))[0]
-        raise Rejection(
-            Reason.TRAJECTORY_NOT_FINITE,
-            f"joint '{names[joint]}' has {field} {values[point, joint]} at point {point}; every "
-            'value must be finite',
-        )
-    return values
 
 
 def to_positions(message: JointState) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from std_msgs.msg import Header
 from mtv_world_ros.data.bag import image_decoding
 from mtv_world_ros.data_types import ByteArray, CameraModel
 from mtv_world_ros.geometry.camera import with_camera_info
+from mtv_world_ros.geometry.image_window import WHOLE, window_of, windowed_pixels
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 
 #: words in the `format` of compressed images that can be read
@@ -107,6 +109,31 @@ def camera_from_info(calibrated: CameraModel, info: CameraInfo) -> CameraModel:
             distortion_model=info.distortion_model,
             distortion=list(info.d),
         )
+
+
+def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
+    """Returns `info` for the images that were received: K and P of them, no ROI, no binning.
+
+    Args:
+        info: as received.
+        camera: at the images' size.
+    """
+    window = window_of(info)
+    if window == WHOLE and (camera.width, camera.height) == (info.width, info.height):
+        return info
+    K = np.reshape(info.k, (3, 3))
+    full = replace(camera, width=info.width, height=info.height, K=K)
+    to_image = windowed_pixels(full, camera.width, camera.height, window).to_image
+    return CameraInfo(
+        header=info.header,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=info.distortion_model,
+        d=info.d,
+        k=(to_image @ K).ravel(),
+        r=info.r,
+        p=(to_image @ np.reshape(info.p, (3, 4))).ravel(),
+    )
 
 
 def scale_camera_info(info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:

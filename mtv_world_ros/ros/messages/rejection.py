@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 
 from mtv_world_ros.bounded_input import LimitError
+from mtv_world_ros.data.joint_plans import PlanError
 from mtv_world_ros.errors import MtvWorldError
 
 
@@ -36,6 +37,7 @@ class Reason(StrEnum):
     TRAJECTORY_TOO_LONG = 'trajectory_too_long'
     JOINT_NAMES = 'joint_names'
     JOINT_LIMITS = 'joint_limits'
+    JOINT_SPEEDS = 'joint_speeds'
     INSTRUCTION_TOO_LONG = 'instruction_too_long'
     NO_CLOCK = 'no_clock'
     NOT_ACTIVE = 'not_active'
@@ -72,3 +74,12 @@ def bounded(reason: Reason) -> Iterator[None]:
         yield
     except LimitError as error:
         raise Rejection(reason, str(error)) from error
+
+
+@contextmanager
+def refused_plan() -> Iterator[None]:
+    """Turns what is wrong with a plan into a `Rejection` that counts under its fault."""
+    try:
+        yield
+    except PlanError as error:
+        raise Rejection(Reason(error.fault), str(error)) from error

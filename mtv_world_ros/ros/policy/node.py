@@ -95,7 +95,9 @@ class PolicyNode(Node):
         self.create_timer(_TICK_S, self._guarded(self._loop.tick), clock=steady)
         self.create_timer(settings.diagnostics_period_s, self._on_period, clock=steady)
         self.add_on_set_parameters_callback(
-            lambda changed: check_calibration(changed, self._settings(), self._spec)
+            parameters.refusing(
+                lambda changed: check_calibration(changed, self._settings(), self._spec)
+            )
         )
         parameters.refuse_unknown(self)
         self.get_logger().info(f"ready: policy '{settings.policy}'")

@@ -16,10 +16,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.image_window import window_of, windowed_camera
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import to_positions
-from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 from mtv_world_ros.ros.parameters import NodeSettings
 
@@ -40,7 +41,7 @@ _AGE_LIMITS = {
 
 _INFO_FIELDS = tuple(CameraInfo.get_fields_and_field_types())
 #: fields whose change makes another camera of it
-_COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p')
+_COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p', 'binning_x', 'binning_y')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +50,7 @@ class Scene:
 
     Attributes:
         observation: frames and cameras at the model's size, positions in the robot's order.
-        camera_infos: CameraInfo of each view as received, with the image's frame_id.
+        camera_infos: CameraInfo of each view's images as received, with their frame_id.
         source_stamp_ns: stamp of the real frames that it goes back to [ns].
     """
 
@@ -178,6 +179,11 @@ class ObservationBuffer:
         )
         return ages
 
+    @property
+    def notes(self) -> list[str]:
+        """What camera infos leave open of the images that came, and how it is taken, in words."""
+        return [note for note in self._intrinsics.notes.values() if note]
+
     def problems(self, now_ns: int) -> list[str]:
         """Returns what is missing or too old for an observation, in words; empty = nothing."""
         limits, said = self._limits(), []
@@ -205,9 +211,11 @@ class ObservationBuffer:
         stamp_ns = min(stamp for stamp, _ in images)
         shown = [image_messages.to_rgb(message) for _, message in images]
         size = _common_size(shown, self._size)
-        cameras, frames = [], []
+        cameras, frames, infos = [], [], []
         for view, (_, message), frame in zip(self.views, images, shown, strict=True):
             camera = self._intrinsics.camera(view, width=frame.shape[1], height=frame.shape[0])
+            info = self._intrinsics.info(view, message.header.frame_id)
+            infos.append(image_messages.windowed_camera_info(info, camera))
             cameras.append(scaled(self._posed(camera, message), *size))
             frames.append(resize_frames(frame[None], *size)[0])
         observation = Observation(
@@ -216,11 +224,7 @@ class ObservationBuffer:
             positions=self._positions(stamp_ns, now_ns, limits),
             stamp_ns=stamp_ns,
         )
-        infos = tuple(
-            self._intrinsics.info(view, message.header.frame_id)
-            for view, (_, message) in zip(self.views, images, strict=True)
-        )
-        return Scene(observation=observation, camera_infos=infos, source_stamp_ns=stamp_ns)
+        return Scene(observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns)
 
     def _posed(self, camera: CameraModel, image: Image | CompressedImage) -> CameraModel:
         """The camera with its pose at the image's time."""
@@ -291,6 +295,9 @@ def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[i
 class Intrinsics:
     """The cameras as their CameraInfo describes them.
 
+    Attributes:
+        notes: what the infos leave open of images that came, and how it is taken; by view.
+
     Args:
         cameras: calibrated cameras of the V views; their poses are used.
     """
@@ -300,6 +307,7 @@ class Intrinsics:
         self._infos: dict[str, CameraInfo] = {}
         self._cameras: dict[str, CameraModel] = {}
         self._changed: dict[str, tuple[CameraInfo, str]] = {}
+        self.notes: dict[str, str] = {}
 
     def add(self, view: str, message: CameraInfo) -> None:
         """Stores the first info of a view and watches the later ones.
@@ -351,13 +359,10 @@ class Intrinsics:
             )
         if view in self._changed:
             raise Rejection(Reason.CAMERA_INFO_CHANGED, self._changed[view][1])
-        camera = self._cameras[view]
-        if (camera.width, camera.height) != (width, height):
-            raise Rejection(
-                Reason.CAMERA_INFO_INVALID,
-                f"view '{view}' has images of {width}x{height} but a camera_info for "
-                f'{camera.width}x{camera.height}; publish the camera_info of these images',
-            )
+        with rejected_as(Reason.CAMERA_INFO_INVALID):
+            window = window_of(self._infos[view])
+            camera, note = windowed_camera(self._cameras[view], width, height, window)
+        self.notes[view] = note
         return camera
 
     def has(self, view: str) -> bool:
@@ -418,6 +423,8 @@ def _differences(first: CameraInfo, later: CameraInfo) -> str:
         before, now = getattr(first, field), getattr(later, field)
         if not np.array_equal(before, now):
             said.append(f'{field} from {_short(before)} to {_short(now)}')
+    if not said and window_of(first) != window_of(later):
+        said.append(f'{window_of(first)} to {window_of(later)}')
     return ', '.join(said)
 
 

@@ -140,7 +140,7 @@ class MatchedSubscription:
             told = ParameterDescriptor(description=f'{text} of {self.topic}', read_only=True)
             if node.has_parameter(f'{prefix}.{name}'):  # a lifecycle node is configured again
                 return node.get_parameter(f'{prefix}.{name}').value
-            return node.declare_parameter(f'{prefix}.{name}', value, told).value
+            return parameters.declare_one(node, f'{prefix}.{name}', value, told)
 
         words = ', '.join(_RELIABILITIES)
         choice = declare('reliability', default, f'{words}: reliability of the subscription')

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable, TYPE_CHECKING
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mtv_world_ros.errors import CheckpointError, MtvWorldError
 from mtv_world_ros.pipeline import WorldModel
+from mtv_world_ros.ros.parameters import refusing
 
 if TYPE_CHECKING:
     from mtv_world_ros.model.lora import Adapter
@@ -65,6 +65,7 @@ class AdapterSwitch:
         if value:
             self._use(value, self._load(value))
         self._node = node
+        self._check = refusing(self._read_named)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
 
@@ -81,17 +82,15 @@ class AdapterSwitch:
             return model.read_adapter(model.own_adapter)
         return model.read_adapter(None if value == NONE else Path(value))
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _read_named(self, parameters: list[Parameter]) -> None:
         """Reads what is named, so that taking it cannot fail for what the user gave."""
         for parameter in parameters:
-            if parameter.name != NAME:
-                continue
-            value = str(parameter.value)
-            try:
-                self._read = (value, self._load(value))
-            except MtvWorldError as error:
-                return SetParametersResult(successful=False, reason=f'{NAME}: {error}')
-        return SetParametersResult(successful=True)
+            if parameter.name == NAME:
+                value = str(parameter.value)
+                try:
+                    self._read = (value, self._load(value))
+                except (MtvWorldError, OSError, ValueError) as error:
+                    raise CheckpointError(f'{NAME}: {error}') from error
 
     def _take(self, parameters: list[Parameter]) -> None:
         if self._read is not None and any(parameter.name == NAME for parameter in parameters):

@@ -7,12 +7,11 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
 from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.errors import CalibrationError, MtvWorldError
+from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
@@ -36,6 +35,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
         describer=settings.describer or None,
         serving=settings.serving,
         foresight=settings.foresight,
+        camera_check=settings.camera_check,
     )
 
 
@@ -94,16 +94,15 @@ def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
 
 def check_calibration(
     changed: Sequence[Parameter], settings: NodeSettings, spec: WorldModelSpec
-) -> SetParametersResult:
-    """Refuses a `calibration_file` that is wrong or lacks a view, before it is taken."""
+) -> None:
+    """Refuses a `calibration_file` that is wrong or lacks a view, before it is taken.
+
+    Raises:
+        Rejection: it cannot be used.
+    """
     for parameter in changed:
-        if parameter.name != 'calibration_file':
-            continue
-        try:
+        if parameter.name == 'calibration_file':
             reload_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
-        except MtvWorldError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-    return SetParametersResult(successful=True)
 
 
 def load_spec(checkpoint: str) -> WorldModelSpec:

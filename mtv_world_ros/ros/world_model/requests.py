@@ -7,11 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
+from mtv_world_ros.data.joint_plans import check_plan_joints
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import to_trajectory
-from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason, refused_plan, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
@@ -63,14 +65,17 @@ class RequestMaker:
         """
         settings = self._settings()
         trajectory = to_trajectory(message)
-        self._check_joints(trajectory, settings.limit_tolerance)
+        with refused_plan():
+            check_plan_joints(trajectory, self.robot, settings.limit_tolerance)
         stamp_ns = to_ns(message.header.stamp)
         limits = TimeLimits(
             trajectory_age=settings.max_trajectory_age_s, horizon=settings.max_horizon_s
         )
         last = self._last_scene() if self.imagine else None
         scene = last or self._real_scene(now_ns)
-        from_observation(trajectory, stamp_ns, scene.observation.stamp_ns, limits)
+        seen = scene.observation
+        from_now = from_observation(trajectory, stamp_ns, seen.stamp_ns, limits)
+        self._check_speeds(from_now, seen.positions, settings.limit_tolerance)
         self.num_requests += 1
         return Request(
             rollout=self.num_requests,
@@ -89,13 +94,15 @@ class RequestMaker:
             limit_tolerance=settings.limit_tolerance,
         )
 
-    def _check_joints(self, trajectory: JointTrajectory, tolerance: float) -> None:
-        """Joints that are not named keep their position; none is outside its limits."""
-        home = np.clip(0.0, self.robot.lower, self.robot.upper)
-        with rejected_as(Reason.JOINT_NAMES):
-            whole = match_joints(trajectory, self.robot, home, allow_missing=True)
-        with rejected_as(Reason.JOINT_LIMITS):
-            check_positions(self.robot, whole.positions, tolerance=tolerance)
+    def _check_speeds(
+        self, trajectory: JointTrajectory, positions: FloatArray, tolerance: float
+    ) -> None:
+        """From (J,) measured positions on, none is to be quicker than it can."""
+        robot = self.robot
+        positions = np.clip(positions, robot.lower, robot.upper)
+        whole = match_joints(trajectory, robot, positions, allow_missing=True)
+        with rejected_as(Reason.JOINT_SPEEDS):
+            check_plan(robot, whole, positions, tolerance=tolerance)
 
     def _real_scene(self, now_ns: int) -> Scene:
         if now_ns == 0:

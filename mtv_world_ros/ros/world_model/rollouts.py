@@ -7,11 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 import time
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -22,7 +20,7 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.parameters import refusing, Settings
 from mtv_world_ros.ros.sensing.live_robot import LiveRobot
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
@@ -88,8 +86,9 @@ class Rollouts:
 
     def _build(self, pipeline: Pipeline, undo: ExitStack) -> None:
         node, settings, reporter = self._node, self._settings, self._reporter
-        node.add_on_set_parameters_callback(self._check_calibration)
-        undo.callback(node.remove_on_set_parameters_callback, self._check_calibration)
+        check = refusing(lambda changed: check_calibration(changed, settings(), self._spec))
+        node.add_on_set_parameters_callback(check)
+        undo.callback(node.remove_on_set_parameters_callback, check)
         self._worker = RolloutWorker(pipeline, lambda: self._results.trigger())
         undo.callback(self._worker.close)
         self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
@@ -200,11 +199,13 @@ class Rollouts:
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
+            'cameras': self._worker.camera_check.text,
             **self._live.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
             **self._buffer.ages(self._node.get_clock().now().nanoseconds),
+            **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
         }
 
     def _on_image(self, view: str, message: Image | CompressedImage) -> None:
@@ -324,10 +325,6 @@ class Rollouts:
         self._buffer.clear()
         self._live.forget_moving()
         self._give_up()
-
-    def _check_calibration(self, changed: list[Parameter]) -> SetParametersResult:
-        """Refuses a `calibration_file` that cannot be used."""
-        return check_calibration(changed, self._settings(), self._spec)
 
 
 def _entities(node: Node) -> dict[str, list[object]]:

@@ -19,6 +19,7 @@ from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO
 from mtv_world_ros.ros.sensing.observations import Scene
+from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: a thread that is stuck in the model is not waited for longer than this at the end [s]
 _LONGEST_JOIN_S = 5.0
@@ -122,6 +123,9 @@ Result = Chunk | Ended
 class RolloutWorker:
     """Runs one request at a time in its own thread.
 
+    Attributes:
+        camera_check: what the newest episode's first pictures say about the cameras.
+
     Args:
         pipeline: the main path.
         notify: called from the thread whenever `take` has something new.
@@ -130,6 +134,7 @@ class RolloutWorker:
     def __init__(self, pipeline: Pipeline, notify: Callable[[], None]) -> None:
         self._pipeline, self._observed = pipeline, ObservedEpisode(pipeline)
         self._notify = notify
+        self.camera_check = CameraCheck()
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
@@ -409,6 +414,7 @@ class RolloutWorker:
                 scene.observation, instruction=request.instruction, objects=request.objects
             )
         episode.should_stop = self._should_stop
+        self.camera_check = episode.camera_check
         return scene, episode
 
     def _put(self, result: Result) -> None:

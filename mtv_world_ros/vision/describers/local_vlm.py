@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.config import Count, expected, Schema
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
@@ -134,6 +135,7 @@ def _load(config: LocalVlmConfig) -> tuple[Any, Any]:
         model = AutoModelForImageTextToText.from_pretrained(
             source, config=architecture, dtype=dtype, use_safetensors=True
         )
+        check_weights(model, Path(source))
         return model, _load_processor(source, architecture)
     except (OSError, ValueError, KeyError, ImportError) as error:
         raise CheckpointError(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_weights, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
 
 #: `model_type` in a folder's config.json -> (class in transformers, a public name of it)
@@ -76,6 +76,7 @@ def load_vision_model(folder: Path, kind: str, device: str) -> Any:
             f"the weights in '{folder}' lack {_some(sorted(report['missing_keys']))}; "
             f'download {public_name} again'
         )
+    check_weights(model, folder)
     return model.to(device).eval()
 
 

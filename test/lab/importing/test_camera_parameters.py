@@ -138,7 +138,7 @@ def test_a_camera_that_moves_has_a_pose_a_row(tmp_path):
     row = {key: value for key, value in row.items() if value is not None}
     values = {'K': np.repeat(np.array(K)[None], 4, axis=0), 'T': poses}
     source = source_of({'feature': 'image', 'camera': row}, tmp_path)
-    camera, track = camera_track(source, tmp_path, 0, values, (64, 48))
+    camera, track, _ = camera_track(source, tmp_path, 0, values, (64, 48))
     assert camera.T_mount_camera == pytest.approx(poses[0]) and track == pytest.approx(poses)
     poses[2, :3, :3] *= 2
     with pytest.raises(CalibrationError, match='not a rotation'):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import shutil
 import sys
@@ -267,3 +268,34 @@ def test_columns_that_are_named_like_the_joints_need_no_mapping(
     again = ['--mapping', str(tmp_path / 'out' / 'mapping.yaml')]
     assert main([*command, *again]) == 0
     assert '0 made, 2 kept' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    'mark',
+    [
+        {'info': {'is_depth_map': True}},
+        {'info': {'video.is_depth_map': True}},
+        {'video_info': {'video.is_depth_map': True}},
+        {'is_depth_map': True},
+    ],
+)
+@pytest.mark.parametrize('kind', ['v2.1', 'v3.0', 'images'])
+def test_a_depth_map_is_no_view_and_the_colour_cameras_are_named(
+    kind, mark, datasets, make_mapping, tmp_path
+):
+    root = Path(shutil.copytree(datasets(kind), tmp_path / 'set'))
+    file = root / 'meta/info.json'
+    described = json.loads(file.read_text())
+    described['features']['observation.images.front'] |= mark
+    file.write_text(json.dumps(described))
+    with pytest.raises(ConfigError, match='is a depth map .* observation.images'):
+        import_dataset(root, make_mapping(), tmp_path / 'out')
+
+
+def test_a_camera_that_is_said_to_be_no_depth_map_is_one(datasets, make_mapping, tmp_path):
+    root = Path(shutil.copytree(datasets('v2.1'), tmp_path / 'set'))
+    file = root / 'meta/info.json'
+    described = json.loads(file.read_text())
+    described['features']['observation.images.front']['info'] = {'video.is_depth_map': False}
+    file.write_text(json.dumps(described))
+    assert import_dataset(root, make_mapping(), tmp_path / 'out').made

@@ -1,5 +1,7 @@
 """`mtv-world robot`: what is guessed from a URDF against robot files that people wrote."""
 
+from xml.etree import ElementTree
+
 from crane import load, URDF, write_robot
 import cv2
 import numpy as np
@@ -137,3 +139,24 @@ def test_what_has_no_arm_is_refused(tmp_path):
     (tmp_path / 'box.urdf').write_text('<robot name="box"><link name="base"/></robot>')
     with pytest.raises(RobotError, match='has no arm'):
         guess_robot(tmp_path / 'box.urdf')
+
+
+@pytest.mark.parametrize('limit', ['', 'lower="0" upper="0"', 'lower="0.3" upper="0.3"'])
+@pytest.mark.parametrize('joint', ['nod', 'jaw_left'])
+def test_a_joint_without_a_range_is_named_before_a_file_is_written(
+    crane, tmp_path, capsys, joint, limit
+):
+    root = ElementTree.fromstring(URDF)
+    given = dict(part.split('=') for part in limit.replace('"', '').split())
+    for element in root.iter('limit'):
+        owner = next(j for j in root.iter('joint') if element in list(j))
+        if owner.get('name') == joint:
+            element.attrib = {'effort': '1', 'velocity': '2', **given}
+    urdf, out = crane.with_name('crane.urdf'), tmp_path / 'guessed.yaml'
+    urdf.write_text(ElementTree.tostring(root, encoding='unicode'))
+    assert main(['robot', str(urdf), '--out', str(out)]) == 1
+    said = capsys.readouterr().err
+    assert f"joint '{joint}'" in said and 'cannot move' in said and "'continuous'" in said
+    assert not out.exists()
+    with pytest.raises(RobotError, match=f"'{joint}' of robot 'crane' cannot move"):
+        load_robot(crane)

@@ -168,7 +168,7 @@ def test_refuses_the_image_and_keeps_the_one_before(node, client, ros, case):
 
 def test_refuses_images_of_another_size_than_their_camera_info(node, client, ros):
     stamp_ns = client.now_ns()
-    pixels = ros.make_pixels('low')[::2, ::2]
+    pixels = ros.make_pixels('low')[::2]
     small = ros.to_image(pixels, ros.make_header('low', stamp_ns))
     client.send_scene(stamp_ns, image_low=small)
     ended = client.imagine_one(scene='sent')

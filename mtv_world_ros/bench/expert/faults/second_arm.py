@@ -31,6 +31,7 @@ class Visit:
         meets: time from the begin of the move, before scaling [s].
         done: number of its way points that are done then.
         waits: the first arm waits at its first way point if the second one takes longer.
+        is_timed: by a way point of the first arm.
     """
 
     ways: Callable[[float], Stops]
@@ -38,6 +39,7 @@ class Visit:
     meets: float
     done: int
     waits: bool = False
+    is_timed: bool = True
 
 
 def visit_of(
@@ -77,6 +79,7 @@ def visit_of(
         meets=sum(times[:number]) + spec.get('late', 0.0),
         done=spec.get('done', 0),
         waits=bool(spec.get('waits')),
+        is_timed=bool({'before', 'after'} & spec.keys()),
     )
 
 

@@ -87,11 +87,12 @@ class WayPointFaults:
             home: where the second arm rests.
             times: of the way points, before scaling [s].
         """
-        return [
+        visits = (
             visit_of(fault.second_arm, stops, size, draws, home, times)
             for fault, size in self._faults
             if fault.second_arm
-        ]
+        )
+        return sorted(visits, key=lambda visit: not visit.waits)
 
 
 def with_faults(

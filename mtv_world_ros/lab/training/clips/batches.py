@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data.recording import chunk_of, clip_starts, cut_clip, Recording
+from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
@@ -28,9 +28,6 @@ from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.lab.training.clips.past import (
     draw_past,
     history_before,
-    history_of_lead,
-    Lead,
-    lead_before,
     Past,
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
@@ -52,8 +49,6 @@ class Batch:
             history; see `past.py`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
         history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
-        leads: B entries: the preceding chunks of clips that start from the model's own
-            prediction, None for other clips; empty = no such clip.
         step: of the training, from 0.
         numbers: of its clips within the step's whole batch, which processes and accumulation
             split; each clip's noise depends on its own.
@@ -67,7 +62,6 @@ class Batch:
     anchor: Tensor | None = None
     history: Tensor | None = None
     history_sigmas: Tensor | None = None
-    leads: tuple[Lead | None, ...] = ()
     step: int = 0
     numbers: Sequence[int] = ()
 
@@ -89,7 +83,6 @@ class _Sample(NamedTuple):
     trajectory: ByteArray | None
     object_ids: ByteArray | None
     actions: np.ndarray | None
-    lead: Lead | None
     past: Past | None
 
 
@@ -137,7 +130,7 @@ class BatchSource:
             actions=actions,
         )
         self._spec, self._augment, self._seed = spec, config.augment, seed
-        self._self_rollout, self._history = config.self_rollout, config.history
+        self._history = config.history
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None
@@ -182,25 +175,20 @@ class BatchSource:
             trajectory=_stack([s.trajectory for s in samples]),
             object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
             actions=torch.from_numpy(collate(encoded)) if encoded else None,
-            leads=tuple(s.lead for s in samples),
             **pasts([s.past for s in samples]),
         )
 
     def _clip(self, step: int, number: int) -> _Sample:
-        return self._sample(np.random.default_rng((self._seed, step, number)), step)
+        return self._sample(np.random.default_rng((self._seed, step, number)))
 
-    def _sample(self, rng: np.random.Generator, step: int) -> _Sample:
+    def _sample(self, rng: np.random.Generator) -> _Sample:
         recording, starts = self._choose(rng)
         start = int(starts[rng.integers(len(starts))])
-        lead = lead_before(recording, start, self._spec, self._self_rollout, step, rng)
-        if lead is None:
-            clip = cut_clip(recording, start, self._spec)
-        else:
-            clip = chunk_of(lead.clip, lead.num_chunks, self._spec.num_frames)
+        clip = cut_clip(recording, start, self._spec)
         begun = self._augment.begun_share
-        if lead is None and begun and rng.random() < begun:
+        if begun and rng.random() < begun:
             clip = clip.begun
-        past = self._past(recording, start, lead, rng)
+        past = self._past(recording, start, rng)
         names = recording.names
         if rng.random() < self._augment.name_dropout:
             names = tuple(name for name in names if rng.random() < 0.5)
@@ -210,24 +198,17 @@ class BatchSource:
             colours = rng.permutation(3)
             frames = frames[..., colours]
             past = past and Past(past.anchor[..., colours], past.frames[..., colours], past.sigma)
-            lead = lead and replace(lead, colours=tuple(colours.tolist()))
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
-        lead = lead and replace(lead, names=names)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, lead, past)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, past)
 
-    def _past(
-        self, recording: Recording, start: int, lead: Lead | None, rng: np.random.Generator
-    ) -> Past | None:
+    def _past(self, recording: Recording, start: int, rng: np.random.Generator) -> Past | None:
         """Anchor and history of the clip, in models that take them."""
         if not self._history.on:  # nothing is drawn: runs without history keep their clips
             return None
-        if lead is None:
-            history = history_before(recording, start, self._spec, self._history, rng)
-        else:
-            history = history_of_lead(lead, self._history)
+        history = history_before(recording, start, self._spec, self._history, rng)
         return draw_past(history, self._history, rng)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:

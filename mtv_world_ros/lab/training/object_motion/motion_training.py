@@ -194,9 +194,7 @@ def _network(
 ) -> ObjectMotionNetwork:
     if init is None:
         width, hidden = config.width or _WIDTH, config.hidden or _HIDDEN
-        return ObjectMotionNetwork(
-            count, width, hidden, fingertips=True, yielding=True, touching=True
-        )
+        return ObjectMotionNetwork(count, width, hidden, fingertips=True, yielding=True)
     try:
         return init.widened(config.width or init.width, config.hidden or init.hidden)
     except ValueError as error:

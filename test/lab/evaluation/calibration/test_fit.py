@@ -161,7 +161,7 @@ def test_weights_are_not_negative_and_are_the_best_of_those():
 
 @pytest.mark.parametrize('seed', range(40))
 def test_bounded_fit_is_at_the_minimum_that_scipys_slsqp_finds(seed):
-    """Random data sets, every other one against the prior: see benchmark/logistic_fit.py."""
+    """Random data sets, every other one against the prior."""
     rng = np.random.default_rng(seed)
     num, count, l2 = int(rng.integers(8, 200)), int(rng.integers(1, 7)), 10 ** rng.uniform(-2, 1)
     prior = np.abs(rng.normal(size=count)) * 10 ** rng.uniform(-1, 1)

@@ -1,0 +1,313 @@
+"""Plans of joints: one reader of JointTrajectory messages for recordings and the live node."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import groupby, pairwise
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.bounded_input import check_limit, LimitError
+from mtv_world_ros.data.episode import JointStates
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import TrajectoryError
+from mtv_world_ros.geometry.resample import match_joints, resample, SAME_S
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+
+Plan = tuple[int, JointTrajectory]
+
+NANO = 1_000_000_000
+#: one-point plans that follow one another within this time are a stream of commands [s]
+_STREAM_GAP_S = 0.5
+_LEAST_STREAM = 3
+#: measured positions are taken this often at most [s]
+_PERIOD_S = 0.02
+#: joints that no plan names have moved between two plans from this on [rad or m]
+_MOVED = 1e-3
+
+
+class PlanFault(StrEnum):
+    """What a plan is refused for, as `/diagnostics` and `~/report` count it."""
+
+    EMPTY = 'trajectory_empty'
+    MALFORMED = 'trajectory_malformed'
+    NOT_FINITE = 'trajectory_not_finite'
+    TIMES = 'trajectory_times'
+    NAMES = 'joint_names'
+    LIMITS = 'joint_limits'
+
+
+class PlanError(TrajectoryError):
+    """A plan cannot be used; `fault` is what it counts under."""
+
+    def __init__(self, fault: PlanFault, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+def read_plan(message: Any) -> JointTrajectory:
+    """Returns the trajectory of a message, of rclpy's or rosbags' class.
+
+    Times count from the message's stamp. Velocities are kept where every point has them.
+
+    Raises:
+        PlanError: empty, names repeated, points of the wrong length, NaN, times not increasing.
+    """
+    names, points = list(message.joint_names), message.points
+    if not names or not len(points):
+        raise PlanError(
+            PlanFault.EMPTY,
+            f'the trajectory has {len(names)} joint names and {len(points)} points; it needs at '
+            'least one of each',
+        )
+    try:
+        check_limit('joint_names', len(names), 'the trajectory')
+        check_limit('trajectory_points', len(points), 'the trajectory')
+    except LimitError as error:
+        raise PlanError(PlanFault.MALFORMED, str(error)) from error
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+    if repeated:
+        raise PlanError(PlanFault.NAMES, f'joint names {repeated} occur more than once')
+    positions = _rows(names, points, 'positions')
+    has_speeds = all(len(point.velocities) for point in points)
+    velocities = _rows(names, points, 'velocities') if has_speeds else None
+    after = [point.time_from_start for point in points]
+    try:
+        return JointTrajectory(
+            joint_names=tuple(names),
+            times=np.array([(one.sec * NANO + one.nanosec) / NANO for one in after]),
+            positions=positions,
+            velocities=velocities,
+        )
+    except TrajectoryError as error:
+        raise PlanError(PlanFault.TIMES, str(error)) from error
+
+
+def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray:
+    """One field of all points, (T, J), checked."""
+    rows = [getattr(point, field) for point in points]
+    for index, row in enumerate(rows):
+        if len(row) != len(names):
+            raise PlanError(
+                PlanFault.MALFORMED,
+                f'point {index} has {len(row)} {field} for {len(names)} joints'
+                if len(row)
+                else f'point {index} has no {field}; velocities alone are not integrated',
+            )
+    values = np.array(rows, np.float64)
+    if not np.isfinite(values).all():
+        point, joint = np.argwhere(~np.isfinite(values))[0]
+        raise PlanError(
+            PlanFault.NOT_FINITE,
+            f"joint '{names[joint]}' has {field} {values[point, joint]} at point {point}; every "
+            'value must be finite',
+        )
+    return values
+
+
+def check_plan_joints(plan: JointTrajectory, robot: RobotModel, tolerance: float) -> None:
+    """Checks that all joints that are named are the robot's, and none is outside its limits.
+
+    Args:
+        plan: of all joints, or of some of them.
+        robot: the robot.
+        tolerance: by which limits may be exceeded [rad or m].
+
+    Raises:
+        PlanError: as said.
+    """
+    home = np.clip(0.0, robot.lower, robot.upper)
+    try:
+        whole = match_joints(plan, robot, home, allow_missing=True)
+    except TrajectoryError as error:
+        raise PlanError(PlanFault.NAMES, str(error)) from error
+    try:
+        check_positions(robot, whole.positions, tolerance=tolerance)
+    except TrajectoryError as error:
+        raise PlanError(PlanFault.LIMITS, str(error)) from error
+
+
+def following(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:
+    """Positions as commands: each is reached at its own stamp.
+
+    Args:
+        states: positions over time.
+        chunk_s: length of a trajectory [s].
+        start_ns: where the first trajectory starts: none can be played before there are images.
+
+    Returns:
+        (start stamp [ns], trajectory), each of which ends where the next one starts.
+    """
+    stamps = states.stamps_ns
+    seconds = (stamps - stamps[0]) * 1e-9
+    chunks: list[Plan] = []
+    first = int(np.searchsorted(stamps, start_ns))
+    while first < len(stamps) - 1:
+        last = int(np.searchsorted(seconds, seconds[first] + chunk_s))
+        last = min(max(last, first + 1), len(stamps) - 1)
+        part = slice(first + 1, last + 1)
+        trajectory = JointTrajectory(
+            joint_names=states.joint_names,
+            times=np.asarray(seconds[part] - seconds[first], np.float64),
+            positions=states.positions[part],
+        )
+        chunks.append((int(stamps[first]), trajectory))
+        first = last
+    return chunks
+
+
+def join_streams(plans: Sequence[Plan], chunk_s: float) -> tuple[list[Plan], int]:
+    """Joins plans of one point that follow one another quickly, as MoveIt Servo sends them.
+
+    Args:
+        plans: (start stamp [ns], trajectory), by stamp.
+        chunk_s: length of the plans that are made of them [s].
+
+    Returns:
+        Plans by stamp, and how many of one point were joined.
+    """
+    joined: list[Plan] = []
+    count = 0
+    for run in _runs(plans):
+        if len(run) < _LEAST_STREAM:
+            joined += run
+            continue
+        count += len(run)
+        start_ns = run[0][0]
+        at = np.array([s + round(float(p.times[0]) * NANO) for s, p in run], np.int64)
+        rows = np.concatenate([p.positions for _, p in run])
+        is_new = np.diff(at, prepend=start_ns) > 0
+        is_new &= at == np.maximum.accumulate(at)
+        states = JointStates(
+            stamps_ns=np.concatenate([[start_ns], at[is_new]]),
+            joint_names=run[0][1].joint_names,
+            positions=np.concatenate([rows[:1], rows[is_new]]),
+        )
+        joined += following(states, chunk_s, start_ns)
+    return joined, count
+
+
+def _runs(plans: Sequence[Plan]) -> list[list[Plan]]:
+    """Plans of one point of the same joints that follow one another; others are alone."""
+    numbers = [0]
+    for (before_ns, before), (now_ns, now) in pairwise(plans):
+        goes_on = (
+            len(before.times) == len(now.times) == 1
+            and before.joint_names == now.joint_names
+            and (now_ns - before_ns) / NANO <= _STREAM_GAP_S
+        )
+        numbers.append(numbers[-1] + (not goes_on))
+    grouped = groupby(zip(numbers, plans, strict=False), key=lambda item: item[0])
+    return [[plan for _, plan in group] for _, group in grouped]
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedPlans:
+    """Plans of all joints.
+
+    Attributes:
+        plans: (start stamp [ns], trajectory), by stamp.
+        taken: joints whose commands are measured positions, as some plan does not name them.
+    """
+
+    plans: list[Plan]
+    taken: tuple[str, ...] = ()
+
+
+def complete_plans(
+    plans: Sequence[Plan], states: JointStates | None, robot: RobotModel, chunk_s: float
+) -> CompletedPlans:
+    """Gives joints that plans leave out the positions that were measured meanwhile.
+
+    Those of a gripper, say, that an action drives. Where such joints move between two plans,
+    plans are made of that. Plans that name joints which are not the robot's are left as they are.
+
+    Args:
+        plans: (start stamp [ns], trajectory), by stamp.
+        states: measured positions; None = nothing is completed.
+        robot: the robot.
+        chunk_s: length of plans between plans [s].
+    """
+    if states is None or not set(robot.joint_names) <= set(states.joint_names):
+        return CompletedPlans(list(plans))
+    measured = _Measured(states, robot)
+    done: list[Plan] = []
+    taken: dict[str, None] = {}
+    for index, (stamp_ns, plan) in enumerate(plans):
+        missing = [name for name in robot.joint_names if name not in plan.joint_names]
+        if not missing or not set(plan.joint_names) <= set(robot.joint_names):
+            done.append((stamp_ns, plan))
+            continue
+        taken.update(dict.fromkeys(missing))
+        next_ns = plans[index + 1][0] if index + 1 < len(plans) else int(states.stamps_ns[-1])
+        done += measured.completed(stamp_ns, plan, missing, next_ns, chunk_s)
+    return CompletedPlans(done, tuple(taken))
+
+
+class _Measured:
+    """Measured positions between stamps.
+
+    Args:
+        states: at least those of the robot.
+        robot: whose order is taken.
+    """
+
+    def __init__(self, states: JointStates, robot: RobotModel) -> None:
+        columns = [states.joint_names.index(name) for name in robot.joint_names]
+        self._stamps, self._rows = states.stamps_ns, states.positions[:, columns]
+        self._robot = robot
+
+    def at(self, stamp_ns: int, seconds: FloatArray) -> FloatArray:
+        """(N, J) at times after a stamp [s]."""
+        known = (self._stamps - stamp_ns) * 1e-9
+        return np.stack([np.interp(seconds, known, row) for row in self._rows.T], axis=1)
+
+    def times(self, stamp_ns: int, begin_s: float, end_s: float) -> FloatArray:
+        """Times of samples after a stamp [s], no denser than needed."""
+        if end_s <= begin_s:
+            return np.zeros(0)
+        known = (self._stamps - stamp_ns) * 1e-9
+        inside = known[(known > begin_s + SAME_S) & (known <= end_s + SAME_S)]
+        slots = np.floor((inside - begin_s) / _PERIOD_S)
+        return np.asarray(inside[np.unique(slots, return_index=True)[1]], np.float64)
+
+    def completed(
+        self,
+        stamp_ns: int,
+        plan: JointTrajectory,
+        missing: Sequence[str],
+        next_ns: int,
+        chunk_s: float,
+    ) -> list[Plan]:
+        """The plan with all joints, and plans of what the missing ones do until the next one."""
+        robot = self._robot
+        own = [robot.joint_names.index(name) for name in plan.joint_names]
+        others = [robot.joint_names.index(name) for name in missing]
+        end_s, next_s = float(plan.times[-1]), (next_ns - stamp_ns) / NANO
+        grid = _union(plan.times, self.times(stamp_ns, 0.0, min(end_s, next_s)))
+        start = self.at(stamp_ns, np.zeros(1))[0, own]
+
+        def rows(times: FloatArray) -> FloatArray:
+            table = self.at(stamp_ns, times)
+            table[:, own] = resample(plan, start, times)
+            return table
+
+        names = robot.joint_names
+        whole = JointTrajectory(joint_names=names, times=grid, positions=rows(grid))
+        rest = np.concatenate([[end_s], self.times(stamp_ns, end_s, next_s)])
+        held = rows(rest)
+        if len(rest) < 2 or np.ptp(held[:, others], axis=0).max() < _MOVED:
+            return [(stamp_ns, whole)]
+        stamps = stamp_ns + np.round(rest * NANO).astype(np.int64)
+        between = JointStates(stamps_ns=stamps, joint_names=names, positions=held)
+        return [(stamp_ns, whole), *following(between, chunk_s, int(stamps[0]))]
+
+
+def _union(times: FloatArray, more: FloatArray) -> FloatArray:
+    """Both, in order; of `more` those that are not among the times already."""
+    apart = np.abs(more[:, None] - times[None]).min(axis=1, initial=np.inf) > SAME_S
+    return np.sort(np.concatenate([times, more[apart]]))

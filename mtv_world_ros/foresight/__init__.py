@@ -1,0 +1,1 @@
+"""What objects will do under a plan: solids from masks, futures of them on MuJoCo."""

@@ -1,0 +1,115 @@
+"""What is not known before a plan is executed, drawn once for each of several futures.
+
+Shape letters: O solids, D degrees of freedom of the arms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.foresight.arms import Drives
+from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
+
+#: what is found as near to the table stands on it [m]
+STANDS_M = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Future:
+    """One way in which what is not known may be.
+
+    Attributes:
+        settings: of contact.
+        solids: O.
+        zeros: (D,) by which the arms are elsewhere than they report [rad or m].
+        delay_s: by which they follow later.
+    """
+
+    settings: ContactSettings
+    solids: tuple[Solid, ...]
+    zeros: FloatArray
+    delay_s: float = 0.0
+
+
+def draw_futures(
+    settings: ContactSettings,
+    solids: Sequence[Solid],
+    drives: Drives,
+    camera_m: float = 0.0,
+) -> tuple[Future, ...]:
+    """Returns `settings.num_motions` futures; in the first all is as it was found.
+
+    The same number always gives the same draws, so that plans are compared under the same ones.
+
+    Args:
+        settings: of contact; their spread says how far futures differ.
+        solids: O, as found.
+        drives: of the arms.
+        camera_m: standard deviation of where the cameras see everything, which moves all solids
+            together [m].
+    """
+    return tuple(
+        _drawn(settings, solids, drives, camera_m, number)
+        for number in range(settings.num_motions)
+    )
+
+
+def _drawn(
+    settings: ContactSettings,
+    solids: Sequence[Solid],
+    drives: Drives,
+    camera_m: float,
+    number: int,
+) -> Future:
+    rng, spread, share = np.random.default_rng((2, number)), settings.spread, float(number > 0)
+
+    def scaled(deviation: float) -> float:
+        return float(np.exp(share * deviation * rng.normal()))
+
+    changed = settings.model_copy(
+        update={
+            'grip_friction': settings.grip_friction * scaled(spread.grip),
+            'table_friction': settings.table_friction * scaled(spread.friction),
+            'finger_stiffness': settings.finger_stiffness * scaled(spread.force),
+        }
+    )
+    heavier = scaled(spread.weight)
+    changed = changed.model_copy(
+        update={'density': settings.density * heavier, 'tray_kg': settings.tray_kg * heavier}
+    )
+    zeros = share * spread.zero_rad * rng.normal(size=len(drives.names))
+    delay_s = share * spread.delay_s * abs(float(rng.normal()))
+    moved = share * camera_m * rng.normal(size=2)
+    return Future(
+        settings=changed,
+        solids=tuple(_disturbed(solid, changed, share, moved, rng) for solid in solids),
+        zeros=np.where(drives.fingers, 0.0, zeros),
+        delay_s=delay_s,
+    )
+
+
+def _disturbed(
+    solid: Solid,
+    settings: ContactSettings,
+    share: float,
+    moved: FloatArray,
+    rng: np.random.Generator,
+) -> Solid:
+    """A solid a little elsewhere, of a little other size; what stands on the table still does."""
+    noise, spread = share * rng.normal(size=5), settings.spread
+    wide, long, high = solid.size * np.exp(spread.size * noise[[0, 0, 1]])
+    x, y = solid.centre[:2] + spread.place_m * noise[2:4] + moved
+    bottom = solid.centre[2] - solid.size[2] / 2
+    if abs(bottom - settings.table_m) < STANDS_M:
+        bottom = settings.table_m
+    return replace(
+        solid,
+        centre=np.array([x, y, bottom + high / 2]),
+        size=np.array([wide, wide if solid.is_round else long, high]),
+        yaw=solid.yaw + spread.turn_rad * float(noise[4]),
+    )

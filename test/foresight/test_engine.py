@@ -1,0 +1,170 @@
+"""Futures side by side: stopping, passing by, plausibility, delays, warnings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import time
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.foresight import engine as engine_module
+from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.engine import Engine
+from mtv_world_ros.foresight.futures import draw_futures
+from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
+from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.model.object_motion.contact_settings import ContactSettings, ContactSpread
+
+SETTINGS = ContactSettings(
+    finger_stiffness=400.0,
+    finger_damping=10.0,
+    finger_mass_kg=0.05,
+    grip_friction=1.0,
+    table_friction=0.5,
+    density=500.0,
+    tray_kg=0.4,
+    num_motions=4,
+)
+BLOCK = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.02, 0.03, 0.04]))
+AWAY = Solid(centre=np.array([0.5, 0.2, 0.02]), size=np.full(3, 0.04))
+
+
+def batch_of(robot, *solids, threads=1, **changed):
+    settings = SETTINGS.model_copy(update=changed)
+    engine = Engine(Arms(robot, None), threads)
+    return engine.begin(draw_futures(settings, solids, engine.arms.drives))
+
+
+def picking(seconds: float = 2.0) -> np.ndarray:
+    """Commands (N, 2): down, close, up, at a block in the middle."""
+    times = np.arange(0, seconds + 0.01, 0.02)
+    height = 0.02 + 0.2 * np.clip(1 - times / 0.5, 0, 1) + 0.1 * np.clip((times - 1) / 0.5, 0, 1)
+    return np.stack([height, np.where(times < 0.6, 0.04, 0.0)], -1)
+
+
+def test_two_threads_and_parts_of_a_plan_give_the_same(lift):
+    commands = picking()
+    whole, _ = batch_of(lift, BLOCK, AWAY).advance(commands, 5)
+    batch = batch_of(lift, BLOCK, AWAY, threads=2)
+    first, state = batch.advance(commands[:51], 5)
+    second, _ = batch.advance(commands[50:], 5, state)
+    np.testing.assert_array_equal(second.points[:, 0], first.points[:, -1])
+    np.testing.assert_allclose(second.points[:, -1], whole.points[:, -1], atol=1e-6)
+
+
+def test_arms_that_pass_by_move_as_they_would_by_dynamics(lift, monkeypatch):
+    commands = picking()
+    passed, _ = batch_of(lift, BLOCK, AWAY).advance(commands, 5)
+    monkeypatch.setattr(engine_module._Run, 'may_pass', lambda *_: False)
+    computed, _ = batch_of(lift, BLOCK, AWAY).advance(commands, 5)
+    assert passed.steps < 0.9 * computed.steps
+    np.testing.assert_allclose(passed.points, computed.points, atol=1e-3)
+    np.testing.assert_allclose(passed.joints, computed.joints, atol=2e-3)
+
+
+def test_futures_differ_in_what_is_not_known_and_the_first_does_not(lift):
+    futures = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives, camera_m=0.01)
+    first, *others = futures
+    assert first.settings == SETTINGS and first.delay_s == 0 and not first.zeros.any()
+    np.testing.assert_array_equal(first.solids[0].centre, BLOCK.centre)
+    for future in others:
+        assert future.settings.grip_friction != SETTINGS.grip_friction
+        assert future.settings.density != SETTINGS.density
+        assert future.delay_s > 0 and future.zeros[0] != 0
+        assert future.solids[0].centre[2] == future.solids[0].size[2] / 2  # it stands
+    again = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives, camera_m=0.01)
+    np.testing.assert_array_equal(again[1].solids[0].centre, others[0].solids[0].centre)
+
+
+def test_nothing_differs_where_all_is_known(lift):
+    sure = ContactSpread(**dict.fromkeys(ContactSpread.model_fields, 0.0))
+    motion, _ = batch_of(lift, BLOCK, spread=sure).advance(picking(), 5)
+    np.testing.assert_array_equal(motion.points[1:], motion.points[:-1])
+
+
+def test_a_late_future_does_the_same_later(lift):
+    spread = ContactSpread(**dict.fromkeys(ContactSpread.model_fields, 0.0) | {'delay_s': 0.1})
+    batch = batch_of(lift, AWAY, spread=spread)
+    joints = batch.advance(picking(), 1)[0].joints[..., 0]
+    for number in (1, 2, 3):
+        late = round(batch.futures[number].delay_s / 0.02)
+        if late:
+            np.testing.assert_allclose(
+                joints[number, late:], joints[0, :-late], atol=0.02 * 0.4 + 1e-3
+            )
+
+
+def test_it_stops_within_50_ms(lift):
+    batch = batch_of(lift, BLOCK, AWAY, num_motions=64)
+    batch.advance(picking(0.2), 5)  # all is compiled
+    asked = []
+
+    def should_stop() -> bool:
+        asked.append(time.thread_time())
+        return len(asked) > 12
+
+    with pytest.raises(RolloutPreempted):
+        batch.advance(picking(), 5, should_stop=should_stop)
+    # by the time of this thread, which computes all: other work on the machine does not count
+    assert np.max(np.diff(asked)) < 0.05
+
+
+@pytest.mark.parametrize('threads', [1, 2])
+def test_a_future_that_cannot_be_is_dropped_and_said(
+    lift, threads, capfd, caplog, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(engine_module, '_told', set())
+    batch = batch_of(lift, AWAY, threads=threads)
+    state = batch.start(picking()[0])
+    physics = state.physics.copy()
+    physics[1, 1 + batch._scene.model.nq + batch._scene.solid_dofs[0]] = 1e3  # m/s
+    physics[2, 1 + batch._scene.solid_qpos[0]] = np.nan
+    state = replace(state, physics=physics, still=np.zeros(4, int))
+    motion, then = batch.advance(picking(), 5, state)
+    assert set(then.lost) == {1, 2}
+    assert then.lost[2] == 'the engine diverged'
+    assert then.lost[1] in ('an object left the table for good', then.lost[2])
+    assert np.isfinite(motion.points[[0, 3]]).all()
+    assert not list(tmp_path.iterdir()) and capfd.readouterr() == ('', '')
+    told = [record.getMessage() for record in caplog.records]
+    assert told and len(told) == len(set(told)) and all('MuJoCo' in line for line in told)
+
+
+def tracked(robot, *solids, **changed) -> TrackedSolids:
+    foresight = SolidForesight(robot, None, SETTINGS.model_copy(update=changed))
+    names = tuple(f'object {k}' for k in range(len(solids)))
+    return TrackedSolids(foresight=foresight, names=names, solids=solids)
+
+
+def test_where_too_few_futures_are_left_nothing_is_said(lift):
+    one = tracked(lift, AWAY)
+    _, one = one.advance(picking(0.2))
+    lost = replace(one, state=replace(one.state, lost=dict.fromkeys(range(3), 'diverged')))
+    motions, _ = lost.advance(picking(0.2))
+    assert all(np.isnan(motion.points).all() for motion in motions)
+    assert lost.reasons == ('3 of 4 foreseen futures do not count: diverged',)
+    few = replace(one, state=replace(one.state, lost={2: 'diverged'}))
+    motions, _ = few.advance(picking(0.2))
+    assert [motion.weight for motion in motions] == [1, 1, 0, 1]
+
+
+def test_what_floats_is_named_and_not_foreseen(lift):
+    floating = replace(AWAY, centre=np.array([0.5, 0.2, 0.3]))
+    motions, then = tracked(lift, BLOCK, floating).advance(picking(0.4))
+    assert np.isnan(motions[0].points[:, 1]).all() and np.isfinite(motions[0].points[:, 0]).all()
+    assert then.reasons == ("'object 1' seems to float 280 mm above the table",)
+
+
+def test_what_stands_on_another_does_not_float(lift):
+    upper = replace(AWAY, centre=np.array([0.5, 0.2, 0.06]))
+    motions, then = tracked(lift, AWAY, upper).advance(picking(0.4))
+    assert not then.reasons and np.isfinite(motions[0].points).all()
+
+
+def test_what_is_not_seen_by_two_views_is_not_foreseen_and_hit_by_nothing(lift):
+    motions, then = tracked(lift, None, AWAY).advance(picking(0.4))
+    assert np.isnan(motions[0].points[:, 0]).all() and np.isfinite(motions[0].points[:, 1]).all()
+    assert np.isnan(then.sizes[:, 0]).all()

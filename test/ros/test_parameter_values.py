@@ -1,0 +1,76 @@
+"""Values of parameters that ROS reads otherwise than it is written, on the line and in files."""
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+NODE = """
+import sys
+from rclpy.node import Node
+from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+from mtv_world_ros.ros.run_node import run
+
+kind = {'world_model': parameters.Settings, 'policy': PolicySettings}[sys.argv[1]]
+
+
+def make():
+    node = Node(sys.argv[1])
+    parameters.declare(node, kind)
+    print(parameters.read(node, kind).model_dump_json())
+    return node
+
+
+sys.exit(run(make, sys.argv[1:], spin=lambda node: None))
+"""
+
+
+def ask(ros, node, *arguments):
+    return subprocess.run(
+        [sys.executable, '-c', NODE, node, '--ros-args', *arguments],
+        env=ros.ENVIRONMENT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+
+
+def lists(kind):
+    return [name for name, field in kind.model_fields.items() if isinstance(field.default, tuple)]
+
+
+@pytest.mark.parametrize('in_file', [False, True])
+def test_an_empty_list_is_an_empty_list(ros, tmp_path, in_file):
+    from mtv_world_ros.ros.parameters import Settings
+    from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+
+    asked = 0
+    for node, kind in (('world_model', Settings), ('policy', PolicySettings)):
+        for name in lists(kind):
+            file = tmp_path / f'{node}.yaml'
+            file.write_text(yaml.safe_dump({node: {'ros__parameters': {name: []}}}))
+            given = ['--params-file', str(file)] if in_file else ['-p', f'{name}:=[]']
+            done = ask(ros, node, *given)
+            assert done.returncode == 0, done.stderr
+            assert f'"{name}":[]' in done.stdout
+            asked += 1
+    assert asked
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        ('seed:=[]', "'seed' is given without a value, or as []; it must be of type int in [0,"),
+        ('pace:=[]', "'pace' is given without a value"),
+        ('objects:=[1.0, 2]', 'all items of a list must be of one type'),
+        ('objects:=[a, 1]', 'all items of a list must be of one type'),
+        ('objects:=[1, 2]', "'objects' must be of type list"),
+        ('objects:=red', "'objects' must be of type list"),
+        ('instruction:=', 'expected -p NAME:=VALUE'),
+        ('seed:={a: 1}', 'expected -p NAME:=VALUE'),
+    ],
+)
+def test_what_cannot_be_a_value_is_one_line_that_says_what_can(ros, given, said):
+    done = ask(ros, 'world_model', '-p', given)
+    assert done.returncode == 1
+    assert said in done.stderr and 'Traceback' not in done.stderr
+    assert done.stderr.splitlines()[-1].startswith('ConfigError: ')
