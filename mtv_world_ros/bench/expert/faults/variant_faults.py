@@ -92,7 +92,7 @@ class WayPointFaults:
             for fault, size in self._faults
             if fault.second_arm
         )
-        return sorted(visits, key=lambda visit: not visit.waits)
+        return sorted(visits, key=lambda visit: (not visit.waits, not visit.is_timed, visit.meets))
 
 
 def with_faults(
