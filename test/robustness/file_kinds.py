@@ -25,6 +25,7 @@ import parameter_calls
 import wild_numbers
 from wild_numbers import judged, with_wild_number
 import wild_plans
+import wild_scenes
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, typestore
@@ -529,6 +530,8 @@ KINDS = {
         _network_weights,
         wild_numbers.no_survivors(_read_network_weights, wild_numbers.are_finite),
         damage=wild_numbers.weights),
+    'scene, foreseen': Kind(
+        wild_scenes.samples, wild_scenes.foresee, wild_scenes.MOST_S, wild_scenes.damaged, 0.2),
     'plan, imagined': Kind(
         wild_plans.samples, wild_plans.imagine, 20.0, wild_plans.damaged, 0.1),
 }  # fmt: skip
