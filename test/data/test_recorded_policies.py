@@ -51,7 +51,6 @@ def test_episodes_that_are_called_alike_have_kinds_of_their_own(dataset):
     ('command', 'what'),
     [
         (['train', '{set}', '--out', '{out}'], 'training'),
-        (['train-motion', '{set}', '--out', '{out}'], 'training'),
         (['calibrate', 'bundled', '{set}', '--no-store', '--out', '{out}'], 'calibration'),
     ],
 )

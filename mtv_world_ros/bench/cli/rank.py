@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.bench.cli.physics_option import add_physics, physics_text
@@ -186,7 +187,9 @@ def _rank(arguments: argparse.Namespace) -> int:
         if sheet is not None:
             write_png(out / 'flips.png', sheet)
     print(f'{console(summaries[0])}\n\nreport: {path}')
-    return 0
+    for job, reason in failed.items():
+        sys.stderr.write(f'mtv-world: {job.name} has no result: {reason}\n')
+    return int(bool(failed))
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:

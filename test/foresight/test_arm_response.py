@@ -10,6 +10,8 @@ import pytest
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.foresight.loading import load_response
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.lab.training.object_motion.response_fit import (
@@ -19,8 +21,6 @@ from mtv_world_ros.lab.training.object_motion.response_fit import (
     tool_errors,
     with_floor,
 )
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.predictor import load_response
 
 ROBOTS = ('yam_bimanual', 'franka')
 DEMO = share_path('resource', 'demo_episode')

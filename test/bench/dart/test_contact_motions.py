@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import json
 import shutil
 
 import numpy as np
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.errors import CheckpointError, RobotError
+from mtv_world_ros.bench.dart import contact_motions
+from mtv_world_ros.bench.dart.contact_motions import (
+    check_robot,
+    ContactMotions,
+    course_of,
+)
+from mtv_world_ros.bench.dart.rigid_bodies import _FREE, RigidBodies
+from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.lab.training.object_motion.contact_fit import read_contact
-from mtv_world_ros.model.object_motion import contact_motions, predictor
-from mtv_world_ros.model.object_motion.contact_motions import (
-    check_robot,
-    ContactMotions,
-    course_of,
-)
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.predictor import (
-    CONTACT_FILE,
-    load_predictor,
-    save_contact,
-)
-from mtv_world_ros.model.object_motion.rigid_bodies import _FREE, RigidBodies
 
 #: of commands between two rows that come back
 ROWS = 5
@@ -326,16 +319,6 @@ def test_friction_is_the_same_in_all_directions_where_fingers_touch(robot, respo
     assert way == pytest.approx(speed**2 / 2 / SETTINGS.table_friction / 9.81, rel=0.1)
 
 
-def test_motions_are_the_same_in_one_process_and_in_two(robot, response, recording, helpers):
-    motions, half = motions_of(response, AWAY, num_motions=3), 8 * ROWS
-    for positions in recording.positions[: half + 1], recording.positions[half : 2 * half]:
-        alone, then = motions.advance(robot, positions, ROWS)
-        shared, motions = motions.begin(robot, positions, ROWS, helpers)()
-        for name in ('points', 'rotations', 'joints'):
-            np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
-        np.testing.assert_array_equal(then.swings, motions.swings)
-
-
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
     robot, response, recording, monkeypatch
 ):
@@ -444,88 +427,3 @@ def test_meshes_are_found_or_named(response, tmp_path):
     stl += b''.join(bytes(12) + face + bytes(2) for face in faces)
     (tmp_path / 'base.stl').write_bytes(stl)
     check_robot(SETTINGS, robot, response)
-
-
-@pytest.fixture
-def folder(tmp_path):
-    copied = tmp_path / 'object_motion'
-    shutil.copytree(checkpoint_path('bundled') / 'object_motion', copied)
-    save_contact(SETTINGS.model_copy(update={'num_motions': 2}), copied)
-    return copied
-
-
-def test_a_checkpoint_foresees_by_both(folder, robot, recording):
-    model = load_predictor(folder, robot)
-    (folder / CONTACT_FILE).unlink()
-    alone = load_predictor(folder, robot)
-    frame = recording.frame
-    names = ['red block'] * len(recording.solids)
-    found = names, frame.masks, frame.cameras, frame.poses
-    both, networks = (one.find(*found) for one in (model, alone))
-    moved, then = both.advance(recording.positions[:51])
-    few, _ = networks.advance(recording.positions[:51])
-    assert len(moved) == len(few) + 2 and len(both.sizes) == len(networks.sizes) + 2
-    np.testing.assert_array_equal(moved[0].points, few[0].points)
-    weights = [motion.weight for motion in moved]
-    assert weights[0] == 1 and sum(weights) == pytest.approx(3 * len(few))
-    assert np.isfinite(np.stack([motion.points for motion in moved])).all()
-    on, _ = then.advance(recording.positions[50:101])
-    np.testing.assert_allclose(on[-1].points[0], moved[-1].points[-1], atol=1e-9)
-
-
-def test_motions_of_what_is_found_again_count_from_where_it_was_whole(folder, robot, recording):
-    model = load_predictor(folder, robot)
-    frame, names = recording.frame, ['red block'] * len(recording.solids)
-    whole = model.find(names, frame.masks, frame.cameras, frame.poses)
-    hidden = frame.masks.copy()
-    rows = np.nonzero(hidden[0, 0])[0]
-    hidden[:, :, : int(np.median(rows))] = False
-    hidden[:, 1] = False
-    now, same, hides = model.find_again(whole, names, hidden, frame.cameras, frame.poses)
-    np.testing.assert_array_equal(same, [True, False])
-    np.testing.assert_array_equal(hides, [True, False])
-    np.testing.assert_allclose(now.reference[0], whole.reference[0], atol=0.002)
-    motions, _ = now.advance(recording.positions[:51])
-    for motion in motions:
-        assert np.abs(motion.ways[0, 0]).max() < 0.006 and np.isnan(motion.ways[0, 1]).all()
-    np.testing.assert_allclose(now.sizes[:, 0], whole.sizes[:, 0], atol=1e-9)
-    was = whole.contact.solids[0]
-    moved = replace(was, centre=was.centre + [0.05, 0.0, 0.02], yaw=was.yaw + 0.5)
-    seen = replace(whole, contact=replace(whole.contact, solids=(moved, whole.contact.solids[1])))
-    masks = frame.masks.copy()
-    masks[:, 0, : int(np.quantile(rows, 0.25))] = False
-    now, same, hides = model.find_again(seen, names, masks, frame.cameras, frame.poses)
-    assert same.all() and hides[0] and not hides[1]
-    np.testing.assert_array_equal(now.seen.centres[1], now.contact.solids[1].centre)
-    # where they are does not make them higher
-    np.testing.assert_allclose(now.sizes[:, :, 2], whole.sizes[:, :, 2], rtol=1e-6)
-    motions, _ = now.advance(recording.positions[:6])
-    np.testing.assert_allclose(motions[-2].ways[0, 0], [-0.05, 0, -0.02], atol=0.003)
-    turned = motions[-2].rotations[0, 0]
-    assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(-0.5, abs=0.05)
-    np.testing.assert_allclose(motions[0].rotations[0, 0], turned, atol=1e-6)
-    masks[0, 1] = False  # one view tells less surely
-    _, same, hides = model.find_again(whole, names, masks, frame.cameras, frame.poses)
-    np.testing.assert_array_equal(same, [True, False])
-    assert hides.all()
-    (folder / CONTACT_FILE).unlink()
-    alone = load_predictor(folder, robot)
-    one = alone.find(names, frame.masks, frame.cameras, frame.poses)
-    _, same, hides = alone.find_again(one, names, frame.masks, frame.cameras, frame.poses)
-    assert not same.any() and not hides.any()
-
-
-def test_a_bad_contact_file_is_named(folder, robot, monkeypatch):
-    file = folder / CONTACT_FILE
-    values = json.loads(file.read_text())
-    file.write_text(json.dumps(values | {'density': -1}))
-    with pytest.raises(CheckpointError, match=r"contact.json': 'density' is -1"):
-        load_predictor(folder, robot)
-    file.write_text(json.dumps(values))
-    monkeypatch.setattr(predictor, 'find_spec', lambda name: None)
-    with pytest.raises(CheckpointError, match="run 'pip install dartpy scipy', or remove"):
-        load_predictor(folder, robot)
-    monkeypatch.undo()
-    (folder / 'arm_response.json').unlink()
-    with pytest.raises(CheckpointError, match="'arm_response.json' beside it is missing"):
-        load_predictor(folder, robot)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
+from mtv_world_ros.bench.dart.finger_swing import FingerDrives
 
 STEP = 0.002
 #: two fingers that face each other, both at their outer stop when open

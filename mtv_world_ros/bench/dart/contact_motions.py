@@ -11,21 +11,18 @@ Shape letters: K motions, T steps, O objects, J joints, D degrees of freedom.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from mtv_world_ros.bench.dart.rigid_bodies import Arms, BodyState, RigidBodies
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.foresight.arm_response import ArmResponse, ArmState, PERIOD_S
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, ArmState, PERIOD_S
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.helpers import Helpers, Work
-from mtv_world_ros.model.object_motion.rigid_bodies import Arms, BodyState, RigidBodies
 
 #: steps of the engine in a period of commands
 _SUBSTEPS = 5
@@ -82,23 +79,12 @@ class ContactMotions:
     def advance(
         self, robot: RobotModel, positions: FloatArray, rows: int
     ) -> tuple[BodyMotions, ContactMotions]:
-        """Returns where everything is at each of 1 + T rows, and then; see `begin`."""
-        return self.begin(robot, positions, rows)()
-
-    def begin(
-        self,
-        robot: RobotModel,
-        positions: FloatArray,
-        rows: int,
-        helpers: Helpers | None = None,
-    ) -> Callable[[], tuple[BodyMotions, ContactMotions]]:
-        """Lets helpers begin; returns what tells where everything is at 1 + T rows, and then.
+        """Returns where everything is at each of 1 + T rows, and then.
 
         Args:
             robot: whose joints are commanded.
             positions: (1 + N, J) commands, `PERIOD_S` apart [rad or m].
             rows: periods between two of the rows that are returned.
-            helpers: that compute motions beside this process; None = it does so alone.
 
         Raises:
             RobotError: see `check_robot`.
@@ -106,15 +92,9 @@ class ContactMotions:
         free = replace(self.response, floor=None)
         where, arms = free.follow(robot, positions, self.arms)
         begun = self if self.pose is not None else replace(self, pose=positions[0])
-        move = partial(begun._moved, robot, where, rows)
-        numbers = [(number,) for number in range(self.settings.num_motions)]
-        work = (helpers or Helpers(0)).begin(move, numbers)
-        return partial(begun._finish, work, arms)
-
-    def _finish(self, work: Work[_Moved], arms: ArmState) -> tuple[BodyMotions, ContactMotions]:
-        moved = work.finish()
+        moved = [begun._moved(robot, where, rows, k) for k in range(self.settings.num_motions)]
         then = replace(
-            self,
+            begun,
             states=tuple(one.state for one in moved),
             arms=arms,
             speeds=tuple(one.speeds for one in moved),

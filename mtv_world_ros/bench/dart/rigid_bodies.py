@@ -21,16 +21,16 @@ import dartpy as dart
 import numpy as np
 from scipy.optimize import nnls
 
+from mtv_world_ros.bench.dart.finger_swing import FingerDrives
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import find_mesh
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
 
 #: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
 _DISH_M, _DISH_RATIO = 0.06, 1.5
