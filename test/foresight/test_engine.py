@@ -11,11 +11,11 @@ import pytest
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.foresight import engine as engine_module
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings, ContactSpread
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings, ContactSpread
 
 SETTINGS = ContactSettings(
     finger_stiffness=400.0,
