@@ -19,7 +19,7 @@ LAB_COMMANDS = (
     'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'foresee', 'import_weights',
     'own_robot', 'train',
 )  # fmt: skip
-BENCH_COMMANDS = ('collect', 'rank')
+BENCH_COMMANDS = ('collect', 'faults', 'rank')
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:

@@ -29,6 +29,7 @@ _ORDER = (
     'foresee',
     'evaluate',
     'rank',
+    'faults',
     'calibrate',
     'view',
     'own_robot',

@@ -7,10 +7,11 @@ over orders of magnitude, so that a few hundred episodes hold what nobody though
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from mtv_world_ros.bench.expert.faults.signals import Commands, crossed
 from mtv_world_ros.data_types import FloatArray
 
 #: between the points of a trajectory that a policy publishes [s]
@@ -27,27 +28,6 @@ _SWINGS, _ALONE = 0.5, 0.4
 _SPEED, _HELD_S = (0.3, 4.0), (0.05, 1.5)
 #: share of its own motion by which an arm moves another that rests; delay of that [s]
 _SHARE, _LAG_S = (0.3, 1.3), 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Commands:
-    """Commands that a glitch changes.
-
-    Attributes:
-        positions: (T, J) [rad or m].
-        period: between two rows [s].
-        grippers: columns of the grippers.
-        closed: of each gripper, its position when closed.
-        travel: of each gripper, from closed to open.
-        num_arms: arms, one after the other in the columns, equally many each.
-    """
-
-    positions: FloatArray
-    period: float
-    grippers: list[int]
-    closed: FloatArray
-    travel: FloatArray
-    num_arms: int
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
@@ -70,16 +50,6 @@ def _published(commands: Commands, changed: FloatArray) -> FloatArray:
     differs = np.abs(changed - commands.positions).max(axis=1) > 0
     between = np.searchsorted(points, rows, side='right')
     return np.where(np.isin(between, between[differs])[:, None], straight, commands.positions)
-
-
-def crossed(positions: FloatArray, to_next: int) -> FloatArray:
-    """Returns (T, J), from the first row on, the mirrored motion of joints `to_next` before.
-
-    Joints that are at opposite angles in the first row turn to opposite sides.
-    """
-    home, ways = positions[0], positions - positions[0]
-    signs = np.where(home * np.roll(home, to_next) < 0, -1.0, 1.0)
-    return signs * np.roll(ways, to_next, axis=1)
 
 
 def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float:
