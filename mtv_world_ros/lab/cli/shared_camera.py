@@ -108,7 +108,7 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
         x, y, z = estimate.cameras[number].T_mount_camera[:3, 3]
         measure = estimate.measures[number]
         parts = [f'place {estimate.places.place[number]}', f'at ({x:.3f}, {y:.3f}, {z:.3f}) m']
-        parts.append(f'match {measure.match_here:.2f}')
+        parts.append(f'fit {estimate.fits[number]:.2f}, match {measure.match_here:.2f}')
         if estimate.guess_measures:
             parts.append(f'guess {estimate.guess_measures[number].match_here:.2f}')
         doubt = estimate.doubts(number)
