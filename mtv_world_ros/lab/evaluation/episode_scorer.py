@@ -106,8 +106,8 @@ class EpisodeScorer:
     """Scores episodes with the same instruments; keeps the last episodes that it read.
 
     Args:
-        instruments: what is measured with.
-        config: what is imagined and scored.
+        instruments: pipeline, image quality and features of Fréchet distances.
+        config: stretches to imagine and scores to compute.
         out: folder of the evaluation; rollouts and features go into `episodes/`.
     """
 
@@ -120,7 +120,7 @@ class EpisodeScorer:
         """Imagines and scores an episode.
 
         Raises:
-            MtvWorldError: it cannot be read or imagined.
+            MtvWorldError: the episode cannot be read or imagined.
         """
         found = _Found()
         with found.timed('reading'):

@@ -183,7 +183,7 @@ class JointTrack:
     """Joint states of a recording, interpolated.
 
     Args:
-        states: as recorded.
+        states: recorded joint states.
         robot: whose joints are picked.
 
     Attributes:

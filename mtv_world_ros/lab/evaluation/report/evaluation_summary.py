@@ -72,10 +72,10 @@ class EvaluationSummary:
         name: of the checkpoint.
         label: of its rows in tables that compare checkpoints.
         spec: of the model.
-        settings: how it was evaluated, by name; goes into metrics.json.
+        settings: of the evaluation, by name; written to metrics.json.
         results: scored episodes.
         failed: reason by path of those that could not be.
-        provenance: what the results were made with, by heading.
+        provenance: versions, machine and command, by heading.
         distances: FID and FVD by (zero-shot set, view), the set None for all episodes.
     """
 
