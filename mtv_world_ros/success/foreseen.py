@@ -8,7 +8,7 @@ K motions, N steps, O objects, A arms.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from math import nan
@@ -100,13 +100,13 @@ class ForeseenMotions:
         openings = self.openings[number]
         openings = np.concatenate([openings[:, :1], openings], axis=1)
         sizes = {
-            role: tuple(map(float, task.sizes_m.get(role) or self.sizes[number, item]))
+            role: _size(self.sizes[number, item], task.sizes_m.get(role))
             for role, item in items.items()
         }
         poses = TruePoses(
             positions={role: points[:, item] for role, item in items.items()},
             rotations={role: turns[:, item] for role, item in items.items()},
-            sizes=sizes,  # type: ignore[arg-type]
+            sizes=sizes,
             openings=openings,
         )
         return ever_and_final(task.holds(poses, openings))[1]
@@ -134,6 +134,13 @@ def foreseen_of(
         weights=np.array([motion.weight for motion in objects.motions]),
         is_begun=is_begun,
     )
+
+
+def _size(measured: FloatArray, usual: Sequence[float] | None) -> tuple[float, float, float]:
+    """Extents of an object as masks show them, or else as usual [m]."""
+    known = measured if usual is None or np.isfinite(measured).all() else usual
+    x, y, z = map(float, known)
+    return (x, y, z)
 
 
 def foreseen_feature(ends: ForeseenEnds | None) -> float:

@@ -14,11 +14,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'fit-contact',
-        help='find friction, weight and grip: a checkpoint then also foresees by rigid bodies',
-        description='Finds how fingers grip, what rubs and how heavy objects are: the settings '
-        'with which rigid bodies, shaped as the masks show them, end nearest to where objects '
-        'ended in recorded episodes. Writes CHECKPOINT/object_motion/contact.json, with which '
-        'motions of rigid bodies are foreseen beside those of the networks.',
+        help='find friction, weight, grip, delay and table of the world that was recorded',
+        description='Finds how fingers grip, what rubs, how heavy objects are, how late commands '
+        'arrive and how high the table is: the settings under which solids, shaped as the first '
+        'masks show them, keep nearest to where later masks show them. Masks, commands and joint '
+        'states are all it reads. Says each number with its interval and how much it rests on, '
+        'and writes CHECKPOINT/object_motion/contact.json, intervals as the spread of futures.',
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument(
@@ -26,13 +27,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=Path,
         required=True,
         metavar='DIR',
-        help='of train-motion, which has found how its arms follow',
+        help='whose foresight is fitted; numbers that it has are where the search begins',
     )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument('--episodes', type=int, default=200, help='at most, spread evenly')
-    parser.add_argument('--motions', type=int, default=4, help='that are foreseen later')
-    parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument(
+        '--episodes', type=int, default=50, help='at most, spread evenly; 20 to 50 will do'
+    )
+    parser.add_argument('--motions', type=int, default=16, help='futures that are foreseen later')
+    parser.add_argument('--threads', type=int, default=0, help='that foresee; 0 = all but one')
     add_overwrite(parser)
     parser.set_defaults(handler=_fit)
 
@@ -40,45 +43,48 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.errors import CheckpointError
+    from mtv_world_ros.foresight.loading import (
+        CONTACT_FILE,
+        load_contact,
+        load_response,
+        save_contact,
+        save_response,
+    )
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
         first_settings,
         fit_contact,
         read_recordings,
     )
+    from mtv_world_ros.lab.training.object_motion.response_fit import found_response
     from mtv_world_ros.lab.training.training_run import find_episodes, spread
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.contact_motions import check_robot
-    from mtv_world_ros.model.object_motion.predictor import (
-        CONTACT_FILE,
-        load_response,
-        save_contact,
-    )
+    from mtv_world_ros.parallel import threads_each
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
+    robot = load_robot(robot_path(arguments.robot))
+    known = load_contact(folder)
     check_free(folder / CONTACT_FILE, arguments.overwrite)
-    file = robot_path(arguments.robot)
-    robot = load_robot(file)
-    response = load_response(folder, robot)
-    if response is None:
-        raise CheckpointError(
-            f"'{folder}' does not say how arms follow their commands; run "
-            "'mtv-world train-motion' first"
-        )
-    first = first_settings(robot, response).model_copy(update={'num_motions': arguments.motions})
-    check_robot(first, robot, response)
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
+    response = load_response(folder, robot)
+    if response is None:
+        response, text = found_response(paths, robot)
+        print(text)
+        if response is not None:
+            save_response(response, folder)
+    first = (known or first_settings(robot, response)).model_copy(
+        update={'num_motions': arguments.motions}
+    )
     recordings, skipped = read_recordings(paths, robot, arguments.views)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
-    settings = fit_contact(
+    settings, _ = fit_contact(
         recordings,
-        file,
+        robot,
         response,
         first,
-        workers=arguments.workers,
+        threads=arguments.threads or threads_each(1),
         report=partial(print, flush=True),
     )
     save_contact(settings, folder)
