@@ -184,7 +184,8 @@ class TrackedSolids:
         """(K, O, 3) extents in each of the futures [m], NaN = not known."""
         sizes = np.full((self.foresight.settings.num_motions, len(self.solids), 3), np.nan)
         for number, future in enumerate(self._futures()):
-            sizes[number, self._known] = [solid.size for solid in future.solids]
+            found = [solid.size for solid in future.solids]
+            sizes[number, self._known] = np.reshape(found, (len(found), 3))  # also of none
         return sizes
 
     @property
@@ -223,7 +224,8 @@ class TrackedSolids:
         points = np.full((num, rows + 1, len(self.solids), 3), np.nan)
         turns = np.tile(np.eye(3), (num, rows + 1, len(self.solids), 1, 1))
         points[:, :, known] = motion.points
-        first = np.stack([[_upright(s) for s in future.solids] for future in batch.futures])
+        upright = [_upright(solid) for future in batch.futures for solid in future.solids]
+        first = np.reshape(upright, (num, len(known), 3, 3))  # also of none
         turns[:, :, known] = motion.rotations @ np.swapaxes(first, -1, -2)[:, None]
         if self.turned is not None:
             turns = turns @ self.turned

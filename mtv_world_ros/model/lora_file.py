@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from math import isfinite, sqrt
+from math import sqrt
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
@@ -249,6 +249,6 @@ def _scale(module: str, rank: int, alpha: Tensor | None, settings: LoraSettings 
         return 1.0 if settings is None else settings.scale(module, rank)
     if settings is not None and settings.lora_alpha is not None:
         raise ConfigError(f"'{module}' has an alpha of its own, and one in the settings")
-    if alpha.numel() != 1 or not isfinite(alpha.item()):
+    if alpha.numel() != 1:
         raise ConfigError(f"alpha of '{module}' must be one number, got {alpha.tolist()}")
     return alpha.item() / rank

@@ -132,23 +132,28 @@ def _open_index(path: Path) -> dict[str, StoredTensor]:
 def _open_files(files: list[Path]) -> dict[str, StoredTensor]:
     tensors: dict[str, StoredTensor] = {}
     for file in files:
-        try:
-            handle: Any = safe_open(file, framework='pt')
-        except (OSError, SafetensorError) as error:
-            raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
-        names: list[str] = handle.keys()
-        for name in names:
-            if name in tensors:
-                raise CheckpointError(f"tensor '{name}' is in '{file}' and in another shard")
-            tensors[name] = _stored(handle, name, file)
+        with _opened(file) as handle:
+            for name in list(handle.keys()):
+                if name in tensors:
+                    raise CheckpointError(f"tensor '{name}' is in '{file}' and in another shard")
+                tensors[name] = _stored(file, handle.get_slice(name), name)
     return tensors
 
 
-def _stored(handle: Any, name: str, file: Path) -> StoredTensor:
-    part = handle.get_slice(name)
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    try:
+        with safe_open(file, framework='pt') as handle:
+            yield handle
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
 
+
+def _stored(file: Path, part: Any, name: str) -> StoredTensor:
     def read() -> Tensor:
-        tensor: Tensor = handle.get_tensor(name)
+        # opened for each: a file that stays open keeps all that was read of it in memory
+        with _opened(file) as handle:
+            tensor: Tensor = handle.get_tensor(name)
         check_finite(tensor, name, file)
         return tensor
 
@@ -189,6 +194,7 @@ def write_tensors(
         values = {name: tensors[name].read().contiguous() for name in names}
         with disk_errors():
             save_file(values, folder / file, metadata={'format': 'pt'})
+        del values  # before the next shard is read
         places |= dict.fromkeys(names, file)
     if len(shards) > 1:
         total = sum(tensor.num_bytes for tensor in tensors.values())

@@ -241,7 +241,7 @@ Q = 'blocks.0.self_attn.q'
         (f'{Q}.lora_B.default.weight', torch.zeros(99, 4), 'for another size'),
         (f'{Q}.lora_B.default.weight', torch.zeros(DIM, 4, dtype=torch.int8), 'not floats'),
         (f'{Q}.alpha', torch.ones(2), 'alpha of .* must be one number'),
-        (f'{Q}.alpha', torch.tensor(float('nan')), 'alpha of .* must be one number'),
+        (f'{Q}.alpha', torch.tensor(float('nan')), 'no finite numbers'),
         (f'{Q}.lora_A.weight', torch.zeros(4, DIM), 'is there under two names'),
         ('lora_te_encoder.lora_down.bias', torch.zeros(4), 'it is for a text encoder'),
         ('transformer_2.proj_out.lora_A.weight', torch.zeros(4, DIM), "Wan 2.2's second"),

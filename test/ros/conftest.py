@@ -447,6 +447,7 @@ COMPRESSED = CompressedImage
 IMAGE = Image
 INFO = CameraInfo
 JOINT_STATE = JointState
+PLAN = JointTrajectory
 STRING = String
 REPORT = DiagnosticArray
 TRIGGER = Trigger

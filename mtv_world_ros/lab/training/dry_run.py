@@ -98,10 +98,10 @@ def step_cost(
     if config.optimizer.gradient_checkpointing:
         transformer.enable_gradient_checkpointing()
     with FakeTensorMode() if fake else nullcontext():
-        _fill(transformer, dtype)
+        fill(transformer, dtype)
         inputs = _inputs(config, transformer, action_dim, dtype)
         parameters = list(transformer.parameters())
-        with FlopCounterMode(display=False, custom_mapping=_attention()) as counter:
+        with FlopCounterMode(display=False, custom_mapping=attention_operations()) as counter:
             with _kept(parameters) as sizes:
                 out = transformer(**inputs)
             forward = counter.get_total_flops()
@@ -119,8 +119,8 @@ def step_cost(
     )
 
 
-def _attention() -> dict[Any, Any]:
-    """The CPU's attention, which torch's counter leaves out."""
+def attention_operations() -> dict[Any, Any]:
+    """Returns counters of the CPU's attention, which torch's own leaves out."""
     forward = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
     backward = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward
     return {
@@ -129,8 +129,8 @@ def _attention() -> dict[Any, Any]:
     }
 
 
-def _fill(module: nn.Module, dtype: torch.dtype) -> None:
-    """Replaces `meta` weights by zeros in a number format."""
+def fill(module: nn.Module, dtype: torch.dtype) -> None:
+    """Replaces `meta` weights by zeros in a number format, in place."""
     for part in module.modules():
         for name, parameter in list(part.named_parameters(recurse=False)):
             trained = parameter.requires_grad

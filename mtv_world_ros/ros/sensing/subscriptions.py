@@ -23,6 +23,8 @@ Handler = Callable[[Any], None]
 _RELIABILITIES = ('match', 'reliable', 'best_effort')
 #: what every publisher can serve
 _LOWEST = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
+#: plans that wait while the node is busy: one that is dropped would get no end
+PLANS_KEPT = 1000
 _HIGHEST = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -58,7 +60,12 @@ class Inputs:
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
         handle = guarded(on_trajectory)
         self._plans = MatchedSubscription(
-            node, JointTrajectory, 'joint_trajectory', handle, depth=10, default='reliable'
+            node,
+            JointTrajectory,
+            'joint_trajectory',
+            handle,
+            depth=PLANS_KEPT,
+            default='reliable',
         )
         self._all.append(self._plans)
 

@@ -37,7 +37,7 @@ MAX_KEPT = 1000
 MAX_OFFSET = 0.3
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)  # arrays have no truth value: one is only itself
 class Expected:
     """A chunk and the frames of it that still may come true: those before the next plan."""
 

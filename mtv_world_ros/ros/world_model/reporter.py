@@ -35,6 +35,8 @@ _KEPT = ('latency_s', 'lead_s', 'first_frame_s', 'frame_lead_s', 'real_time_fact
 _WINDOW = 50
 #: a rejection shows as a warning for this long [s]
 _WARN_S = 5.0
+#: reports that are kept for a subscriber that is busy: each plan has one end
+REPORTS_KEPT = 1000
 #: rollouts ended in a row without a chunk that are worth a warning
 _STARVED = 5
 #: reasons that mean something is broken here and not in what was sent
@@ -64,7 +66,7 @@ class Reporter:
         self._node, self.robot_name = node, ''
         self._settings, self._state, self._missing = settings, state, missing
         self._tally = Tally()
-        self._report = create_publisher(node, DiagnosticArray, '~/report', 100)
+        self._report = create_publisher(node, DiagnosticArray, '~/report', REPORTS_KEPT)
         self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
 
     def count(self, what: str) -> None:

@@ -72,3 +72,23 @@ def test_what_was_given_up_by_a_reset_is_not_compared(node, ros, client):
         send_images(ros, client, start_ns + k * PERIOD_NS, 0)
     client.spin_for(0.5)
     assert len(client.report_values('fidelity')) == before
+
+
+def test_chunks_that_wait_are_told_apart_by_identity_not_by_their_arrays(ros):
+    """Comparing arrays raised, again and again, once two chunks of the same frames waited."""
+    from types import SimpleNamespace
+
+    from mtv_world_ros.ros.world_model.live_fidelity import Expected
+
+    times = np.array([0.2, 0.4])
+    chunks = [
+        SimpleNamespace(
+            prediction=SimpleNamespace(stamp_ns=0, video=SimpleNamespace(times=times.copy()))
+        )
+        for _ in range(2)
+    ]
+    first, second = map(Expected, chunks)
+    first.stamps = second.stamps = np.array([1, 2])
+    waiting = [first, second]
+    waiting.remove(second)
+    assert waiting == [first]

@@ -1,0 +1,160 @@
+"""Plans at 10 Hz with bursts, for as long as one likes: each gets exactly one end, and in time.
+
+Plans are told apart by their stamps. Between bursts a plan goes out every `1 / --rate` seconds,
+and at times the node is stopped for a second (SIGSTOP), as a busy machine does to it: what
+arrives meanwhile waits, and nothing of it may be lost. Prints a row; the exit status is 1 if one
+got no end, more than one, or one too late, or if the log has a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+import json
+from pathlib import Path
+import signal
+import sys
+import time
+from typing import Any
+
+from node_messages import commit, ROOT, ros
+import numpy as np
+
+#: an end that comes later than this after its plan is late, on a machine that is not busy [s]
+LATE_S = 2.0
+#: a burst, and how often there is one
+BURST, BURST_EVERY = 40, 100
+#: how often and how long the node is stopped [plans, s]
+STOP_EVERY, STOP_S = 250, 1.5
+#: ends that are missing are waited for this long [s]
+PATIENCE_S = 30.0
+PLANS = '/joint_trajectory'
+#: what a plan is given to be answered with the bundled model
+NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
+
+
+class Rate:
+    """A node, a client that sends plans, and the ends of each by its stamp."""
+
+    def __init__(self, out: Path, *, bundled: bool) -> None:
+        self.out = out
+        program = {'program': NODE} if bundled else {}
+        values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
+        self.process = ros().start_node(out, *values, **program)
+        self.client = ros().Client()
+        topics = {t: kind for t, kind in ros().INPUTS.items() if t != PLANS}
+        self.client.connect_inputs(topics)
+        # with the usual 10, this side drops the rest of a burst that nobody has taken yet
+        self.plans = self.client.node.create_publisher(ros().PLAN, PLANS, 1000)
+        self.client.wait(self.plans.get_subscription_count, 'the node')
+        self.client.spin_for(1.0)
+        self.client.send_scene()
+        self.sent: dict[int, float] = {}
+        self.ends: Counter[int] = Counter()
+        self.latencies: list[float] = []
+        self.memory: list[tuple[int, float]] = []
+
+    def send(self) -> None:
+        """Sends a plan of its own stamp."""
+        stamp_ns = self.client.now_ns()
+        self.plans.publish(ros().make_trajectory(stamp_ns=stamp_ns))
+        self.sent[stamp_ns] = time.monotonic()
+
+    def spin(self, seconds: float) -> None:
+        """Takes what the node says for so long."""
+        end_s = time.monotonic() + seconds
+        while True:
+            self.client.executor.spin_once(timeout_sec=max(min(end_s - time.monotonic(), 0.02), 0))
+            self._count()
+            if time.monotonic() > end_s:
+                return
+
+    def _count(self) -> None:
+        now_s = time.monotonic()
+        for values in self.client.report_values():
+            if values['state'] in ros().ENDS:
+                stamp_ns = int(values['trajectory_stamp_ns'])
+                self.ends[stamp_ns] += 1
+                self.latencies.append(now_s - self.sent.get(stamp_ns, now_s))
+        for received in self.client.received.values():
+            received.clear()
+
+    def run(self, count: int, rate_hz: float) -> None:
+        """Sends so many plans."""
+        begin_s, paced = time.monotonic(), 0
+        while len(self.sent) < count and self.process.process.poll() is None:
+            number = len(self.sent)
+            stops = number and number % STOP_EVERY < (BURST if number % BURST_EVERY == 0 else 1)
+            if stops:
+                self.process.process.send_signal(signal.SIGSTOP)
+            for _ in range(BURST if number % BURST_EVERY == 0 else 1):
+                self.send()
+            if stops:
+                time.sleep(STOP_S)
+                self.process.process.send_signal(signal.SIGCONT)
+                begin_s += STOP_S
+            if number % 10 == 0:
+                self.client.send_scene()
+                self.memory.append((number, _megabytes(self.process.process.pid)))
+            paced += 1
+            self.spin(max(begin_s + paced / rate_hz - time.monotonic(), 0.0))
+        end_s = time.monotonic() + PATIENCE_S
+        while len(self.ends) < len(self.sent) and time.monotonic() < end_s:
+            self.spin(0.2)
+        self.spin(1.0)
+
+    def row(self) -> dict[str, Any]:
+        """What became of the plans."""
+        log = self.process.output()
+        number, megabytes = np.array(self.memory[len(self.memory) // 4 :] or [(0, 0.0)]).T
+        grown = np.polyfit(number, megabytes, 1)[0] * 1000 if len(number) > 4 else float('nan')
+        return {
+            'commit': commit(),
+            'plans': len(self.sent),
+            'without_end': len(set(self.sent) - set(self.ends)),
+            'several_ends': sum(count > 1 for count in self.ends.values()),
+            'unknown_ends': len(set(self.ends) - set(self.sent)),
+            'late': sum(latency > LATE_S + STOP_S for latency in self.latencies),
+            'median_s': float(np.median(self.latencies)) if self.latencies else None,
+            'worst_s': max(self.latencies, default=None),
+            'memory_growth_mb_per_1000': float(grown),
+            'tracebacks': log.count('Traceback'),
+            'died': self.process.process.poll() is not None,
+        }
+
+    def close(self) -> None:
+        """Ends both."""
+        self.process.stop()
+        self.client.close()
+
+
+def _megabytes(pid: int) -> float:
+    lines = Path(f'/proc/{pid}/status').read_text().splitlines()
+    status = dict(line.split(':', 1) for line in lines if ':' in line)
+    return int(status['VmRSS'].split()[0]) / 1024
+
+
+def main() -> int:
+    """Sends; 1 if a plan was lost, late or answered twice."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    parser.add_argument('--cases', type=int, default=20_000, help='plans')
+    parser.add_argument('--rate', type=float, default=10.0, help='[Hz]')
+    parser.add_argument('--bundled', action='store_true', help='the bundled model, not a fake')
+    parser.add_argument('--busy', action='store_true', help='the machine is busy: late is allowed')
+    parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'rate')
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    rate = Rate(arguments.out, bundled=arguments.bundled)
+    try:
+        rate.run(arguments.cases, arguments.rate)
+        row = rate.row()
+    finally:
+        rate.close()
+    sys.stdout.write(json.dumps(row, indent=1) + '\n')
+    (arguments.out / 'rate.json').write_text(json.dumps(row, indent=1))
+    wrong = ('without_end', 'several_ends', 'unknown_ends', 'tracebacks', 'died')
+    return int(any(row[key] for key in wrong) or (row['late'] > 0 and not arguments.busy))
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
