@@ -16,6 +16,7 @@ from math import nan
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.success.situation import CannotTell, TruePoses
@@ -56,6 +57,7 @@ class ForeseenMotions:
         sizes: (K, O, 3) extents [m].
         openings: (K, A, N) of the grippers, 0 closed to 1 open.
         weights: (K,) how much each counts.
+        step_s: between the rows [s].
         is_begun: whether they begin with the rollout, and not later.
     """
 
@@ -65,7 +67,18 @@ class ForeseenMotions:
     sizes: FloatArray
     openings: FloatArray
     weights: FloatArray
+    step_s: float = 0.1
     is_begun: bool = True
+
+    def at_frames(self, plan: ChunkPlan) -> FloatArray:
+        """Returns centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
+
+        Args:
+            plan: the chunk, at whose end these motions end.
+        """
+        each = round(plan.frame_s / self.step_s)
+        rows = self.points.shape[1] - 1 - each * np.arange(plan.num_frames, -1, -1)
+        return self.points[:, np.maximum(rows, 0)]
 
     def ends(
         self, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
@@ -132,6 +145,7 @@ def foreseen_of(
         sizes=objects.tracked.sizes,
         openings=np.stack([rows[kept].T for rows in openings]),
         weights=np.array([motion.weight for motion in objects.motions]),
+        step_s=objects.tracked.step_s,
         is_begun=is_begun,
     )
 

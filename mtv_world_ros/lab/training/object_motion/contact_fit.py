@@ -17,13 +17,15 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import multivariate_normal, qmc
 
+from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
-from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP
+from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S
+from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.lab.training.object_motion.tracks import (
@@ -39,7 +41,7 @@ from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: what is drawn, and as how large it may be thought before: factors are of the first settings
 RANGES = {
-    'grip_friction': (0.1, 3.0),
+    'grip_friction': (0.03, 3.0),
     'table_friction': (0.15, 2.5),
     'density': (60.0, 3000.0),
     'finger_stiffness': (0.2, 3.0),
@@ -66,7 +68,11 @@ _WIDER, _LEAST = 1.3, 0.08
 _SAYS = 0.5
 #: delays and heights of a table that are tried [s], [m]
 _DELAYS = np.arange(0.0, 0.31, PERIOD_S)
-_HEIGHTS = np.arange(-0.03, 0.0301, 0.005)
+_HEIGHTS = np.arange(-0.03, 0.0301, 0.0075)
+#: recordings whose table is looked for
+_MOST_TABLES = 8
+#: objects of which less is shown than this share of the first frame's are hidden in part
+_SHOWN = 0.85
 #: slower joints do not show a delay [rad/s or m/s]
 _MOVES = 0.1
 _RESAMPLED, _SEED = 400, 5
@@ -134,7 +140,7 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     times, positions = fine_commands(episode, robot, views)
     assert episode.masks is not None and episode.joint_states is not None
     stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
-    known = track.known[0] & track.known
+    known = track.known[0] & track.known & _unhidden(episode, views, len(track.points))
     return ContactRecording(
         names=tuple(episode.info.objects),
         frame=first_frame(episode, robot, views),
@@ -142,6 +148,25 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
         recorded=recorded_positions(episode.joint_states, robot, stamps_ns),
         points=np.where(known[..., None], track.points, np.nan),
     )
+
+
+def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArray:
+    """(1 + T, O) whether all views show about as much of an object as at first."""
+    assert episode.masks is not None
+    count = len(episode.info.objects)
+    areas = []
+    for view in views:
+        track = episode.masks[view]
+        wanted = track.stamps_ns[0] + np.arange(num_rows) * STEP_S * 1e9
+        each = np.stack(
+            [
+                np.bincount(np.asarray(track.frames[k]).ravel(), minlength=1 + count)[1:]
+                for k in range(len(track.stamps_ns))
+            ]
+        )
+        areas.append(each[nearest_rows(track.stamps_ns, wanted)][:, :count])
+    shown = np.stack(areas)
+    return np.asarray((shown >= _SHOWN * shown[:, :1]).all(axis=0))
 
 
 def read_recordings(
@@ -355,11 +380,13 @@ class _Trial:
         ]
         motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
         rows = min(motion.points.shape[1], len(self.ways))
-        foreseen = motion.points[:, :rows] - motion.points[:, :1]
-        away = np.linalg.norm(foreseen - self.ways[:rows], axis=-1)
+        # how it ends counts: at first nothing has moved whatever the settings
+        late = slice(rows // 2, rows)
+        foreseen = motion.points[:, late] - motion.points[:, :1]
+        away = np.linalg.norm(foreseen - self.ways[late], axis=-1)
         away = np.clip(np.nan_to_num(away, nan=np.nan), 0.0, _LOST_M)
         unlikely = np.log1p((away / _NEAR_M) ** 2)
-        known = np.isfinite(self.ways[:rows]).all(-1)
+        known = np.isfinite(self.ways[late]).all(-1)
         counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)
         found = -(counted / np.maximum(known.sum(0), 1)).sum(-1)
         found[list(state.lost)] = -np.log1p((_LOST_M / _NEAR_M) ** 2) * len(self.solids)
@@ -400,7 +427,7 @@ def _delay_errors(
 def find_table(recordings: Sequence[ContactRecording]) -> Finding:
     """Returns the height at which the outlines of what stands on a table fit best."""
     errors = []
-    for recording in recordings:
+    for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
         frame, points = recording.frame, recording.frame.points()
         for item, name in enumerate(recording.names):
             row = [

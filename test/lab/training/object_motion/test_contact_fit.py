@@ -56,8 +56,11 @@ def test_objects_are_where_masks_show_them_and_no_recorded_pose_is_read(recordin
     episode = read_episode(DEMO, views=VIEWS)
     assert episode.object_poses is not None
     true = episode.object_poses.T_base_object[:, :, :3, 3]
-    ends = recording.points[-1] - recording.points[0], true[-1] - true[0]
-    assert ends[0] == pytest.approx(ends[1], abs=0.006)
+    carried = recording.points[-1, 0] - recording.points[0, 0]
+    assert carried == pytest.approx(true[-1, 0] - true[0, 0], abs=0.006)
+    # the block below it is hidden in part by then: its masks no longer say where it is
+    assert np.isnan(recording.points[-1, 1]).all()
+    assert np.isfinite(recording.points[: len(recording.points) // 3]).all()
     # centres of masks are not those of solids, so that the recorded ones would be exact
     assert np.abs(recording.points[0] - true[0]).max() > 1e-4
 
@@ -75,7 +78,7 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     """Recordings made by foresight itself under known numbers, in place of real ones."""
     monkeypatch.setattr(contact_fit, '_DRAWS', 32)
     monkeypatch.setattr(contact_fit, '_ROUNDS', 2)
-    truth = settings.model_copy(update={'grip_friction': 0.12, 'num_motions': 1})
+    truth = settings.model_copy(update={'grip_friction': 0.05, 'num_motions': 1})
     frame = recording.frame
     tracked = SolidForesight(robot, response, truth).find(
         recording.names, frame.masks, frame.cameras, frame.poses
@@ -85,7 +88,7 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     found, numbers = fit_contact([made] * 4, robot, response, settings)
     by_name = {one.name: one for one in numbers}
     # the search begins at 1.6; a block that slips bounds the friction from above
-    assert by_name['grip_friction'].value < 0.5
+    assert by_name['grip_friction'].value < 0.3
     assert by_name['grip_friction'].high < settings.grip_friction
     assert found.grip_friction == by_name['grip_friction'].value
     assert found.spread.grip == pytest.approx(np.clip(by_name['grip_friction'].spread, 0.1, 0.8))
