@@ -25,6 +25,7 @@ from mtv_world_ros.data_types import (
     CameraModel,
     FloatArray,
     JointTrajectory,
+    Observation,
     WorldModelSpec,
 )
 from mtv_world_ros.errors import DescriptionError, EpisodeError
@@ -100,6 +101,16 @@ class Recording:
         posed = zip(self.recorded, cameras, strict=True)
         return np.stack(shown), tuple(
             replace(own, T_mount_camera=now.T_mount_camera) for (_, own), now in posed
+        )
+
+    def observation(self, frame: int) -> Observation:
+        """Returns what the robot saw and where it stood at a recorded frame."""
+        frames, cameras = self.seen_at(frame)
+        return Observation(
+            cameras=cameras,
+            frames=frames,
+            positions=self.positions[frame],
+            stamp_ns=self.stamp_ns + round(float(self.times[frame]) * 1e9),
         )
 
     def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:

@@ -14,11 +14,11 @@ import pinocchio as pin
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco
 from mtv_world_ros.foresight.robot_parts import load_parts, Part, with_inertias
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: what can touch what: solids are bit 0, each arm has a bit of its own
 SOLIDS = 1
@@ -85,6 +85,7 @@ class Arms:
 
     Attributes:
         robot: the same, with inertias for all of its bodies.
+        response: as given.
         notes: what was assumed of it, in words.
         drives: of its joints, with the numbers of free air.
 
@@ -95,6 +96,7 @@ class Arms:
     def __init__(self, robot: RobotModel, response: ArmResponse | None) -> None:
         found = load_parts(robot)
         self.robot, assumed = with_inertias(robot, found.parts)
+        self.response = response
         self._model = self.robot.pinocchio_model
         self._frames = {f.name: f for f in self._model.frames if f.type == pin.FrameType.BODY}
         base = self._frames[robot.base_link]
@@ -261,6 +263,14 @@ class Arms:
             'armature': np.zeros(len(mass)),
             'lead': np.full(len(mass), _DAMPED_S),
         }
+        for joint in travels:  # a gripper presses with its largest force at half its travel
+            column = robot.joint_names.index(joint)
+            effort = model.effortLimit[model.joints[model.getJointId(joint)].idx_v]
+            travel = robot.upper[column] - robot.lower[column]
+            if np.isfinite([effort, travel]).all() and min(effort, travel) > 0:
+                unit['stiffness'][column] = 2 * effort / travel
+                unit['damping'][column] = 2 * effort / travel * _DAMPED_S
+                unit['armature'][column] = 2 * effort / travel / _STIFF**2
         known = np.zeros(len(mass), np.bool_)
         if response is not None:
             known = response.compliance > 0

@@ -15,6 +15,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms, SOLIDS
 from mtv_world_ros.foresight.course import (
     ArmsState,
@@ -26,7 +27,6 @@ from mtv_world_ros.foresight.course import (
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import kind_of, Scene, STEP_S
-from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
 
 #: slower solids are at rest [rad/s], [m/s]; arms that are nearer to their way are on it
 _REST_RAD_S, _REST_M_S = 0.02, 0.002
@@ -153,6 +153,11 @@ class Batch:
         self._nearby = _Nearby(self._scene, self._models[0])
         self._delays = [round(future.delay_s / STEP_S) for future in futures]
         self._gains = np.stack([model.actuator_gainprm[:, 0] for model in self._models])
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo's model of the first future."""
+        return self._models[0]
 
     def touches_arms(self, positions: FloatArray) -> bool:
         """Returns whether arms at joints (J,) are near a solid, as one that they hold."""

@@ -16,10 +16,11 @@ from math import nan
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.success.situation import CannotTell, TruePoses
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationInfo
 
 from mtv_world_ros.config import wrong
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, ObjectMasks
-from mtv_world_ros.success.situation import CannotTell
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.vision.segmenters.segmenter import resize_masks, Segmenter
 
 #: sides of a picture and of its view may differ in ratio by this share

@@ -27,7 +27,7 @@ BURST, BURST_EVERY = 40, 100
 #: how often and how long the node is stopped [plans, s]
 STOP_EVERY, STOP_S = 250, 1.5
 #: ends that are missing are waited for this long [s]
-PATIENCE_S = 30.0
+PATIENCE_S = 180.0
 PLANS = '/joint_trajectory'
 #: what a plan is given to be answered with the bundled model
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
@@ -42,6 +42,7 @@ class Rate:
         values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
         self.process = ros().start_node(out, *values, **program)
         self.client = ros().Client()
+        self.client.wait(self.client.diagnostic_values, 'the node', PATIENCE_S)
         topics = {t: kind for t, kind in ros().INPUTS.items() if t != PLANS}
         self.client.connect_inputs(topics)
         # with the usual 10, this side drops the rest of a burst that nobody has taken yet

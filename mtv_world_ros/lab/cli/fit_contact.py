@@ -14,27 +14,29 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'fit-contact',
-        help='find friction, weight, grip, delay and table of the world that was recorded',
-        description='Finds how fingers grip, what rubs, how heavy objects are, how late commands '
-        'arrive and how high the table is: the settings under which solids, shaped as the first '
-        'masks show them, keep nearest to where later masks show them. Masks, commands and joint '
-        'states are all it reads. Says each number with its interval and how much it rests on, '
-        'and writes CHECKPOINT/object_motion/contact.json, intervals as the spread of futures.',
+        help='find how arms follow, friction, weight and grip: what foresight is told',
+        description='Finds how arms follow their commands and how late they do, how high the '
+        'table is, how fingers grip, what rubs and how heavy objects are: the numbers under which '
+        'solids, shaped as the first masks show them, keep nearest to where later masks show '
+        'them. Masks, commands and joint states are all it reads. Says each number with its '
+        'interval and how much it rests on. Numbers that OUT has are where it begins. Writes '
+        'OUT/object_motion/arm_response.json and contact.json, with which a checkpoint foresees '
+        "where objects go. OUT may be the checkpoint's folder.",
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument(
         '--checkpoint',
+        '--out',
+        dest='checkpoint',
         type=Path,
         required=True,
-        metavar='DIR',
-        help='whose foresight is fitted; numbers that it has are where the search begins',
+        metavar='OUT',
+        help='folder of a checkpoint, or any',
     )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument(
-        '--episodes', type=int, default=50, help='at most, spread evenly; 20 to 50 will do'
-    )
-    parser.add_argument('--motions', type=int, default=16, help='futures that are foreseen later')
+    parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
+    parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
     parser.add_argument('--threads', type=int, default=0, help='that foresee; 0 = all but one')
     add_overwrite(parser)
     parser.set_defaults(handler=_fit)
@@ -43,6 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.foresight.arms import Arms
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,
         load_contact,
@@ -52,7 +55,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
-        first_settings,
         fit_contact,
         read_recordings,
     )
@@ -62,31 +64,31 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.parallel import threads_each
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
-    robot = load_robot(robot_path(arguments.robot))
-    known = load_contact(folder)
     check_free(folder / CONTACT_FILE, arguments.overwrite)
+    robot = load_robot(robot_path(arguments.robot))
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
     if response is None:
-        response, text = found_response(paths, robot)
-        print(text)
-        if response is not None:
-            save_response(response, folder)
-    first = (known or first_settings(robot, response)).model_copy(
-        update={'num_motions': arguments.motions}
-    )
+        response, told = found_response(paths, Arms(robot, None).robot)
+        print(told)
+    arms = Arms(robot, response)
+    for note in arms.notes:
+        print(note)
     recordings, skipped = read_recordings(paths, robot, arguments.views)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
     settings, _ = fit_contact(
         recordings,
-        robot,
-        response,
-        first,
+        arms,
+        load_contact(folder),
         threads=arguments.threads or threads_each(1),
         report=partial(print, flush=True),
     )
+    settings = settings.model_copy(update={'num_motions': arguments.motions})
+    folder.mkdir(parents=True, exist_ok=True)
+    if response is not None:
+        save_response(response, folder)
     save_contact(settings, folder)
     print(f'{len(recordings)} episodes, {len(skipped)} left out: {folder / CONTACT_FILE}')
     return 0

@@ -21,23 +21,24 @@ from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S
 from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
+from mtv_world_ros.lab.training.object_motion.finger_fit import fit_fingers, FreeGrippers
 from mtv_world_ros.lab.training.object_motion.tracks import (
     fine_commands,
     first_frame,
     FirstFrame,
+    object_ways,
     read_each,
     recorded_positions,
-    tracks_of,
 )
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: what is drawn, and as how large it may be thought before: factors are of the first settings
 RANGES = {
@@ -89,14 +90,16 @@ class ContactRecording:
         frame: the first.
         positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
         recorded: (1 + T * n, J) reported by the joints then.
-        points: (1 + T, O, 3) where masks show the objects; NaN = in fewer than two views [m].
+        ways: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        grippers: before they close.
     """
 
     names: tuple[str, ...]
     frame: FirstFrame
     positions: FloatArray
     recorded: FloatArray
-    points: FloatArray
+    ways: FloatArray
+    grippers: FreeGrippers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,21 +135,23 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     """Reads what an episode says about contact: masks, commands and joint states.
 
     Raises:
-        EpisodeError: see `tracks_of`.
+        EpisodeError: see `object_ways`.
     """
     # poses of objects that a simulator recorded are not looked at
     episode = replace(read_episode(path, views=tuple(views)), object_poses=None)
-    track = tracks_of(episode, robot, views)[0]
+    ways = object_ways(episode, robot, views)
     times, positions = fine_commands(episode, robot, views)
     assert episode.masks is not None and episode.joint_states is not None
     stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
-    known = track.known[0] & track.known & _unhidden(episode, views, len(track.points))
+    shown = _unhidden(episode, views, len(ways))
+    recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
     return ContactRecording(
         names=tuple(episode.info.objects),
         frame=first_frame(episode, robot, views),
         positions=positions,
-        recorded=recorded_positions(episode.joint_states, robot, stamps_ns),
-        points=np.where(known[..., None], track.points, np.nan),
+        recorded=recorded,
+        ways=np.where(shown[..., None], ways, np.nan),
+        grippers=FreeGrippers.of(robot, positions, recorded),
     )
 
 
@@ -176,33 +181,31 @@ def read_recordings(
     return read_each(paths, lambda path: read_contact(path, robot, views))
 
 
-def first_settings(robot: RobotModel, response: ArmResponse | None) -> ContactSettings:
+def first_settings(arms: Arms) -> ContactSettings:
     """Returns what a search begins with: fingers as their joints follow, objects of plastic."""
+    drives = arms.drives
     stiffness, damping, mass = 200.0, 10.0, 0.05
-    drives = Arms(robot, response).drives
-    fingers = np.flatnonzero(drives.fingers & (drives.travels > 0))
-    if response is not None and len(fingers):
-        way = drives.travels[fingers] ** 2
-        stiffness, damping, mass = (
-            float(np.mean(numbers[fingers] / way))
-            for numbers in (drives.stiffness, drives.damping, drives.armature)
-        )
+    if drives.fingers.any():
+        way = drives.travels[drives.fingers] ** 2
+        numbers = (drives.stiffness, drives.damping, drives.armature)
+        found = [float(np.mean(one[drives.fingers] / way)) for one in numbers]
+        stiffness, damping, mass = (max(one, 1e-6) for one in found)
     return ContactSettings(
-        finger_stiffness=float(np.clip(stiffness, 0.1, 1e6)),
-        finger_damping=float(np.clip(damping, 1e-3, 1e5)),
-        finger_mass_kg=float(np.clip(mass, 1e-4, 10)),
+        finger_stiffness=stiffness,
+        finger_damping=damping,
+        finger_mass_kg=mass,
         grip_friction=1.0,
         table_friction=0.5,
         density=300.0,
         tray_kg=0.4,
+        num_motions=16,
     )
 
 
 def fit_contact(
     recordings: Sequence[ContactRecording],
-    robot: RobotModel,
-    response: ArmResponse | None,
-    first: ContactSettings,
+    arms: Arms,
+    first: ContactSettings | None = None,
     threads: int = 1,
     report: Callable[[str], None] = lambda line: None,
 ) -> tuple[ContactSettings, list[Finding]]:
@@ -210,9 +213,9 @@ def fit_contact(
 
     Args:
         recordings: E.
-        robot: that was recorded.
-        response: how its arms follow; None = not known.
-        first: what is not found stays as it is here.
+        arms: of the robot that was recorded.
+        first: numbers that were found before, where the search begins; None = it begins with
+            `first_settings`, and with fingers as `fit_fingers` finds them.
         threads: that foresee.
         report: is told how each round went.
 
@@ -220,14 +223,16 @@ def fit_contact(
         TrainingError: no recording says where an object went.
         RobotError: see `Arms`.
     """
-    moved = [np.nanmax(_ways(r.points), initial=0.0) > 2 * _NEAR_M for r in recordings]
+    moved = [np.nanmax(np.abs(r.ways), initial=0.0) > 2 * _NEAR_M for r in recordings]
     if not any(moved):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
-    table, delay = find_table(recordings), find_delay(recordings, robot, response)
+    if first is None:
+        first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
+    table, delay = find_table(recordings), find_delay(recordings, arms)
     report(str(table))
     report(str(delay))
     first = first.model_copy(update={'table_m': table.value, 'delay_s': delay.value})
-    engine = Engine(Arms(robot, response), threads)
+    engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
     factors, likelihoods, weights = _populations(engine, trials, first, report)
     found = [
@@ -368,7 +373,7 @@ class _Trial:
         return cls(
             solids=tuple(solid for solid in found if solid is not None),
             positions=recording.positions,
-            ways=_ways(recording.points)[:, known],
+            ways=recording.ways[:, known],
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
@@ -393,27 +398,18 @@ class _Trial:
         return found
 
 
-def _ways(points: FloatArray) -> FloatArray:
-    """(1 + T, O, 3) since the first step, from (1 + T, O, 3)."""
-    return points - points[:1]
-
-
-def find_delay(
-    recordings: Sequence[ContactRecording], robot: RobotModel, response: ArmResponse | None
-) -> Finding:
+def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> Finding:
     """Returns how much later joints move than commands of now would have them move."""
-    errors = np.stack([_delay_errors(one, robot, response) for one in recordings])
+    errors = np.stack([_delay_errors(one, arms) for one in recordings])
     return _least('delay_s', errors, _DELAYS)
 
 
-def _delay_errors(
-    recording: ContactRecording, robot: RobotModel, response: ArmResponse | None
-) -> FloatArray:
+def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
     """Error of the joints by delay; NaN = they do not move."""
-    free = None if response is None else replace(response, floor=None)
     expected = recording.positions
-    if free is not None:
-        expected = free.follow(robot, recording.positions)[0]
+    if arms.response is not None:
+        free = replace(arms.response, floor=None)
+        expected = free.follow(arms.robot, recording.positions)[0]
     speeds = np.abs(np.gradient(expected, PERIOD_S, axis=0))
     moving = speeds > _MOVES
     errors = []

@@ -10,15 +10,16 @@ import shutil
 import numpy as np
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.assembly import checkpoint_path, robot_path
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.engine import Engine
-from mtv_world_ros.foresight.loading import CONTACT_FILE, load_contact
+from mtv_world_ros.foresight.loading import CONTACT_FILE, load_contact, load_foresight
 from mtv_world_ros.foresight.solid_foresight import SolidForesight
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.training.object_motion import contact_fit
 from mtv_world_ros.lab.training.object_motion.contact_fit import (
     find_delay,
@@ -56,13 +57,11 @@ def test_objects_are_where_masks_show_them_and_no_recorded_pose_is_read(recordin
     episode = read_episode(DEMO, views=VIEWS)
     assert episode.object_poses is not None
     true = episode.object_poses.T_base_object[:, :, :3, 3]
-    carried = recording.points[-1, 0] - recording.points[0, 0]
+    carried = recording.ways[-1, 0]
     assert carried == pytest.approx(true[-1, 0] - true[0, 0], abs=0.006)
     # the block below it is hidden in part by then: its masks no longer say where it is
-    assert np.isnan(recording.points[-1, 1]).all()
-    assert np.isfinite(recording.points[: len(recording.points) // 3]).all()
-    # centres of masks are not those of solids, so that the recorded ones would be exact
-    assert np.abs(recording.points[0] - true[0]).max() > 1e-4
+    assert np.isnan(recording.ways[-1, 1]).all()
+    assert np.isfinite(recording.ways[: len(recording.ways) // 3]).all()
 
 
 def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
@@ -84,8 +83,8 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
         recording.names, frame.masks, frame.cameras, frame.poses
     )
     (motion,), _ = tracked.advance(recording.positions)
-    made = replace(recording, points=motion.points)
-    found, numbers = fit_contact([made] * 4, robot, response, settings)
+    made = replace(recording, ways=motion.points - motion.points[0])
+    found, numbers = fit_contact([made] * 4, Arms(robot, response), settings)
     by_name = {one.name: one for one in numbers}
     # the search begins at 1.6; a block that slips bounds the friction from above
     assert by_name['grip_friction'].value < 0.3
@@ -98,8 +97,8 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
 def test_how_late_commands_arrive_is_found(recording, robot, response):
     late = np.concatenate([np.repeat(recording.recorded[:1], 5, 0), recording.recorded])
     delayed = replace(recording, recorded=late[: len(recording.recorded)])
-    usual = find_delay([recording], robot, response)
-    found = find_delay([delayed], robot, response)
+    usual = find_delay([recording], Arms(robot, response))
+    found = find_delay([delayed], Arms(robot, response))
     assert usual.value == pytest.approx(0.0, abs=0.01)
     assert found.value == pytest.approx(0.1, abs=0.01)
     assert str(found).startswith('commands arrive late by [s]: 0.1')
@@ -128,14 +127,14 @@ def test_numbers_of_which_nothing_tells_say_so(recording, robot, response, setti
 def test_recordings_that_say_nothing_are_refused(robot, response, recording, tmp_path):
     recordings, skipped = read_recordings([DEMO, tmp_path], robot, VIEWS)
     assert len(recordings) == 1 and list(skipped) == [str(tmp_path)]
-    still = replace(recording, points=np.repeat(recording.points[:1], len(recording.points), 0))
+    still = replace(recording, ways=np.zeros_like(recording.ways))
     for nothing in ([], [still]):
         with pytest.raises(TrainingError, match='no episode says where an object went'):
-            fit_contact(nothing, robot, response, first_settings(robot, response))
+            fit_contact(nothing, Arms(robot, response))
 
 
 def test_fingers_begin_as_their_joints_follow(robot, response):
-    found = first_settings(robot, response)
+    found = first_settings(Arms(robot, response))
     columns = [robot.joint_names.index(tool.gripper_joint) for tool in robot.tools]
     both = 0.5 / response.compliance[columns]
     assert found.finger_stiffness == pytest.approx(both.mean(), rel=0.05)
@@ -156,3 +155,23 @@ def test_the_command_writes_what_a_checkpoint_foresees_with(checkpoint, capsys, 
     contact = load_contact(file.parent)
     assert contact is not None and contact.num_motions == 2
     assert contact.model_dump(mode='json') == json.loads(file.read_text())
+
+
+def test_how_arms_follow_is_found_where_a_checkpoint_does_not_know(
+    tmp_path, robot, capsys, monkeypatch
+):
+    """Of one episode alone nothing is: defaults are taken, and said."""
+    monkeypatch.setattr(contact_fit, '_DRAWS', 4)
+    monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
+    assert main(['fit-contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0
+    told = capsys.readouterr().out
+    assert 'how 14 joints follow commands was not found' in told and 'one episode' in told
+    assert load_foresight(tmp_path / 'new' / 'object_motion', robot).response is None
+
+
+@pytest.mark.parametrize('name', ['franka', 'ur5e_pair'])
+def test_robots_without_inertias_have_numbers_to_begin_with(name):
+    arms = Arms(load_robot(robot_path(name)), None)
+    found = first_settings(arms)
+    assert np.isfinite(found.finger_stiffness) and found.finger_stiffness > 50
+    assert any('state no inertia' in note for note in arms.notes)
