@@ -433,7 +433,8 @@ def find_table(recordings: Sequence[ContactRecording]) -> Finding:
                 )
                 for height in _HEIGHTS
             ]  # fmt: skip
-            errors.append([np.nan if solid is None else solid.error_px**2 for solid in row])
+            # logarithms: what is no box or cylinder fits badly at any height
+            errors.append([np.nan if s is None else np.log(s.error_px + 0.05) for s in row])
     return _least('table_m', np.array(errors), _HEIGHTS)
 
 
