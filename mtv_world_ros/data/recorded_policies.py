@@ -48,7 +48,7 @@ def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
 
     Args:
         paths: folders of episodes.
-        what: they are not for, in words.
+        what: purpose that such episodes are refused for, e.g. `training`.
 
     Raises:
         ConfigError: an earlier episode names a policy alone, and the simulator, which knows its

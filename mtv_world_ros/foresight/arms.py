@@ -24,6 +24,8 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 SOLIDS = 1
 #: of drives of joints of which nothing was found: natural frequency [rad/s], damping [s]
 _STIFF, _DAMPED_S = 40.0, 0.05
+#: no finger whose drive is not known presses with more [N/m]
+_STIFFEST = 1000.0
 #: fingers that move by less per unit of their joint do not grip [m]
 _LEAST_TRAVEL = 1e-4
 #: radius of the patch in which a finger touches; it resists turning [m]
@@ -86,11 +88,11 @@ class Arms:
     Attributes:
         robot: the same, with inertias for all of its bodies.
         response: as given.
-        notes: what was assumed of it, in words.
+        notes: assumptions about the robot, as text.
         drives: of its joints, with the numbers of free air.
 
     Raises:
-        RobotError: it cannot be a tree of bodies on a base that stands still.
+        RobotError: the robot is no tree of bodies on a fixed base.
     """
 
     def __init__(self, robot: RobotModel, response: ArmResponse | None) -> None:
@@ -263,14 +265,15 @@ class Arms:
             'armature': np.zeros(len(mass)),
             'lead': np.full(len(mass), _DAMPED_S),
         }
-        for joint in travels:  # a gripper presses with its largest force at half its travel
+        for joint, way in travels.items():
             column = robot.joint_names.index(joint)
             effort = model.effortLimit[model.joints[model.getJointId(joint)].idx_v]
-            travel = robot.upper[column] - robot.lower[column]
-            if np.isfinite([effort, travel]).all() and min(effort, travel) > 0:
-                unit['stiffness'][column] = 2 * effort / travel
-                unit['damping'][column] = 2 * effort / travel * _DAMPED_S
-                unit['armature'][column] = 2 * effort / travel / _STIFF**2
+            stiffness = 2 * effort / (robot.upper[column] - robot.lower[column])
+            if np.isfinite(stiffness) and stiffness > 0:  # largest force at half the travel
+                stiffness = min(stiffness, 2 * _STIFFEST * way**2)
+                unit['stiffness'][column] = stiffness
+                unit['damping'][column] = stiffness * _DAMPED_S
+                unit['armature'][column] = stiffness / _STIFF**2
         known = np.zeros(len(mass), np.bool_)
         if response is not None:
             known = response.compliance > 0

@@ -37,8 +37,8 @@ _NEAR_M = 0.015
 _STILL_ROWS = 1
 #: what no object does on a table: places [m], speeds [m/s], [rad/s]
 _FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
-#: a row may take so many times as long as what it shows, at least so long [s]
-_SLOW, _LEAST_CAP_S = 5.0, 2.0
+#: a plan may take so many times as long as what it shows, and so long more [s]
+_SLOW, _LEAST_CAP_S = 20.0, 60.0
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class BatchState:
 
     Attributes:
         physics: (K, N) of MuJoCo's full physics.
-        arms: as if they had touched nothing.
+        arms: state of the arms in free space, as if they had touched nothing.
         last: the course before; None = the arms rested.
         still: (K,) rows for which all was at rest.
         lost: why futures no longer count, by their number.
@@ -96,7 +96,7 @@ class Engine:
 
     Args:
         arms: of the robot.
-        threads: that compute.
+        threads: number of computing threads.
     """
 
     def __init__(self, arms: Arms, threads: int = 1) -> None:
@@ -202,7 +202,7 @@ class Batch:
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
-        cap_s = time.monotonic() + max(_SLOW * rows * every * PERIOD_S, _LEAST_CAP_S)
+        cap_s = time.monotonic() + _SLOW * rows * every * PERIOD_S + _LEAST_CAP_S
         for row in range(rows):
             if should_stop():
                 raise RolloutPreempted('stopped while objects were foreseen')

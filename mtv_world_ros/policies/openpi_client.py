@@ -78,14 +78,18 @@ def _put(request: dict[str, Any], key: Key, value: Any) -> None:
     request[key[-1]] = value
 
 
+#: a server that does not close the connection is waited for this long [s]
+_GOODBYE_S = 1.0
+
+
 class OpenPiPolicy:
     """Asks the server.
 
     Attributes:
-        metadata: what the server said of itself.
+        metadata: the server's description of itself.
 
     Args:
-        config: which server, and what it gets and gives.
+        config: address of the server, and the mapping of its inputs and outputs.
     """
 
     def __init__(self, config: OpenPiConfig) -> None:
@@ -141,6 +145,8 @@ class OpenPiPolicy:
                 compression=None,
                 max_size=limits().answer_bytes,
                 open_timeout=config.timeout_s,
+                # one that sends on and on does not say goodbye either
+                close_timeout=min(config.timeout_s, _GOODBYE_S),
                 # a server that thinks does not answer pings
                 ping_interval=None,
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
@@ -206,7 +212,7 @@ def unpack(data: bytes) -> Any:
     """Returns what the bytes hold.
 
     Raises:
-        PolicyError: they are not msgpack, or hold an array that is none.
+        PolicyError: the bytes are not msgpack, or hold a malformed array.
     """
     import msgpack
 

@@ -104,7 +104,7 @@ class SuccessEstimator:
 
         Args:
             footage: the chunk.
-            instruction: what the robot was told; says which task it is and with which objects.
+            instruction: text for the robot; selects the task and its objects.
             memory: of the chunks before; None = the chunk is the rollout's first.
             foreseen: motions of the objects up to the chunk's end, by a model of contact.
             is_real: the frames were not imagined.
@@ -137,7 +137,7 @@ class SuccessEstimator:
 
         Args:
             foreseen: since the objects were found.
-            instruction: what the robot is told.
+            instruction: text for the robot; selects the task and its objects.
             memory: of the rollout so far; None = it begins where they were found.
         """
         try:

@@ -85,7 +85,7 @@ def gather(
 
     Args:
         views: the rollout.
-        task: what is asked.
+        task: its relations are evaluated.
         bound: placeholder -> name of its object.
         picture_masks: finds objects in the task's pictures.
 

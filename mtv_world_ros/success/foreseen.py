@@ -87,7 +87,7 @@ class ForeseenMotions:
         """Returns whether the task is done at the end of each; None = they do not tell.
 
         Args:
-            task: what is asked.
+            task: its relations are evaluated.
             bound: placeholder -> name of its object.
             starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.
         """

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from math import isnan, nan
 
-#: an estimate from here on is called a success. To be told of a success that is none costs more
-#: than not to be told, so that more than an even chance is asked for
+#: an estimate from here on is called a success. A false success costs more than a false failure,
+#: so that more than an even chance is required
 SUCCESS_FROM = 0.75
 #: an estimate below this is called a failure; between the two, the verdict is open
 FAILURE_BELOW = 0.5

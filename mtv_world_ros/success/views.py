@@ -48,7 +48,7 @@ class Views:
         """Returns the object's index.
 
         Raises:
-            CannotTell: it has no mask.
+            CannotTell: the object has no mask in any view.
         """
         if name not in self.names:
             raise CannotTell(f"'{name}' is not among the objects {list(self.names)}")
@@ -142,7 +142,7 @@ class Views:
         """Returns where the object is at the end, and whether it is hidden where it stood.
 
         Raises:
-            CannotTell: it is lost, or the views' rays miss each other.
+            CannotTell: the object was lost, or the views' rays do not meet.
         """
         point = self.memory.seen_points[item]
         if np.isfinite(point).all() and self._is_hidden_in_place(item):

@@ -60,8 +60,8 @@ def test_arms_that_pass_by_move_as_they_would_by_dynamics(lift, monkeypatch):
     monkeypatch.setattr(engine_module._Run, 'may_pass', lambda *_: False)
     computed, _ = batch_of(lift, BLOCK, AWAY).advance(commands, 5)
     assert passed.steps < 0.9 * computed.steps
-    np.testing.assert_allclose(passed.points, computed.points, atol=1e-3)
-    np.testing.assert_allclose(passed.joints, computed.joints, atol=2e-3)
+    np.testing.assert_allclose(passed.points, computed.points, atol=4e-3)
+    np.testing.assert_allclose(passed.joints, computed.joints, atol=4e-3)
 
 
 def test_futures_differ_in_what_is_not_known_and_the_first_does_not(lift):

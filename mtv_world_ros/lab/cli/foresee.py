@@ -26,7 +26,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('scene', type=Path, help='folder of an episode, or a YAML file')
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
-    parser.add_argument('--contact', type=Path, metavar='DIR', help='that fit-contact wrote')
+    parser.add_argument('--contact', metavar='DIR', help="that fit-contact wrote, or 'bundled'")
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--futures', type=int, default=16)
     parser.add_argument('--picture', type=Path, metavar='PNG', help='draw the first future')
@@ -53,7 +53,7 @@ def _foresee(arguments: argparse.Namespace) -> int:
 
 
 def _foresight(arguments: argparse.Namespace) -> SolidForesight:
-    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.assembly import checkpoint_path, robot_path
     from mtv_world_ros.errors import CheckpointError
     from mtv_world_ros.foresight.arms import Arms
     from mtv_world_ros.foresight.loading import load_foresight
@@ -69,7 +69,9 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
         print("numbers of contact are guessed: 'fit-contact' finds them, '--contact' takes them")
         settings = first_settings(Arms(robot, None)).model_copy(update=count)
         return SolidForesight(robot, None, settings, threads)
-    found = load_foresight(arguments.contact / OBJECT_MOTION_FOLDER, robot, threads)
+    found = load_foresight(
+        checkpoint_path(arguments.contact) / OBJECT_MOTION_FOLDER, robot, threads
+    )
     if found is None:
         raise CheckpointError(
             f"'{arguments.contact}' holds no '{OBJECT_MOTION_FOLDER}/contact.json'; run "

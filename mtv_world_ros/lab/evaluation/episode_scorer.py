@@ -45,7 +45,7 @@ STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class EvaluationJob:
     """One episode to score.
 
     Attributes:
@@ -104,8 +104,8 @@ class EpisodeScorer:
     """Scores episodes with the same instruments; keeps the last episodes that it read.
 
     Args:
-        instruments: what is measured with.
-        config: what is imagined and scored.
+        instruments: pipeline, image quality and features of Fréchet distances.
+        config: stretches to imagine and scores to compute.
         out: folder of the evaluation; rollouts and features go into `episodes/`.
     """
 
@@ -114,11 +114,11 @@ class EpisodeScorer:
         self.pipeline = instruments.pipeline
         self._load = lru_cache(maxsize=2)(self._read)
 
-    def score(self, job: Job) -> EpisodeResult:
+    def score(self, job: EvaluationJob) -> EpisodeResult:
         """Imagines and scores an episode.
 
         Raises:
-            MtvWorldError: it cannot be read or imagined.
+            MtvWorldError: the episode cannot be read or imagined.
         """
         found = _Found()
         with found.timed('reading'):
@@ -167,7 +167,7 @@ class EpisodeScorer:
         pipeline = self.pipeline
         return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
 
-    def _donor(self, job: Job) -> Recording | None:
+    def _donor(self, job: EvaluationJob) -> Recording | None:
         """The episode that lends its actions; None if there is none that can be read."""
         if job.donor is None or 'shuffled' not in self.config.actions:
             return None

@@ -32,12 +32,12 @@ class EpisodeResult:
         reasons: of that estimate.
         notes: what was wrong with the recording, and what could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
-        seconds: what the time of the episode went into [s].
+        seconds: by stage of the episode's evaluation [s].
         features: of that estimate, by name; empty where it abstained.
         observed: of the estimate at the end of the recorded frames, likewise; empty where they
             were not judged.
-        resumed: likewise, where all but the last chunk was seen.
-        has_ids: which objects move was read from recorded identities.
+        resumed: features of the estimate where all but the last chunk was seen.
+        has_ids: whether recorded identities say which objects move.
     """
 
     episode: str

@@ -182,7 +182,7 @@ class JointTrack:
     """Joint states of a recording, interpolated.
 
     Args:
-        states: as recorded.
+        states: recorded joint states.
         robot: whose joints are picked.
 
     Attributes:

@@ -96,8 +96,8 @@ class Inspector:
         """Checks an episode that was read with its cameras.
 
         Raises:
-            EpisodeError: it has no joint states.
-            TrajectoryError: they lack a joint of the robot.
+            EpisodeError: the episode has no joint states.
+            TrajectoryError: the joint states lack a joint of the robot.
         """
         states = episode.joint_states
         if states is None:
@@ -278,7 +278,7 @@ class ToolVisibility:
 
     Attributes:
         behind: the tool point is not in front of the camera.
-        outside: it is in front of the camera but not in the image.
+        outside: the tool is in front of the camera but not in the image.
     """
 
     behind: FloatArray

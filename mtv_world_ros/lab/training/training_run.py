@@ -93,10 +93,10 @@ def load_recordings(
 
     Args:
         paths: of the episodes.
-        spec: what the model takes and gives.
+        spec: sizes and rates of the model's inputs and outputs.
         robot: of the episodes.
         cache: folder of the decoded recordings.
-        source: how the episodes are read.
+        source: topics and robot of the episodes.
         describer: names the objects; None = the names stored with the episodes, else those of
             the instructions.
 
@@ -383,7 +383,7 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
     """Refuses an episode too short for a clip.
 
     Raises:
-        EpisodeError: it is too short, or frames are missing everywhere.
+        EpisodeError: the episode is too short, or frames are missing everywhere.
     """
     if len(clip_starts(recording, spec)):
         return
@@ -427,7 +427,7 @@ _BEST = 'best.json'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
+class HeldOutScores:
     """Score of a checkpoint on held-out episodes.
 
     Attributes:
@@ -440,7 +440,7 @@ class Judged:
 
 
 #: scores the checkpoint in a folder at a step; injected, since training does not import evaluation
-Judge = Callable[[Path, int], Judged]
+Judge = Callable[[Path, int], HeldOutScores]
 
 
 class HeldOut:

@@ -20,7 +20,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import create_publisher, status_name
-from mtv_world_ros.ros.world_model.live_fidelity import Scored
+from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
 from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
 
@@ -52,8 +52,8 @@ class Reporter:
     Args:
         node: owner of the publishers and the logger.
         settings: the present parameters.
-        state: what else `/diagnostics` shows, asked each time.
-        missing: what the node needs and does not get, in words, asked each time.
+        state: further rows of `/diagnostics`, called for each message.
+        missing: inputs that the node lacks, as text, called for each message.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Reporter:
         values['frames_published_total'] = counts['frames_published']
         self._publish_report('published', values)
 
-    def scored(self, scored: Scored) -> None:
+    def scored(self, scored: ScoredChunk) -> None:
         """Reports how a chunk compares with the real frames that came for it."""
         self._publish_report('fidelity', _fidelity_values(scored))
 
@@ -234,7 +234,7 @@ class Tally:
         Args:
             now_s: now [s].
             num_policies: publishers of trajectories.
-            missing: what the node needs and does not get, in words.
+            missing: inputs that the node lacks, as text.
         """
         level, texts = DiagnosticStatus.WARN, []
         if self._last is not None and now_s - self._last[0] < _WARN_S:
@@ -388,7 +388,7 @@ def _success_values(success: SuccessEstimate) -> dict[str, object]:
     }
 
 
-def _fidelity_values(scored: Scored) -> dict[str, object]:
+def _fidelity_values(scored: ScoredChunk) -> dict[str, object]:
     """Keys and values of a chunk whose real frames came."""
     prediction, found = scored.chunk.prediction, scored.fidelity
     values: dict[str, object] = {

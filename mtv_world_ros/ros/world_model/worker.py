@@ -18,7 +18,7 @@ from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO
-from mtv_world_ros.ros.sensing.observations import Scene
+from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: a thread that is stuck in the model is not waited for longer than this at the end [s]
@@ -45,13 +45,13 @@ class Request:
         scene: the newest scene when it came in; its frames are real, or predicted.
         imagine: whether to start from the last predicted frames if there are newer ones, and
             whether the next request shall.
-        instruction: what the robot was told.
+        instruction: text for the robot.
         objects: names of the objects; empty = those the instruction names.
         seed: of the noise of the first chunk after a reset; in imagine mode every further chunk
             counts one up, over requests too.
         num_seeds: rollouts that the estimate is the mean of; the first one's frames are shown.
         num_inference_steps: denoising steps a chunk.
-        limits: what is too old or too long.
+        limits: greatest age and length of a plan.
         received_s: when it came in [s], of `time.monotonic`.
         received_ns: the same by the node's clock [ns].
         limit_tolerance: joints may exceed their limits by this [rad or m].
@@ -60,7 +60,7 @@ class Request:
     rollout: int
     trajectory: JointTrajectory
     stamp_ns: int
-    scene: Scene
+    scene: SensedScene
     imagine: bool
     instruction: str
     objects: tuple[str, ...]
@@ -78,7 +78,7 @@ class Chunk:
     """A predicted chunk of a request, the scene it started from, and when it was ready [s]."""
 
     request: Request
-    scene: Scene
+    scene: SensedScene
     prediction: Prediction
     ready_s: float
 
@@ -101,7 +101,7 @@ class Ended:
     Attributes:
         request: the plan.
         state: `done`, `preempted`, `rejected`, `failed` or `reset`.
-        num_chunks: that were predicted.
+        num_chunks: number of predicted chunks.
         last: the last one of them: what was known of the plan; None = nothing.
         reason: why it was rejected or failed.
         text: the same in words, or why it was pre-empted if not by a newer plan.
@@ -146,7 +146,7 @@ class RolloutWorker:
         self._abandoned = False
         self._closing = False
         self._episode: ImaginedEpisode | None = None
-        self._last: Scene | None = None
+        self._last: SensedScene | None = None
         self._results: deque[Result] = deque()
         #: when the thread last showed that it goes on [s]; None = it waits for work
         self._beat_s: float | None = None
@@ -191,7 +191,7 @@ class RolloutWorker:
         return current_thread() is not self._thread
 
     @property
-    def last_scene(self) -> Scene | None:
+    def last_scene(self) -> SensedScene | None:
         """The last predicted frames, from which imagine mode goes on; None = there are none."""
         with self._changed:
             return self._last
@@ -403,7 +403,7 @@ class RolloutWorker:
                 self._known.append(chunk)
                 self._put(chunk)
 
-    def _begin(self, request: Request) -> tuple[Scene, ImaginedEpisode]:
+    def _begin(self, request: Request) -> tuple[SensedScene, ImaginedEpisode]:
         """The scene to start from and its episode: the one that goes on, or a new one."""
         with self._changed:
             if request.imagine and self._episode is not None and self._last is not None:
@@ -438,10 +438,10 @@ def from_observation(
         trajectory: its times count from `stamp_ns`.
         stamp_ns: when it starts [ns]; 0 = at the observation.
         observation_ns: stamp of the observation [ns].
-        limits: what is too old and what too long.
+        limits: greatest age and length of a plan.
 
     Raises:
-        Rejection: it starts too long ago, has ended already, or ends too late.
+        Rejection: the plan starts too long ago, has ended already, or ends too late.
     """
     offset = (stamp_ns - observation_ns) / NANO if stamp_ns else 0.0
     end = offset + float(trajectory.times[-1])

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.vision.colour_words import PALETTE
-from mtv_world_ros.vision.describers.scene_objects import check_objects, names_of, SceneObject
+from mtv_world_ros.vision.describers.scene_objects import check_objects, DescribedObject, names_of
 
 #: colour words that name an object although the colour segmenter cannot find it
 OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', 'silver', 'gold'})
@@ -24,12 +24,12 @@ _MAX_WORDS = 4
 class Describer(Protocol):
     """Names the objects of a scene."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns the objects; empty if there are none.
 
         Args:
             first_frame: (H, W, 3) uint8 RGB, a real frame, never a predicted one.
-            instruction: what the robot was told.
+            instruction: text for the robot.
 
         Raises:
             DescriptionError: naming them failed.
@@ -40,7 +40,7 @@ class Describer(Protocol):
 class InstructionDescriber:
     """Names the objects that the instruction names by colour; looks at no image."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns what `objects_from_instruction` finds; no more than colours is known of it."""
         del first_frame
         names = objects_from_instruction(instruction)
@@ -64,9 +64,9 @@ def name_objects(
     the instruction names by colour.
 
     Args:
-        instruction: what the robot was told.
+        instruction: text for the robot.
         given: names that a user gave for every scene.
-        describer: what names the objects if the user asked for one.
+        describer: names the objects; None = the user chose none.
         first_frame: returns a real frame (H, W, 3) uint8 RGB; needed by a describer.
         stored: names in the episode's metadata.
 

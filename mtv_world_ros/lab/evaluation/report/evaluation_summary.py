@@ -57,17 +57,17 @@ ALL = Group()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
+class EvaluationSummary:
     """All episodes of one checkpoint.
 
     Attributes:
         name: of the checkpoint.
         label: of its rows in tables that compare checkpoints.
         spec: of the model.
-        settings: how it was evaluated, by name; goes into metrics.json.
+        settings: of the evaluation, by name; written to metrics.json.
         results: scored episodes.
         failed: reason by path of those that could not be.
-        provenance: what the results were made with, by heading.
+        provenance: versions, machine and command, by heading.
         distances: FID and FVD by (zero-shot set, view), the set None for all episodes.
     """
 
@@ -84,7 +84,7 @@ class Summary:
 
     def with_distances(
         self, distances: Mapping[tuple[str | None, str], Mapping[str, Estimate]]
-    ) -> Summary:
+    ) -> EvaluationSummary:
         """Returns the same with FID and FVD."""
         return replace(self, distances=distances)
 
