@@ -16,10 +16,10 @@ MARKER = f'resource/{PACKAGE}'
 #: modules of commands on each floor
 GROUND_COMMANDS = ('imagine', 'view')
 LAB_COMMANDS = (
-    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'import_weights',
-    'own_robot', 'train', 'train_motion',
+    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'foresee', 'import_weights',
+    'own_robot', 'train',
 )  # fmt: skip
-BENCH_COMMANDS = ('collect', 'rank')
+BENCH_COMMANDS = ('collect', 'faults', 'rank')
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:
@@ -52,7 +52,6 @@ setup(
         'Jinja2>=3.1',
         'PyYAML>=6',
         'av>=18',
-        'dartpy>=6.20,<7',
         'diffusers>=0.42,<0.43',
         'lz4>=4.3',
         'mcap>=1.6',
@@ -91,6 +90,8 @@ setup(
         'rank': ['ray>=2.60,<3'],
         # The simulator needs nothing more but an OpenGL library, see docs/installation.md.
         'sim': [],
+        # A second engine as another truth of the bench.
+        'dart': ['dartpy>=6.20,<7'],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
         'ros': [
             f'{name}; sys_platform == "linux" and platform_machine == "x86_64"'

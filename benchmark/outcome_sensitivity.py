@@ -28,7 +28,7 @@ from page import publish, table
 from mtv_world_ros.bench.collect.episode_maker import CollectConfig
 from mtv_world_ros.bench.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import EXPERT
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.scene import Scene

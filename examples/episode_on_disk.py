@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.files import share_path

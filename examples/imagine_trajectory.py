@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.data_types import Observation
 from mtv_world_ros.files import share_path
 from mtv_world_ros.rendering.video import write_video
 
@@ -27,12 +26,7 @@ options = parser.parse_args()
 
 pipeline = load_pipeline('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
-observation = Observation(
-    cameras=recording.cameras,
-    frames=recording.frames[:, 0],
-    positions=recording.positions[0],
-    stamp_ns=recording.stamp_ns,
-)
+observation = recording.observation(0)
 
 episode = pipeline.begin(observation, instruction=recording.instruction, seed=0)
 chunks = []

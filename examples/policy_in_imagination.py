@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.files import share_path
@@ -52,12 +52,7 @@ options = parser.parse_args()
 
 pipeline = load_pipeline('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
-observation = Observation(
-    cameras=recording.cameras,
-    frames=recording.frames[:, 0],
-    positions=recording.positions[0],
-    stamp_ns=recording.stamp_ns,
-)
+observation = recording.observation(0)
 policy = SwingingPolicy(pipeline.robot.joint_names)
 policy.reset(seed=0)
 

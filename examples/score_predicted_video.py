@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.data_types import Observation
 from mtv_world_ros.files import share_path
 from mtv_world_ros.vision.jaccard import jaccard
 
@@ -27,12 +26,7 @@ options = parser.parse_args()
 
 pipeline = load_pipeline('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
-observation = Observation(
-    cameras=recording.cameras,
-    frames=recording.frames[:, 0],
-    positions=recording.positions[0],
-    stamp_ns=recording.stamp_ns,
-)
+observation = recording.observation(0)
 episode = pipeline.begin(observation, instruction=recording.instruction)
 prediction = next(episode.extend(commands_from(recording, 0)))
 
@@ -41,7 +35,7 @@ nearest = np.abs(recording.times[:, None] - prediction.video.times).argmin(axis=
 start = prediction.start_masks.masks[:, :, 0]  # (V, O, H, W)
 names = prediction.masks.names
 real = pipeline.segmenter.segment(
-    recording.frames[:, nearest], names, first_masks=start, first_frames=observation.frames
+    recording.frames[:, nearest], names, first_masks=start, first_frames=recording.frames[:, 0]
 )
 imagined_j = jaccard(prediction.masks.masks, real.masks)  # (V, O, T)
 held_j = jaccard(np.broadcast_to(start[:, :, None], real.masks.shape), real.masks)

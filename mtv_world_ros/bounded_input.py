@@ -111,7 +111,7 @@ def check_limit(name: str, value: int, what: str) -> None:
         what: has the size, e.g. `the image`.
 
     Raises:
-        LimitError: it is larger; names the variable that allows more.
+        LimitError: the value is larger; names the environment variable that allows more.
     """
     most = getattr(limits(), name)
     if value > most:
@@ -130,8 +130,8 @@ def read_bytes(path: Path | str, limit: str) -> bytes:
         limit: name of the field of `Limits`.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
-        LimitError: it is too large.
+        OSError: the file cannot be read, or is no regular file.
+        LimitError: the file is too large.
     """
     with _open_regular(path) as (file, size):
         check_limit(limit, size, f"'{path}'")
@@ -160,8 +160,8 @@ def read_json(path: Path | str) -> Any:
     """Returns the values of a JSON file.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
-        ValueError: it is too large, too deeply nested, or not JSON.
+        OSError: the file cannot be read, or is no regular file.
+        ValueError: the file is too large, too deeply nested, or not JSON.
     """
     return parse_json(read_bytes(path, 'json_bytes'), f"'{path}'")
 
@@ -170,7 +170,7 @@ def parse_json(text: str | bytes, what: str) -> Any:
     """Returns the values of a JSON text whose size was checked.
 
     Raises:
-        ValueError: it is not JSON, or too deeply nested.
+        ValueError: the text is not JSON, or too deeply nested.
     """
     try:
         return json.loads(text, parse_int=_whole_number)
@@ -193,7 +193,7 @@ def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
         limit: name of the field of `Limits` for all of them together, inflated.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
+        OSError: the file cannot be read, or is no regular file.
         ValueError: it is too large once inflated, damaged, or holds objects (pickles).
     """
     try:
@@ -230,7 +230,7 @@ def check_finite(tensor: Any, name: str, file: Path) -> None:
     """Checks that a tensor of torch holds finite numbers: what others give would be believed.
 
     Raises:
-        CheckpointError: it does not.
+        CheckpointError: a number is not finite.
     """
     if not tensor.is_floating_point() or tensor.numel() == 0:
         return

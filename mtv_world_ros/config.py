@@ -150,8 +150,8 @@ def validated(
     Args:
         kind: the model.
         values: e.g. of a YAML file.
-        where: what the error begins with, e.g. the file.
-        context: what validators need to know, e.g. the robot.
+        where: beginning of the error text, e.g. the file.
+        context: values that validators use, e.g. the robot.
         error: raised instead of `ConfigError`.
 
     Raises:
@@ -245,12 +245,12 @@ def read_yaml(
 
     Args:
         path: the file.
-        what: what it is, e.g. `robot file`.
-        setting: what names it, e.g. `robot_file`.
+        what: kind of file, e.g. `robot file`.
+        setting: name of the parameter or option that gives the file, e.g. `robot_file`.
         error: raised instead of `ConfigError`.
 
     Raises:
-        ConfigError: it cannot be read, or is not YAML.
+        ConfigError: the file cannot be read, or is not YAML.
     """
     try:
         return parse_yaml(read_text(path, 'yaml_bytes'))

@@ -295,8 +295,8 @@ class SuccessEstimate:
         probability: in [0, 1]; NaN = abstains.
         interval: (low, high); NaN where it abstains.
         jaccard: (V, O) Jaccard index, NaN where absent.
-        reasons: what the estimate rests on, or why it abstains.
-        features: what a calibration weighs, by name; empty where it abstains.
+        reasons: grounds of the estimate, or why it abstains.
+        features: inputs of the calibration by name; empty where the estimate abstains.
         is_calibrated: whether the probability is a fitted one.
         num_seeds: rollouts that it is the mean of.
         spread: standard deviation of their probabilities; NaN for one.

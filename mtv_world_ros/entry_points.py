@@ -20,7 +20,7 @@ def load(entry: metadata.EntryPoint) -> Any:
     """Returns what an entry point names.
 
     Raises:
-        ConfigError: it cannot be imported.
+        ConfigError: the module cannot be imported.
     """
     try:
         return entry.load()

@@ -91,6 +91,10 @@ class RolloutPreempted(MtvWorldError):
     """A newer trajectory arrived; the running rollout was given up."""
 
 
+class CannotTell(Exception):
+    """Why something about a situation is not known; the estimator abstains with this reason."""
+
+
 def masked(text: str, key: str) -> str:
     """Returns the text without an API key; servers may quote it, and it belongs into no log."""
     return text.replace(key, '***') if key else text

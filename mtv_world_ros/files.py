@@ -96,7 +96,7 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
         instead: option that names another place.
 
     Raises:
-        ConfigError: it exists.
+        ConfigError: the path exists.
     """
     is_free = not any(path.iterdir()) if path.is_dir() else not path.exists()
     if not (overwrite or is_free):
@@ -175,7 +175,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
         content: text is written as UTF-8.
 
     Raises:
-        OSError: it cannot be written; what was there before is still there.
+        OSError: the file cannot be written; the old one is untouched.
     """
     data = content.encode() if isinstance(content, str) else content
     beside = path.with_name(f'.{path.name}.{os.getpid()}.part')  # others may write the same file
@@ -199,7 +199,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         folder: the final name.
 
     Raises:
-        OSError: it cannot be written; what was there before is still there.
+        OSError: the folder cannot be written; the old one is untouched.
     """
     partial, old = (folder.with_name(f'{folder.name}.{word}') for word in ('partial', 'old'))
     recover_folder(folder)

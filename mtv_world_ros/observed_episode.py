@@ -81,7 +81,7 @@ class ObservedEpisode:
 
         Args:
             observation: real, of V views; not before those that were seen.
-            instruction: what the robot is told.
+            instruction: text for the robot.
             objects: names of the objects; empty = the pipeline's, else those of the instruction.
 
         Raises:

@@ -56,7 +56,7 @@ def run_all(
     They end with this process, however that ends.
 
     Args:
-        jobs: what to run.
+        jobs: arguments of the function, one a call.
         make_run: makes what runs a job, once in every process; has to be picklable for more than
             one.
         workers: processes; 1 = this one.
@@ -178,7 +178,7 @@ def score_all(
     """Yields jobs with their scores, or why there are none; see `run_all`.
 
     Args:
-        jobs: what to score.
+        jobs: to score, in any order.
         make_scorer: called once in every process; has to be picklable for more than one.
         workers: processes; 1 = this one.
         threads: of each process, where there are several.
@@ -206,7 +206,7 @@ def score_with_ray(
     Every machine of the cluster needs this package, and checkpoints under the same path.
 
     Args:
-        jobs: what to score.
+        jobs: to score, in any order.
         make_scorer: called once in every actor; has to be picklable.
         workers: actors, of one core each.
         address: of the cluster; empty = `RAY_ADDRESS`, else a new one on this machine.

@@ -109,7 +109,7 @@ class Pipeline:
         object_mask: whether trajectory videos carry the object masks.
         objects: names of the objects; empty = the describer's.
         describer: names the objects of an episode's first frame; None = the instruction's words.
-        horizon: how J falls with the horizon, where it was measured.
+        horizon: measured J by horizon; None = not measured.
         object_motion: where objects go, for models whose trajectory videos show that; None = the
             trajectory video shows them where they were.
         camera_checker: compares the first pictures with the arm's outline; None = nothing does.
@@ -237,7 +237,7 @@ class ImaginedEpisode:
 
     Attributes:
         pipeline: imagines and judges.
-        instruction: what the robot was told; names the objects unless they are given.
+        instruction: text for the robot; names the objects unless they are given.
         objects: names of the objects; empty = the pipeline's, else its describer's, which is
             asked once for each instruction, else those of the instruction.
         seed: of the noise; chunk k of rollout r uses `seed + k + r * SEED_STEP`.
@@ -393,7 +393,7 @@ class ImaginedEpisode:
         """One chunk of one rollout, stage by stage, and where the rollout stands then.
 
         Args:
-            state: where it stands.
+            state: the rollout so far.
             plan: the chunk.
             seed: of the noise.
         """

@@ -43,7 +43,7 @@ class Prediction:
     """One imagined chunk and what was made on the way.
 
     Attributes:
-        start: what the chunk starts from, at the model's size.
+        start: the observation that the chunk starts from, at the model's size.
         video: the T predicted frames, frame k after command k; its times count from `stamp_ns`.
         seed: of the noise.
         positions: (T, J) commanded at these times [rad or m].
@@ -54,8 +54,8 @@ class Prediction:
         stamp_ns: stamp of the rollout's observation [ns].
         chunk: index of this chunk in its rollout.
         num_chunks: chunks of the rollout.
-        imagined_seconds: how far the last frame is from the last real one [s].
-        horizon: how J falls with the horizon, where that was measured.
+        imagined_seconds: time from the last real frame to the last predicted one [s].
+        horizon: measured J by horizon; None = not measured.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
         in_view: (V,) share of the states in which the view shows a tool.

@@ -25,8 +25,8 @@ class RolloutState:
     Attributes:
         observation: its last frame, at the model's size.
         history: the frames before that one.
-        objects: where the named objects are, as far as they are foreseen.
-        memory: what the estimate remembers; None before the first chunk.
+        objects: foreseen poses of the named objects.
+        memory: of the success estimate; None before the first chunk.
         num_imagined: frames since the last real one.
     """
 
@@ -78,8 +78,8 @@ class RolloutState:
             positions: (J,) commanded at the last one [rad or m].
             stamp_ns: of the last one [ns].
             num_history: most frames to keep before it.
-            memory: what the estimate remembers then.
-            objects: where they are then.
+            memory: of the success estimate after the chunk.
+            objects: foreseen poses after the chunk.
         """
         start = self.observation
         return RolloutState(

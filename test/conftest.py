@@ -12,9 +12,9 @@ import pytest
 
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
 
 
 def _no_gpu() -> str:
@@ -60,7 +60,7 @@ def robot() -> RobotModel:
 @pytest.fixture(scope='session')
 def response(robot: RobotModel) -> ArmResponse:
     """How it follows commands, as the bundled checkpoint found."""
-    from mtv_world_ros.model.object_motion.predictor import load_response
+    from mtv_world_ros.foresight.loading import load_response
 
     found = load_response(checkpoint_path('bundled') / 'object_motion', robot)
     assert found is not None

@@ -17,6 +17,7 @@ from mtv_world_ros.errors import (
     TrajectoryError,
 )
 from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight.loading import load_foresight
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
@@ -29,8 +30,6 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
 )
 from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.model.object_motion.network import ObjectMotionNetwork
-from mtv_world_ros.model.object_motion.predictor import Member, ObjectMotionPredictor
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import resize_frames
@@ -476,8 +475,8 @@ def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole
 def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     recording: Recording, world_model: CountingWorldModel
 ) -> None:
-    predictor = ObjectMotionPredictor([Member(network=ObjectMotionNetwork())], YAM)
-    episode = with_motion(world_model, predictor).begin(observe(recording))
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    episode = with_motion(world_model, foresight).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
     assert len(chunks) == 2 and chunks[-1].masks.names == ()
 

@@ -25,10 +25,11 @@ _ORDER = (
     'imagine',
     'collect',
     'train',
-    'train_motion',
     'fit_contact',
+    'foresee',
     'evaluate',
     'rank',
+    'faults',
     'calibrate',
     'view',
     'own_robot',
@@ -36,7 +37,7 @@ _ORDER = (
     'import_weights',
 )
 #: commands that left, and the last version that has them
-_REMOVED = {'distill': '0.1.0'}
+_REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}
 _ADVICE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,

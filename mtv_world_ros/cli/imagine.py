@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import sqrt
 from pathlib import Path
+from statistics import NormalDist
 import sys
 
 from mtv_world_ros.cli.shared_options import (
@@ -22,6 +25,9 @@ from mtv_world_ros.cli.shared_options import (
 )
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
+
+#: ends of an episode that are no fault, as the node `policy` reports them
+GOOD_ENDS = ('done', 'max_chunks', 'stopped', 'max_seconds')
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -160,10 +166,41 @@ def _imagine(arguments: argparse.Namespace) -> int:
     for result in results:
         if int(str(result['num_chunks'])) and Path(str(result['bag'])).is_dir():
             write_pictures([Path(str(result['bag']))], Path(str(result['bag'])))
-    print('episode  end          chunks  seconds  bag')
-    for result in results:
-        print(
-            f'{result["episode"]:>7}  {result["how"]:<11}  {result["num_chunks"]:>6}  '
-            f'{result["episode_s"]:>7}  {result["bag"]}'
+    print('\n'.join(episode_table(results)))
+    print(f'look at them: mtv-world view {arguments.out}')
+    failed = [result for result in results if result['how'] not in GOOD_ENDS]
+    for result in failed:
+        why = str(result['text']).strip().splitlines() or ['no reason was given']
+        sys.stderr.write(
+            f'mtv-world: episode {result["episode"]} failed: {result["how"]}: {why[-1]} '
+            f"(logs are in '{arguments.out / 'logs'}')\n"
         )
-    return 0
+    return int(bool(failed))
+
+
+def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:
+    """Returns a row an episode with its estimate, why, and the success rate, as lines of text."""
+    lines = ['episode  end            chunks  estimate         verdict   seconds  bag']
+    for result in results:
+        low, value, high = (result[f'success{end}'] for end in ('_low', '', '_high'))
+        estimate = '-' if value is None else f'{value:.2f} [{low:.2f} {high:.2f}]'
+        lines.append(
+            f'{result["episode"]:>7}  {result["how"]:<13}  {result["num_chunks"]:>6}  '
+            f'{estimate:<15}  {result["verdict"]:<8}  {result["episode_s"]:>7}  {result["bag"]}'
+        )
+        lines += [f'         {reason}' for reason in str(result['reasons']).split('; ') if reason]
+    return [*lines, _success_rate([str(result['verdict']) for result in results])]
+
+
+def _success_rate(verdicts: Sequence[str]) -> str:
+    """The share of successes among the verdicts, with Wilson's 95 % interval."""
+    hits, count = verdicts.count('success'), sum(v in ('success', 'failure') for v in verdicts)
+    without = len(verdicts) - count
+    rest = f'; {without} without a verdict (open, or the estimate abstains)' if without else ''
+    if not count:
+        return f'success rate: no verdict in {len(verdicts)} episodes'
+    z = NormalDist().inv_cdf(0.975)
+    middle = (hits + z * z / 2) / (count + z * z)
+    half = z / (count + z * z) * sqrt(hits * (count - hits) / count + z * z / 4)
+    low, high = max(middle - half, 0.0), min(middle + half, 1.0)
+    return f'success rate: {hits} of {count} = {hits / count:.2f} [{low:.2f} {high:.2f}]{rest}'

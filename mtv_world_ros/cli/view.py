@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Shows real, drawn and imagined frames of every view on one timeline, masks outlined, joints, the
 success estimate and its reasons. PATH is an episode, predictions, an imagined episode, the folder
-of mtv-world demo, an evaluation (its episodes are tabs) or a ranking (its worst rollouts are
-tabs); bags of the same time that are given together are shown together, e.g. an episode and its
-predictions. --live shows what the cameras and the node publish now. Needs the extra `view`.
+of mtv-world demo, or, with a tab for each of its episodes, that of mtv-world imagine or evaluate,
+or of mtv-world rank (its worst rollouts); bags of the same time that are given together are shown
+together, e.g. an episode and its predictions. --live shows what the cameras and the node publish
+now. Needs the extra `view`.
 """
 
 
@@ -96,6 +97,7 @@ def _view_live(arguments: argparse.Namespace) -> int:
 
 def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
     """What the paths hold, by path of its entities."""
+    from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.viewing.scored_rollout import is_scored, scored_rollouts
     from mtv_world_ros.viewing.streams import read_streams
 
@@ -104,6 +106,9 @@ def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
     for path in arguments.paths:
         if is_scored(path):
             found |= {f'/{one.name}': one for one in scored_rollouts(path, arguments.episodes)}
+        elif (path / 'episodes.json').is_file():
+            episodes = list_episodes(path)[: arguments.episodes]
+            found |= {f'/{one.name}': read_streams([one]) for one in episodes}
         else:
             bags.append(_bag(path))
     if bags:

@@ -107,7 +107,7 @@ class EpisodeSource:
     """How recordings are read that are not episodes of this package's own.
 
     Attributes:
-        mapping: what their topics are; None = the default names.
+        mapping: names and kinds of the topics; None = the default names.
         calibration: camera calibration; None = `calibration.yaml` beside each, or TF.
     """
 

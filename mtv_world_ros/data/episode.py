@@ -193,7 +193,7 @@ class Episode:
     """A recorded episode.
 
     Attributes:
-        info: what it shows.
+        info: task, outcome, objects, instruction and robot.
         views: names of the views, in order.
         cameras: camera of each view at the size of its images; empty where not asked for.
         images: images of each view.

@@ -752,7 +752,7 @@ class LazyFrames:
     """Frames that are decoded when asked for (`episode.Frames`).
 
     Args:
-        topic: where they come from, for error texts.
+        topic: of the messages, for error texts.
         messages: the image messages.
         decode: message to frame.
     """

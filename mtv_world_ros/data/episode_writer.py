@@ -41,7 +41,7 @@ class EpisodeWriter(BagWriter):
     Args:
         path: folder to make.
         task: name of the task.
-        instruction: what the robot is told; `write_instruction` records it as a topic.
+        instruction: text for the robot; `write_instruction` records it as a topic.
         robot: name of the robot.
         cameras: calibrated views; go into calibration.yaml beside the record.
         seed: seed the episode is made from.

@@ -25,6 +25,7 @@ from mtv_world_ros.data_types import (
     CameraModel,
     FloatArray,
     JointTrajectory,
+    Observation,
     WorldModelSpec,
 )
 from mtv_world_ros.errors import DescriptionError, EpisodeError
@@ -48,7 +49,7 @@ class Recording:
         path: folder of the episode.
         task: its name.
         outcome: `success`, `failure` or `unknown`.
-        instruction: what the robot was told.
+        instruction: text for the robot.
         objects: names of the objects by the episode; what `object_ids` stand for.
         described: names of the objects by a describer; empty = none was asked.
         masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
@@ -59,7 +60,7 @@ class Recording:
         frames: (V, N, H, W, 3) uint8 RGB.
         object_ids: (V, N, H, W) uint8, 0 = none, i + 1 = objects[i]; None where not recorded.
         positions: (N, J) measured joint positions at `times`.
-        commands: what the policy commanded; times on the same clock.
+        commands: the policy's joint commands; times on the same clock.
         stamp_ns: stamp of the first frame.
         object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
         warnings: problems found and how the reader handled them.
@@ -102,6 +103,16 @@ class Recording:
             replace(own, T_mount_camera=now.T_mount_camera) for (_, own), now in posed
         )
 
+    def observation(self, frame: int) -> Observation:
+        """Returns what the robot saw and where it stood at a recorded frame."""
+        frames, cameras = self.seen_at(frame)
+        return Observation(
+            cameras=cameras,
+            frames=frames,
+            positions=self.positions[frame],
+            stamp_ns=self.stamp_ns + round(float(self.times[frame]) * 1e9),
+        )
+
     def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:
         """Returns the V cameras as they are at a frame.
 
@@ -126,7 +137,7 @@ class Clip:
 
     Attributes:
         cameras: V cameras at the model's size.
-        objects: what `object_ids` stand for.
+        objects: names; `object_ids` number them from 1.
         masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
         times: (1 + T,) [s] since the clip's start.
         frames: (V, 1 + T, H, W, 3) uint8 RGB.
@@ -213,7 +224,7 @@ def load_recording(
     """Reads an episode at the model's size.
 
     Raises:
-        EpisodeError: it lacks a view, joint states or commands.
+        EpisodeError: the episode lacks a view, joint states or commands.
         TrajectoryError: its joints are not the robot's.
     """
     episode = read_episode(
@@ -316,8 +327,8 @@ def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) 
     """Returns the joint states (T, J) at stamps (T,) [ns], in the robot's joint order.
 
     Raises:
-        EpisodeError: it has none.
-        TrajectoryError: they lack joints of the robot.
+        EpisodeError: the episode has no joint states.
+        TrajectoryError: the joint states lack joints of the robot.
     """
     states = episode.joint_states
     if states is None or len(states.stamps_ns) == 0:

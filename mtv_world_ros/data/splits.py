@@ -24,9 +24,9 @@ class Selection:
 
     Attributes:
         paths: their folders.
-        split: that they are of; `all` where the data set has no splits.
+        split: of the chosen episodes; `all` where the data set has no splits.
         zero_shot: by folder what the model was not trained for, where the data set says so.
-        num_in_dataset: how many episodes the data set holds.
+        num_in_dataset: number of episodes in the data set.
     """
 
     paths: Sequence[Path]

@@ -133,7 +133,7 @@ def load_rollout(path: Path) -> StoredRollout:
     """Reads a rollout back.
 
     Raises:
-        EpisodeError: it is not there or cannot be read.
+        EpisodeError: the file is missing or cannot be read.
     """
     try:
         return _unpacked(read_arrays(path))

@@ -96,7 +96,7 @@ def add_tool_poses(
         measured: (T, J).
         robot: the robot.
         arm: whose tool it is.
-        poses: what the poses mean.
+        poses: frame, units and reference of the poses.
         wanted: (T, 4, 4) poses or differences.
 
     Returns:
@@ -144,7 +144,7 @@ class ToolTrack(NamedTuple):
     """Commanded poses of a tool over time.
 
     Attributes:
-        targets: what they mean.
+        targets: frame, units and reference of the tool targets.
         stamps_ns: (N,) int64, increasing.
         poses: (N, 4, 4) poses or differences.
     """

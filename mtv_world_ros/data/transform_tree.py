@@ -128,7 +128,7 @@ class TransformTree:
 
         Args:
             message: of /tf or /tf_static.
-            latched: it holds until it is published again, as on a live /tf_static.
+            latched: the transform holds until it is published again, as on a live /tf_static.
         """
         for item in message.transforms:
             edge = self.name(item.header.frame_id), self.name(item.child_frame_id)
@@ -313,7 +313,7 @@ class TransformTree:
         A breadth-first search that visits a frame once: frames in a circle end it, too.
 
         Args:
-            frame: where to begin.
+            frame: the chain begins at it.
             only_still: leave out transforms that move.
             stamp_ns: when the poses are wanted [ns]; None = by the newest transforms.
         """

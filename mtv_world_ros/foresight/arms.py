@@ -14,16 +14,18 @@ import pinocchio as pin
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco
 from mtv_world_ros.foresight.robot_parts import load_parts, Part, with_inertias
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: what can touch what: solids are bit 0, each arm has a bit of its own
 SOLIDS = 1
 #: of drives of joints of which nothing was found: natural frequency [rad/s], damping [s]
 _STIFF, _DAMPED_S = 40.0, 0.05
+#: no finger whose drive is not known presses with more [N/m]
+_STIFFEST = 1000.0
 #: fingers that move by less per unit of their joint do not grip [m]
 _LEAST_TRAVEL = 1e-4
 #: radius of the patch in which a finger touches; it resists turning [m]
@@ -261,6 +263,15 @@ class Arms:
             'armature': np.zeros(len(mass)),
             'lead': np.full(len(mass), _DAMPED_S),
         }
+        for joint, way in travels.items():
+            column = robot.joint_names.index(joint)
+            effort = model.effortLimit[model.joints[model.getJointId(joint)].idx_v]
+            stiffness = 2 * effort / (robot.upper[column] - robot.lower[column])
+            if np.isfinite(stiffness) and stiffness > 0:  # largest force at half the travel
+                stiffness = min(stiffness, 2 * _STIFFEST * way**2)
+                unit['stiffness'][column] = stiffness
+                unit['damping'][column] = stiffness * _DAMPED_S
+                unit['armature'][column] = stiffness / _STIFF**2
         known = np.zeros(len(mass), np.bool_)
         if response is not None:
             known = response.compliance > 0

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.linalg import expm
 
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.foresight.arm_response import PERIOD_S
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import Scene, STEP_S
-from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: steps of the engine in a period of commands
 SUBSTEPS = round(PERIOD_S / STEP_S)

@@ -15,6 +15,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms, SOLIDS
 from mtv_world_ros.foresight.course import (
     ArmsState,
@@ -26,7 +27,6 @@ from mtv_world_ros.foresight.course import (
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import kind_of, Scene, STEP_S
-from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
 
 #: slower solids are at rest [rad/s], [m/s]; arms that are nearer to their way are on it
 _REST_RAD_S, _REST_M_S = 0.02, 0.002
@@ -37,8 +37,8 @@ _NEAR_M = 0.015
 _STILL_ROWS = 1
 #: what no object does on a table: places [m], speeds [m/s], [rad/s]
 _FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
-#: a row may take so many times as long as what it shows, at least so long [s]
-_SLOW, _LEAST_CAP_S = 5.0, 2.0
+#: a plan may take so many times as long as what it shows, and so long more [s]
+_SLOW, _LEAST_CAP_S = 20.0, 60.0
 
 logger = logging.getLogger(__name__)
 
@@ -154,6 +154,11 @@ class Batch:
         self._delays = [round(future.delay_s / STEP_S) for future in futures]
         self._gains = np.stack([model.actuator_gainprm[:, 0] for model in self._models])
 
+    @property
+    def model(self) -> Any:
+        """MuJoCo's model of the first future."""
+        return self._models[0]
+
     def touches_arms(self, positions: FloatArray) -> bool:
         """Returns whether arms at joints (J,) are near a solid, as one that they hold."""
         at = self._scene.arms.drives.spread(positions)
@@ -197,7 +202,7 @@ class Batch:
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
-        cap_s = time.monotonic() + max(_SLOW * rows * every * PERIOD_S, _LEAST_CAP_S)
+        cap_s = time.monotonic() + _SLOW * rows * every * PERIOD_S + _LEAST_CAP_S
         for row in range(rows):
             if should_stop():
                 raise RolloutPreempted('stopped while objects were foreseen')

@@ -11,10 +11,10 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import validated
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import write_json
+from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.solid_foresight import SolidForesight
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: numbers of contact, and how arms follow their commands
 CONTACT_FILE, RESPONSE_FILE = 'contact.json', 'arm_response.json'

@@ -15,9 +15,9 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arms import Arms, PATCH_M, set_drives, SOLIDS
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: of the engine [s]
 STEP_S = 0.004
@@ -27,6 +27,8 @@ _DISH_M, _DISH_RATIO = 0.06, 1.5
 _FLOOR_M, _LIFT_M = 0.006, 0.0005
 #: round walls are so many boxes
 _SIDES = 16
+#: nothing is thinner [m]
+_LEAST_M = 1e-3
 _LEAST_KG = 0.01
 #: contacts give way within so many steps; friction is stiffer than they by this factor
 _SOFT_STEPS, _STIFF_FRICTION = 2.5, 10.0
@@ -109,7 +111,7 @@ class Scene:
         for number, kind in enumerate(kinds):
             body = spec.worldbody.add_body(name=f'solid {number}')
             body.add_freejoint(name=f'solid {number}')
-            _add_pieces(body, _pieces(_EXAMPLES[kind], _SETTINGS))
+            _add_pieces(body, _pieces(_EXAMPLES[kind], _SETTINGS, kind))
         try:
             model = spec.compile()
         except ValueError as error:
@@ -151,7 +153,7 @@ class Scene:
         model.eq_active0[:] = not settings.fingers_swing
         for number, solid in enumerate(solids):
             _set_pieces(model, self._bodies[number], self._geoms[number],
-                        _pieces(solid, settings))  # fmt: skip
+                        _pieces(solid, settings, self.kinds[number]))  # fmt: skip
         mujoco.mj_setConst(model, mujoco.MjData(model) if data is None else data)
         return model
 
@@ -248,9 +250,10 @@ def _inertia_of(pieces: Sequence[_Piece]) -> tuple[float, FloatArray, FloatArray
     return mass, middle, moments, turn
 
 
-def _pieces(solid: Solid, settings: ContactSettings) -> list[_Piece]:
-    wide, long, high = map(float, solid.size)
-    kind, density = kind_of(solid), settings.density
+def _pieces(solid: Solid, settings: ContactSettings, kind: str) -> list[_Piece]:
+    """Of the kind that it was found as: of another size in a future, it still is that."""
+    wide, long, high = (max(float(extent), _LEAST_M) for extent in solid.size)
+    density = settings.density
     if kind == 'tray':
         return _tray(wide, long, high, settings)
     if kind in ('dish', 'cup'):
@@ -265,7 +268,8 @@ def _pieces(solid: Solid, settings: ContactSettings) -> list[_Piece]:
 
 def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece]:
     """Round and open at the top."""
-    middle, half = (wide - rim) / 2, (high - _LIFT_M) / 2
+    rim = min(rim, wide / 2)
+    middle, half = (wide - rim) / 2, max(high - _LIFT_M, _LEAST_M) / 2
     wall = (rim / 2, float(middle * np.tan(np.pi / _SIDES)) * 1.02, half)
     floor = _Piece(
         size=(middle, _FLOOR_M / 2, 0.0),
@@ -287,7 +291,8 @@ def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece
 
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Piece]:
     """A box without a lid; it is heavy below."""
-    x, y, half, wall = wide / 2, long / 2, (high - _LIFT_M) / 2, settings.wall_m / 2
+    x, y, wall = wide / 2, long / 2, min(settings.wall_m, wide / 2, long / 2) / 2
+    half = max(high - _LIFT_M, _LEAST_M) / 2
     walls = (
         ((wall, y, half), (x - wall, 0.0)),
         ((wall, y, half), (wall - x, 0.0)),

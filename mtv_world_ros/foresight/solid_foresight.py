@@ -11,15 +11,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.foresight.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Batch, BatchState, Engine
 from mtv_world_ros.foresight.futures import draw_futures, Future, STANDS_M
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import find_solid, fit_solid, is_vessel, Solid
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 #: positions that are commanded in a step of a motion, and its length [s]
 COMMANDS_A_STEP = 5
@@ -183,7 +183,7 @@ class TrackedSolids:
     def sizes(self) -> FloatArray:
         """(K, O, 3) extents in each of the futures [m], NaN = not known."""
         sizes = np.full((self.foresight.settings.num_motions, len(self.solids), 3), np.nan)
-        for number, future in enumerate(self._futures()):
+        for number, future in enumerate(self.futures()):
             found = [solid.size for solid in future.solids]
             sizes[number, self._known] = np.reshape(found, (len(found), 3))  # also of none
         return sizes
@@ -215,7 +215,7 @@ class TrackedSolids:
         """
         rows = (len(positions) - 1) // COMMANDS_A_STEP
         positions = positions[: 1 + rows * COMMANDS_A_STEP]
-        batch = self.batch or self.foresight.engine.begin(self._futures())
+        batch = self.batch or self.foresight.engine.begin(self.futures())
         doubts = (
             self.doubts if self.batch else {**self._floating(batch, positions[0]), **self.doubts}
         )
@@ -262,7 +262,8 @@ class TrackedSolids:
             if (height := _floats(solid, [s for s in solids if s is not solid], table)) > 0
         }
 
-    def _futures(self) -> tuple[Future, ...]:
+    def futures(self) -> tuple[Future, ...]:
+        """Returns the K futures."""
         if self.batch is not None:
             return self.batch.futures
         solids = [solid for solid in self.solids if solid is not None]

@@ -83,10 +83,10 @@ def windowed_camera(
     """Returns the camera for images of a size, and what had to be assumed; see `windowed_pixels`.
 
     Args:
-        camera: as calibrated.
+        camera: the calibrated camera, before cropping.
         width: of the images [px].
         height: of the images [px].
-        window: which of the calibrated pixels they have.
+        window: part of the calibrated image that the frames show.
 
     Raises:
         CalibrationError: images of this size are not explained.

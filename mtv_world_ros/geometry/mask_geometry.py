@@ -24,7 +24,7 @@ class Location:
 
     Attributes:
         point: (3,) in the base frame [m].
-        residual_px: how far the views' rays miss each other.
+        residual_px: distance of the views' rays where they pass each other, in pixels.
         sigma_m: position error that the centroid's error, or the larger residual, causes [m].
     """
 

@@ -39,7 +39,7 @@ class ObjectMotion:
         rotations: (T, O, 3, 3) from the reference.
         openings: (T, A) of the grippers, 0 closed to 1 open, which what they touch may stop; None
             = not foreseen.
-        weight: how much it counts among others of the same plan.
+        weight: relative weight among the motions of the same plan.
     """
 
     reference: FloatArray
@@ -158,7 +158,7 @@ class ObjectMotionModel(Protocol):
         """Returns the same, of objects that something may hide in part by now.
 
         Args:
-            whole: what `find` returned when they were seen whole.
+            whole: what `find` returned on a frame in which nothing hid the objects.
             names: see `find`; so are the others.
             masks: of what is seen of them now.
             cameras: V cameras.
@@ -183,13 +183,13 @@ class FoundObjects:
         names: O of them.
         cuts: (V, O, H, W, 4) `cut_outs` of the frame that shows each best, at the model's size.
         poses: (V, O, 4, 4) T_base_camera then.
-        tracked: where they are now.
+        tracked: current poses of the objects.
         motions: from there on, `tracked.step_s` apart; of the first one places and sizes are as
             the masks have them.
         positions: (N, J) joints at their rows [rad or m].
         part_row: row at which the last part of a plan begins.
-        shown: which of the motions pictures show.
-        shown_before: which one they showed until the last part.
+        shown: index of the motion that the pictures show.
+        shown_before: index of the motion that the pictures of the part before showed.
         is_whole: whether all were seen whole, now or before.
     """
 

@@ -134,7 +134,7 @@ def cut_off(
     Args:
         trajectory: joints in the order of `start_positions`.
         start_positions: (J,) positions at time 0.
-        seconds: where it is cut [s].
+        seconds: time of the cut, from the trajectory's time 0 [s].
     """
     kept = trajectory.times < seconds - SAME_S
     end = resample(trajectory, start_positions, np.array([seconds]))

@@ -155,7 +155,7 @@ def find_solid(
     Most of its outline is that of the masks; what is hidden is left out of account.
 
     Args:
-        solid: as it was when it was seen whole.
+        solid: the object's solid from a frame in which nothing hid it.
         masks: (V, H, W) of what is seen of it now.
         point: (3,) the middle of that; NaN = not known, as of one view: then where it would look
             as large as it does there [m].

@@ -72,7 +72,7 @@ def imagine_episodes(
     """Runs the episodes; `out` gets a bag for each, `episodes.json` and `logs/`.
 
     Args:
-        options: what is started.
+        options: policy, episodes and settings of the nodes.
         out: folder of the results.
         overwrite: remove the episodes of an earlier run from it.
 

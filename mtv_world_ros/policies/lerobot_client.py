@@ -85,7 +85,7 @@ class LeRobotPolicy:
     """Asks the server, one observation at a time.
 
     Args:
-        config: which server and policy, and what it gets and gives.
+        config: address of the server, policy, and the mapping of its inputs and outputs.
     """
 
     def __init__(self, config: LeRobotConfig) -> None:

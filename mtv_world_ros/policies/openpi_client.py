@@ -82,10 +82,10 @@ class OpenPiPolicy:
     """Asks the server.
 
     Attributes:
-        metadata: what the server said of itself.
+        metadata: the server's description of itself.
 
     Args:
-        config: which server, and what it gets and gives.
+        config: address of the server, and the mapping of its inputs and outputs.
     """
 
     def __init__(self, config: OpenPiConfig) -> None:
@@ -206,7 +206,7 @@ def unpack(data: bytes) -> Any:
     """Returns what the bytes hold.
 
     Raises:
-        PolicyError: they are not msgpack, or hold an array that is none.
+        PolicyError: the bytes are not msgpack, or hold a malformed array.
     """
     import msgpack
 

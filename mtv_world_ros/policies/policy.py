@@ -50,7 +50,7 @@ class Policy(Protocol):
         part of them alone and ask again.
 
         Raises:
-            PolicyError: it cannot answer, e.g. its server is gone.
+            PolicyError: the policy cannot answer, e.g. its server is gone.
         """
         ...
 
@@ -63,7 +63,7 @@ def first_part(
     Args:
         trajectory: times count from the observation it answers; joints in any order.
         start_positions: (J,) positions at time 0, in the trajectory's joint order.
-        seconds: where it is cut [s].
+        seconds: time of the cut, from the observation [s].
 
     Raises:
         ConfigError: the time is not positive.

@@ -92,7 +92,7 @@ def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
     Args:
         values: of the file.
         robot: whose joints it moves.
-        where: what errors begin with.
+        where: beginning of error texts, e.g. the file.
 
     Raises:
         ConfigError: a key is unknown or missing, a value is wrong.

@@ -27,7 +27,7 @@ class ServerProcess:
     """Runs the command of a server; it ends with this process.
 
     Attributes:
-        port: that it listens on, of this machine; 0 before the first start.
+        port: TCP port of the server on this machine; 0 before the first start.
 
     Args:
         name: of the policy; log files begin with it.
@@ -50,7 +50,7 @@ class ServerProcess:
         """Starts the server unless it runs; returns whether it did.
 
         Raises:
-            PolicyServerError: it does not start, or was given up.
+            PolicyServerError: the server does not start, or was given up.
         """
         if self._process is not None and self._process.poll() is None:
             return False

@@ -166,7 +166,7 @@ class _Machine:
     """Runs one pickle.
 
     Args:
-        names: what stands for a module's name.
+        names: module names, by the names in the pickle.
         persistent: whether the pickle refers to something outside; it is the result then.
     """
 

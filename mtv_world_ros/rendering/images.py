@@ -34,7 +34,7 @@ def encode_jpeg(rgb: ByteArray, quality: int) -> bytes:
     """Returns the JPEG file of an (H, W, 3) RGB image.
 
     Raises:
-        EpisodeError: it is too large.
+        EpisodeError: the image is too large.
     """
     return _encode('.jpg', rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
 
@@ -43,7 +43,7 @@ def encode_png(image: ByteArray) -> bytes:
     """Returns the PNG file of an (H, W, 3) RGB or (H, W) image.
 
     Raises:
-        EpisodeError: it is empty.
+        EpisodeError: the image has no pixels.
     """
     return _encode('.png', image[..., ::-1] if image.ndim == 3 else image, [])
 

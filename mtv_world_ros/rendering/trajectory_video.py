@@ -130,7 +130,7 @@ def render_trajectory_video(
         times: (T,) [s], increasing.
         object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
         objects: (V, T, H, W, 4) uint8 of `moved_pictures`, in place of masks; or None.
-        config: how it looks.
+        config: widths, colours and fading of the trails.
 
     Returns:
         (V, T, H, W, 3) frames.
@@ -454,7 +454,7 @@ class ArmLinks:
 
         Args:
             image: drawn upon.
-            arm: which.
+            arm: index of the arm.
             frame: of the T.
             colour: (3,) RGB in 0 .. 1.
         """

@@ -71,7 +71,7 @@ def contact_sheet(
     """Returns an (H, W, 3) uint8 RGB picture: a row per view and kind, time from left to right.
 
     Args:
-        comparison: what to show.
+        comparison: real, drawn and imagined frames of a rollout.
         title: heading.
         notes: lines below.
         num_columns: most frames in a row; spread evenly, the first and last among them.
@@ -155,7 +155,7 @@ def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> 
 
     Args:
         path: ends in `.mp4`; written beside and renamed.
-        frames: what to show.
+        frames: (T, H, W, 3) uint8 RGB.
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
     """
@@ -208,7 +208,7 @@ def encode_video(
     """Returns an MP4 file of (T, H, W, 3) uint8 RGB frames.
 
     Args:
-        frames: what to show; of even size unless `full_colour`.
+        frames: (T, H, W, 3) uint8 RGB; H and W even unless `full_colour`.
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
         full_colour: keep colour at every pixel (4:4:4), which not every browser plays; the same
@@ -238,7 +238,7 @@ def decode_video(data: bytes) -> ByteArray:
     """Returns the (T, H, W, 3) uint8 RGB frames of a video file's bytes.
 
     Raises:
-        EpisodeError: they are no video.
+        EpisodeError: the bytes are no video.
     """
     try:
         with av.open(io.BytesIO(data), 'r') as container:

@@ -51,7 +51,7 @@ class ReplaySummary:
         video_s: time the written frames cover [s].
         probabilities: success estimate at the end of each trajectory; NaN = abstains.
         rejected: (stamp [ns], reason) of trajectories that were not imagined.
-        warnings: what was odd about the episode.
+        warnings: problems of the episode.
     """
 
     out: Path
@@ -109,10 +109,10 @@ def replay_offline(
         pipeline: imagines.
         episode_path: rosbag2 folder or .mcap file, also one that was cut off.
         out: folder for the predictions; appears only when all is written.
-        source: how the episode is read if it is not this package's own.
+        source: topics and robot of an episode that is not in this package's format.
         seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
-        limits: what is too old or out of sync.
+        limits: greatest age and spread of images and joint states.
         overwrite: replace an existing folder of predictions.
         show_progress: draw a progress bar.
 

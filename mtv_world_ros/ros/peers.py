@@ -25,7 +25,7 @@ _ASK_AGAIN_S = 2.0
 class Peers:
     """Keeps the newest diagnostics of every node, and talks to their services.
 
-    Nodes are told apart by their whole names, with the namespace.
+    Nodes are distinguished by their full names, with the namespace.
 
     Args:
         node: owner of the subscription and the clients.
@@ -70,7 +70,7 @@ class Peers:
         """Spins until the condition holds.
 
         Raises:
-            ConfigError: it does not in time.
+            ConfigError: the condition does not hold in time.
         """
         end_s = time.monotonic() + timeout_s
         while not condition():
@@ -82,7 +82,7 @@ class Peers:
         """Calls a service, which a second request does not harm, and returns its answer.
 
         Raises:
-            ConfigError: it is not there, or does not answer, in time.
+            ConfigError: the node is missing or does not answer in time.
         """
         if name not in self._clients:
             self._clients[name] = self._node.create_client(kind, name)
@@ -104,7 +104,7 @@ class Peers:
         """Sets parameters of a node.
 
         Raises:
-            ConfigError: it refuses one, or is not there.
+            ConfigError: the node refuses a parameter, or is missing.
         """
         parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         request = SetParameters.Request(parameters=parameters)

@@ -1,4 +1,4 @@
-"""Runs a node until it is told to stop, and shuts down without a traceback."""
+"""Runs a node until a signal ends it, and shuts down without a traceback."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def run(
     Args:
         make: makes the node; where it has `close()`, that ends it.
         args: command line with the program's name; default: the process' own.
-        spin: what the node does.
-        signals: which signals end it; NO = it has its own handlers.
+        spin: runs the node's callbacks until shutdown.
+        signals: signals that rclpy handles; NO = the node has handlers of its own.
         help_text: printed instead if the command line has `--help`.
 
     Returns:

@@ -62,7 +62,7 @@ class StatusPublisher:
 
         Args:
             state: keys and values.
-            warning: what is wrong right now; empty = nothing.
+            warning: current problem; empty = none.
         """
         values = {**state, **dict(sorted(self.counts.items()))}
         if self._last is not None:

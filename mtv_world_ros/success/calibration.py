@@ -82,9 +82,9 @@ class Calibration(Weights):
             those that are imagined.
         unforeseen: for imagined frames where no motion is foreseen, as of a rollout that begins
             in mid-episode; None = as where some are.
-        segmenter: that found the masks.
-        tasks: that it was fitted on.
-        num_episodes: that it was fitted on.
+        segmenter: name of the segmenter whose masks were fitted on.
+        tasks: names of the tasks that were fitted on.
+        num_episodes: number of episodes that were fitted on.
         num_seeds: rollouts of each.
         l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
         scores: before and after, the latter on tasks that were left out of the fit.
@@ -140,7 +140,7 @@ class HorizonCurve(Schema):
         period_s: between frames [s]; frame k is `(k + 1) * period_s` ahead.
         values: (T,) mean J.
         lower: (T,) lower end of the 95 % interval over episodes; 0 where too few reach it.
-        segmenter: that found the masks.
+        segmenter: name of the segmenter whose masks were fitted on.
         num_episodes: behind it.
         made: command, date, machine.
     """

@@ -16,7 +16,7 @@ def doubted(
 
     Args:
         estimate: of pictures and foreseen motions.
-        notes: what has to be known to read it, one line each.
+        notes: remarks for the reader, one line each.
         refusal: why there is no verdict; empty = there may be one.
     """
     if refusal:

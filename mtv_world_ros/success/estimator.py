@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds, ForeseenMotions
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
-from mtv_world_ros.success.situation import CannotTell, grippers_open
+from mtv_world_ros.success.situation import grippers_open
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -104,7 +104,7 @@ class SuccessEstimator:
 
         Args:
             footage: the chunk.
-            instruction: what the robot was told; says which task it is and with which objects.
+            instruction: text for the robot; selects the task and its objects.
             memory: of the chunks before; None = the chunk is the rollout's first.
             foreseen: motions of the objects up to the chunk's end, by a model of contact.
             is_real: the frames were not imagined.
@@ -137,7 +137,7 @@ class SuccessEstimator:
 
         Args:
             foreseen: since the objects were found.
-            instruction: what the robot is told.
+            instruction: text for the robot; selects the task and its objects.
             memory: of the rollout so far; None = it begins where they were found.
         """
         try:

@@ -9,6 +9,7 @@ from math import isfinite, nan
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.imagined_scene import ImaginedScene
 from mtv_world_ros.success.relations import (
@@ -21,7 +22,6 @@ from mtv_world_ros.success.relations import (
     Within,
 )
 from mtv_world_ros.success.rollout_memory import Grasp
-from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -85,7 +85,7 @@ def gather(
 
     Args:
         views: the rollout.
-        task: what is asked.
+        task: its relations are evaluated.
         bound: placeholder -> name of its object.
         picture_masks: finds objects in the task's pictures.
 

@@ -16,9 +16,10 @@ from math import nan
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.success.situation import CannotTell, TruePoses
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
 
 
@@ -73,7 +74,7 @@ class ForeseenMotions:
         """Returns whether the task is done at the end of each; None = they do not tell.
 
         Args:
-            task: what is asked.
+            task: its relations are evaluated.
             bound: placeholder -> name of its object.
             starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.
         """

@@ -13,7 +13,7 @@ from pydantic import ValidationInfo
 
 from mtv_world_ros.config import wrong
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, ObjectMasks
-from mtv_world_ros.success.situation import CannotTell
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.vision.segmenters.segmenter import resize_masks, Segmenter
 
 #: sides of a picture and of its view may differ in ratio by this share
@@ -65,7 +65,7 @@ def load_pictures(data: Any, info: ValidationInfo) -> Any:
     The context's `folder` is what names are relative to; without it, `data` are pictures already.
 
     Raises:
-        ValueError: it is no such mapping, or a file is no picture.
+        ValueError: the value is no mapping of views to files, or a file is no picture.
     """
     if not info.context:
         return data
@@ -120,7 +120,7 @@ class PictureMasks:
 
         Args:
             pictures: by view.
-            names: of all objects: an object is told from others of its kind.
+            names: of all objects; the segmenter distinguishes objects of the same kind by them.
             item: index of the one.
             cameras: of the V views.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.mask_geometry import (
     block_size,
     count_reversals,
@@ -15,7 +16,6 @@ from mtv_world_ros.geometry.mask_geometry import (
     widest_swing,
 )
 from mtv_world_ros.success.goal_pictures import Picture, PictureMasks
-from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
 

@@ -391,7 +391,7 @@ class Shaken(Relation):
 
     Attributes:
         min_lift_m: height of its lowest point over the table.
-        num_reversals: how often its lean turns back while it is lifted.
+        num_reversals: turning points of the object's lean while it is lifted.
         min_swing_rad: smaller turns do not count.
     """
 

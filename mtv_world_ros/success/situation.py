@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.mask_geometry import count_reversals, widest_swing
-
-if TYPE_CHECKING:
-    from mtv_world_ros.success.goal_pictures import Picture
+from mtv_world_ros.success.goal_pictures import Picture
 
 #: a gripper counts as open above this share of its range
 OPEN_SHARE = 0.8
-
-
-class CannotTell(Exception):
-    """Why something about a situation is not known; the estimator abstains with this reason."""
 
 
 class Situation(Protocol):

@@ -61,7 +61,7 @@ class TaskSpec(Schema):
     Attributes:
         name: e.g. `stack_blocks_two`.
         instruction: template with placeholders for the objects, `stack the {a} on the {b}`.
-        relations: what must hold between the objects at the end, all of it.
+        relations: between objects; all must hold at the end.
         sizes_m: usual extents (x, y, z) of a placeholder's object, for where they are not known:
             from pictures, an object that is not named here is taken as a cube [m].
         nouns: what a placeholder's object may be called, by its last word; not given = anything.
@@ -123,7 +123,7 @@ class TaskSpec(Schema):
         """Returns (T,) whether the task is done at each sample.
 
         Args:
-            at: where the objects are.
+            at: object poses and gripper openings over time.
             openings: (A, T) of the grippers, 0 closed to 1 open.
 
         Raises:

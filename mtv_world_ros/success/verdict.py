@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from math import nan
+from math import isnan, nan
 
-#: an estimate from here on is called a success. To be told of a success that is none costs more
-#: than not to be told, so that more than an even chance is asked for
+#: an estimate from here on is called a success. A false success costs more than a false failure,
+#: so that more than an even chance is required
 SUCCESS_FROM = 0.75
 #: an estimate below this is called a failure; between the two, the verdict is open
 FAILURE_BELOW = 0.5
@@ -16,3 +16,10 @@ def verdict(probability: float) -> float:
     if probability >= SUCCESS_FROM:
         return 1.0
     return 0.0 if probability < FAILURE_BELOW else nan
+
+
+def verdict_word(probability: float) -> str:
+    """Returns `success`, `failure`, `open`, or `abstains` where the probability is NaN."""
+    if isnan(probability):
+        return 'abstains'
+    return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability), 'open')

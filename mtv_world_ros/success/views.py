@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.mask_geometry import centroids, locate, Location, moved_mask
 from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
-from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: frames at the end whose median counts
@@ -48,7 +48,7 @@ class Views:
         """Returns the object's index.
 
         Raises:
-            CannotTell: it has no mask.
+            CannotTell: the object has no mask in any view.
         """
         if name not in self.names:
             raise CannotTell(f"'{name}' is not among the objects {list(self.names)}")
@@ -142,7 +142,7 @@ class Views:
         """Returns where the object is at the end, and whether it is hidden where it stood.
 
         Raises:
-            CannotTell: it is lost, or the views' rays miss each other.
+            CannotTell: the object was lost, or the views' rays do not meet.
         """
         point = self.memory.seen_points[item]
         if np.isfinite(point).all() and self._is_hidden_in_place(item):

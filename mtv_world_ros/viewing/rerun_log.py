@@ -51,7 +51,7 @@ def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = No
 
     Args:
         stream: of `recording`.
-        streams: what is shown.
+        streams: frames, masks, joints and texts of a bag or of topics.
         root: path of its entities.
         begin: stamp of second 0 [ns]; None = that of the first frame.
     """
@@ -164,7 +164,7 @@ def layout(roots: dict[str, Streams | ScoredRollout]) -> Any:
     """Returns the blueprint: a tab per root; a row per view, its kinds side by side; curves.
 
     Args:
-        roots: what was logged, by path of its entities.
+        roots: logged streams and rollouts, by path of their entities.
     """
     import rerun.blueprint as rrb
 

@@ -122,7 +122,7 @@ def take(streams: Streams, message: BagMessage) -> None:
     """Adds what a message shows.
 
     Raises:
-        MtvWorldError: it cannot be read.
+        MtvWorldError: the message cannot be read.
     """
     what = shown_as(message.topic, message.msgtype)
     if what is None:

@@ -81,7 +81,7 @@ class CameraFit:
     Attributes:
         view: its name.
         status: `fits`, `corrected` for this episode, `refused` as too far off, or `unchecked`.
-        T_told_found: (4, 4) the found optical frame in the told one; identity where not found.
+        T_told_found: (4, 4) found optical frame in the calibrated one; identity where not found.
         offset_px: how far the arm is from where it should be, at the picture's size; NaN = not
             known.
         off_m: of the camera's place [m].
@@ -142,7 +142,7 @@ class CameraChecker:
     """Compares pictures with the outline of a robot.
 
     Args:
-        robot: whose joint states are told.
+        robot: the one whose joint states are given.
         shape: its links.
     """
 
@@ -179,7 +179,7 @@ class _Found(NamedTuple):
     """A pose, and how far it moves what is looked at.
 
     Attributes:
-        T: (4, 4) the found optical frame in the told one.
+        T: (4, 4) the found optical frame in the calibrated one.
         offset: mean shift of the outline, as a share of the width; NaN = it is met nowhere near.
     """
 

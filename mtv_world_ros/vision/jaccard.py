@@ -58,7 +58,7 @@ def boundary_f(pred: BoolArray, true: BoolArray) -> FloatArray:
 
     Args:
         pred: (..., H, W) bool.
-        true: the same shape.
+        true: masks of the real frames, of the same shape.
     """
     height, width = true.shape[-2:]
     reach = ceil(BOUNDARY_SHARE * hypot(height, width))

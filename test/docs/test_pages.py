@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.bench.expert.faults import FAULTS
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.policies.policy_config import load_policy_config
@@ -72,12 +71,6 @@ def test_every_example_is_run():
     page = (ROOT / 'docs' / 'python_api.md').read_text()
     for script in (ROOT / 'examples').glob('*.py'):
         assert f'\npython examples/{script.name}' in page, script.name
-
-
-def test_the_fault_catalogue_has_a_row_for_every_kind():
-    page = (ROOT / 'docs' / 'ranking.md').read_text()
-    rows = re.findall(r'^\| `(\w+)` \| (\w+) \| (\w+) \|', page, re.M)
-    assert rows == [(name, kind.family, kind.split) for name, kind in FAULTS.items()]
 
 
 def test_the_page_of_tasks_has_every_relation():

@@ -198,7 +198,7 @@ def check_mtv_world(words: Sequence[str]) -> bool:
 def check_values(given: dict[str, Any]) -> None:
     """Raises a user error where a preset, policy, task ... does not exist."""
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.bench.expert.faults import parse_variant
+    from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
     from mtv_world_ros.bench.tasks.tasks import tasks_named
     from mtv_world_ros.bench.world.zero_shot import kinds_named
     from mtv_world_ros.lab.cli.train import set_overrides

@@ -11,11 +11,11 @@ import pytest
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.foresight import engine as engine_module
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings, ContactSpread
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings, ContactSpread
 
 SETTINGS = ContactSettings(
     finger_stiffness=400.0,
@@ -60,8 +60,8 @@ def test_arms_that_pass_by_move_as_they_would_by_dynamics(lift, monkeypatch):
     monkeypatch.setattr(engine_module._Run, 'may_pass', lambda *_: False)
     computed, _ = batch_of(lift, BLOCK, AWAY).advance(commands, 5)
     assert passed.steps < 0.9 * computed.steps
-    np.testing.assert_allclose(passed.points, computed.points, atol=1e-3)
-    np.testing.assert_allclose(passed.joints, computed.joints, atol=2e-3)
+    np.testing.assert_allclose(passed.points, computed.points, atol=4e-3)
+    np.testing.assert_allclose(passed.joints, computed.joints, atol=4e-3)
 
 
 def test_futures_differ_in_what_is_not_known_and_the_first_does_not(lift):
@@ -168,3 +168,19 @@ def test_what_is_not_seen_by_two_views_is_not_foreseen_and_hit_by_nothing(lift):
     motions, then = tracked(lift, None, AWAY).advance(picking(0.4))
     assert np.isnan(motions[0].points[:, 0]).all() and np.isfinite(motions[0].points[:, 1]).all()
     assert np.isnan(then.sizes[:, 0]).all()
+
+
+def test_what_is_almost_hollow_is_of_one_kind_in_all_futures(lift):
+    # 6 cm wide is where a flat box begins to count as a tray; futures differ by 1.5 % in size
+    almost = Solid(centre=np.array([0.3, 0.0, 0.015]), size=np.array([0.0602, 0.0602, 0.03]))
+    batch = batch_of(lift, almost, num_motions=16)
+    assert len(batch.futures) == 16
+
+
+def test_nothing_on_the_table_is_foreseen_as_nothing(lift):
+    foresight = SolidForesight(lift, None, SETTINGS)
+    tracked = TrackedSolids(foresight=foresight, names=(), solids=())
+    motions, then = tracked.advance(picking(0.5))
+    assert len(motions) == SETTINGS.num_motions
+    assert motions[0].points.shape[1:] == (0, 3)
+    assert then.sizes.shape == (SETTINGS.num_motions, 0, 3)

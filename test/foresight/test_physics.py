@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
 
 G = 9.81
 SETTINGS = ContactSettings(

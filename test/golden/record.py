@@ -271,12 +271,10 @@ def rank() -> dict[str, str]:
 
 
 def train() -> dict[str, str]:
-    """Weights after twenty steps of `train` and of `train-motion`."""
+    """Weights after twenty steps of `train`."""
     out = folder() / 'trained'
     command('train', episodes(), '--out', out / 'world', '--preset', 'small', '--threads', 1,
             '--split', 'all', '--set', 'optimizer.steps=20')  # fmt: skip
-    command('train-motion', episodes(), '--out', out / 'motion', '--steps', 20, '--threads', 1,
-            '--dtype', 'float32')  # fmt: skip
     return weights(out)
 
 

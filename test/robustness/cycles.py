@@ -76,6 +76,7 @@ class Cycles:
         self.out, self.rows = out, [dict[str, float]()][:0]
         self.process = ros().start_node(out, 'pace:=burst', **program)
         self.client = ros().Client()
+        self.client.wait(self.client.diagnostic_values, 'the node', PATIENCE_S)
         self.client.connect_inputs(ros().INPUTS)
         self.problems: list[str] = []
 

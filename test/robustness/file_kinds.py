@@ -25,6 +25,7 @@ import parameter_calls
 import wild_numbers
 from wild_numbers import judged, with_wild_number
 import wild_plans
+import wild_scenes
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, typestore
@@ -412,45 +413,13 @@ def _read_weights(data: bytes, folder: Path) -> Any:
         tensor.read()
 
 
-def _networks() -> list[bytes]:
-    return [share_path('resource', 'checkpoint', 'object_motion', 'config.json').read_bytes()]
-
-
-def _read_network(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.object_motion.predictor import load_network
-
-    source = share_path('resource', 'checkpoint', 'object_motion')
-    (folder / 'motion').mkdir(exist_ok=True)
-    if not (folder / 'motion' / 'model.safetensors').exists():
-        (folder / 'motion' / 'model.safetensors').symlink_to(source / 'model.safetensors')
-    _file(folder / 'motion' / 'config.json', data)
-    return load_network(folder / 'motion')
-
-
-def _network_weights() -> list[bytes]:
-    return [
-        share_path('resource', 'checkpoint', 'object_motion', 'model.safetensors').read_bytes()
-    ]
-
-
-def _read_network_weights(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.object_motion.predictor import load_network
-
-    (folder / 'other').mkdir(exist_ok=True)
-    shutil.copy(
-        share_path('resource', 'checkpoint', 'object_motion', 'config.json'), folder / 'other'
-    )
-    _file(folder / 'other' / 'model.safetensors', data)
-    return load_network(folder / 'other')
-
-
 def _responses() -> list[bytes]:
     folder = share_path('resource', 'checkpoint', 'object_motion')
     return [(folder / 'arm_response.json').read_bytes()]
 
 
 def _read_response(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.object_motion.predictor import load_response
+    from mtv_world_ros.foresight.loading import load_response
 
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
     return load_response(_file(folder / 'arm_response.json', data).parent, robot)
@@ -462,7 +431,7 @@ def _contacts() -> list[bytes]:
 
 
 def _read_contact(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.object_motion.predictor import load_contact
+    from mtv_world_ros.foresight.loading import load_contact
 
     return load_contact(_file(folder / 'contact.json', data).parent)
 
@@ -492,7 +461,6 @@ KINDS = {
     'training state': Kind(_trees, _read_state_card),
     'features': Kind(_features, _read_features),
     'weights': Kind(_weights, _read_weights),
-    'object motion': Kind(_networks, _read_network),
     'arm response': Kind(_responses, _read_response),
     'contact': Kind(_contacts, _read_contact),
     'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, _mutated_content, 0.1),
@@ -525,10 +493,8 @@ KINDS = {
     'weights, numbers': Kind(
         _weights, wild_numbers.no_survivors(_read_weights, wild_numbers.are_finite),
         damage=wild_numbers.weights),
-    'object motion weights, numbers': Kind(
-        _network_weights,
-        wild_numbers.no_survivors(_read_network_weights, wild_numbers.are_finite),
-        damage=wild_numbers.weights),
+    'scene, foreseen': Kind(
+        wild_scenes.samples, wild_scenes.foresee, wild_scenes.MOST_S, wild_scenes.damaged, 0.2),
     'plan, imagined': Kind(
         wild_plans.samples, wild_plans.imagine, 20.0, wild_plans.damaged, 0.1),
 }  # fmt: skip

@@ -20,6 +20,8 @@ from typing import Any
 from node_messages import commit, ROOT, ros
 import numpy as np
 
+from mtv_world_ros.ros.messages.conversions import values_of
+
 #: an end that comes later than this after its plan is late, on a machine that is not busy [s]
 LATE_S = 2.0
 #: a burst, and how often there is one
@@ -27,8 +29,8 @@ BURST, BURST_EVERY = 40, 100
 #: how often and how long the node is stopped [plans, s]
 STOP_EVERY, STOP_S = 250, 1.5
 #: ends that are missing are waited for this long [s]
-PATIENCE_S = 30.0
-PLANS = '/joint_trajectory'
+PATIENCE_S = 180.0
+PLANS, REPORT = '/joint_trajectory', '/world_model/report'
 #: what a plan is given to be answered with the bundled model
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
 
@@ -38,10 +40,17 @@ class Rate:
 
     def __init__(self, out: Path, *, bundled: bool) -> None:
         self.out = out
+        self.sent: dict[int, float] = {}
+        self.ends: Counter[int] = Counter()
+        self.latencies: list[float] = []
+        self.memory: list[tuple[int, float]] = []
         program = {'program': NODE} if bundled else {}
         values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
         self.process = ros().start_node(out, *values, **program)
         self.client = ros().Client()
+        self.client.wait(self.client.diagnostic_values, 'the node', PATIENCE_S)
+        # a client that is not scheduled for a while would lose ends itself with the usual 100
+        self.client.node.create_subscription(ros().REPORT, REPORT, self._take, 10_000)
         topics = {t: kind for t, kind in ros().INPUTS.items() if t != PLANS}
         self.client.connect_inputs(topics)
         # with the usual 10, this side drops the rest of a burst that nobody has taken yet
@@ -49,10 +58,6 @@ class Rate:
         self.client.wait(self.plans.get_subscription_count, 'the node')
         self.client.spin_for(1.0)
         self.client.send_scene()
-        self.sent: dict[int, float] = {}
-        self.ends: Counter[int] = Counter()
-        self.latencies: list[float] = []
-        self.memory: list[tuple[int, float]] = []
 
     def send(self) -> None:
         """Sends a plan of its own stamp."""
@@ -65,19 +70,18 @@ class Rate:
         end_s = time.monotonic() + seconds
         while True:
             self.client.executor.spin_once(timeout_sec=max(min(end_s - time.monotonic(), 0.02), 0))
-            self._count()
+            for received in self.client.received.values():
+                received.clear()
             if time.monotonic() > end_s:
                 return
 
-    def _count(self) -> None:
+    def _take(self, report: Any) -> None:
         now_s = time.monotonic()
-        for values in self.client.report_values():
+        for values in map(values_of, report.status):
             if values['state'] in ros().ENDS:
                 stamp_ns = int(values['trajectory_stamp_ns'])
                 self.ends[stamp_ns] += 1
                 self.latencies.append(now_s - self.sent.get(stamp_ns, now_s))
-        for received in self.client.received.values():
-            received.clear()
 
     def run(self, count: int, rate_hz: float) -> None:
         """Sends so many plans."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.success.relations import (
     Apart,
     AsPictured,
@@ -20,7 +21,7 @@ from mtv_world_ros.success.relations import (
     Shifted,
     Within,
 )
-from mtv_world_ros.success.situation import CannotTell, grippers_open, TruePoses
+from mtv_world_ros.success.situation import grippers_open, TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
 
 B = np.array([[0.1, 0.3, 0.025]])

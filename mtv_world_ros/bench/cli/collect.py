@@ -73,7 +73,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--pictures',
         choices=('all', 'first'),
         default='all',
-        help='first: render the first frame only, for train-motion',
+        help='first: render the first frame only, for fit-contact',
     )
     add_physics(parser)
     parser.add_argument('--seed', type=int, default=0)
@@ -94,7 +94,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.bench.collect.collect_dataset import collect
     from mtv_world_ros.bench.collect.episode_maker import CollectConfig
     from mtv_world_ros.bench.collect.record import RecordConfig
-    from mtv_world_ros.bench.expert.faults import kinds_named
+    from mtv_world_ros.bench.expert.faults.catalogue import kinds_named
     from mtv_world_ros.bench.world.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)

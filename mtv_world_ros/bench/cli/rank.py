@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.bench.cli.physics_option import add_physics, physics_text
@@ -24,7 +25,7 @@ from mtv_world_ros.cli.shared_options import (
     provenance,
     threads_of_workers,
 )
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, PolicyError
 
 if TYPE_CHECKING:
     from mtv_world_ros.bench.ranking.policy_list import ListedPolicy
@@ -40,7 +41,7 @@ was stopped.
 """
 _EPILOG = """\
 A scripted policy is `expert`, followed by faults with their sizes, e.g.
-expert-noise-0.03-late-0.3; the catalogue of faults is sim/expert/faults.py. By default one
+expert-joint_noise-0.03-gripper_delay-0.3; mtv-world faults prints all kinds. By default one
 denoising step. Logs of the policy servers that a file starts go to DIR/logs.
 """
 
@@ -62,9 +63,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     policies.add_argument(
         '--faults',
-        choices=('train', 'calibrate', 'test'),
+        type=_fault_set,
+        metavar='{train,calibrate,test,drawn:SEED}',
         help='the optimism benchmark: the expert and each fault kind of this split in small and '
-        'large; kinds of test are in no training and no calibration',
+        'large; kinds of test are in no training and no calibration; drawn:SEED composes new ones',
     )
     parser.add_argument(
         '--tasks', metavar='LIST', help='comma-separated; default: three, with --faults six'
@@ -185,7 +187,9 @@ def _rank(arguments: argparse.Namespace) -> int:
         if sheet is not None:
             write_png(out / 'flips.png', sheet)
     print(f'{console(summaries[0])}\n\nreport: {path}')
-    return 0
+    for job, reason in failed.items():
+        sys.stderr.write(f'mtv-world: {job.name} has no result: {reason}\n')
+    return int(bool(failed))
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:
@@ -226,12 +230,23 @@ def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:
     return listed
 
 
+def _fault_set(text: str) -> str:
+    from mtv_world_ros.bench.expert.faults.catalogue import kinds_of
+
+    try:
+        kinds_of(text)
+    except PolicyError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
 def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list[Job]:
     from mtv_world_ros.assembly import checkpoint_robot
     from mtv_world_ros.bench.expert.expert import Expert
+    from mtv_world_ros.bench.expert.faults.catalogue import policies_of
     from mtv_world_ros.bench.ranking.policy_list import check_tasks, tasks_of
-    from mtv_world_ros.bench.ranking.policy_sets import BENCHMARK_TASKS, POLICY_SETS
     from mtv_world_ros.bench.ranking.rollout_jobs import (
+        BENCHMARK_TASKS,
         DEFAULT_POLICIES,
         DEFAULT_TASKS,
         make_jobs,
@@ -246,7 +261,7 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
     elif arguments.policies is not None:
         policies = policies_named(arguments.policies)
     elif arguments.faults is not None:
-        policies, names = POLICY_SETS[arguments.faults], BENCHMARK_TASKS
+        policies, names = policies_of(arguments.faults), BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
     check_tasks(listed, tasks)
     robot = checkpoint_robot(arguments.checkpoint, arguments.robot)

@@ -31,6 +31,7 @@ KEYS = {
     'attempt': 'seeds dropped before this one',
     'index': 'number within the task',
     'policy': 'what acted in place of the expert',
+    'fault_split': 'splits of its fault kinds; nothing may learn from `test`',
     'robot': 'name of the robot, `config/robots/`',
     'zero_shot': '`view`, `task` or `object`: what no training or test episode shows',
 }

@@ -14,7 +14,7 @@ from mtv_world_ros.bench.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.bench.collect.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.bench.collect.siblings import BoundarySearch
 from mtv_world_ros.bench.expert.expert import Expert, ExpertConfig
-from mtv_world_ros.bench.expert.faults import draw_variant, parse_variant, PolicyVariant
+from mtv_world_ros.bench.expert.faults.catalogue import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.cameras import CameraMoves, TRAINING_MOVES
 from mtv_world_ros.bench.world.physics import physics_named
@@ -197,7 +197,7 @@ class EpisodeMaker:
             extra['zero_shot'] = job.zero_shot
         policy = self._policy(job, seed)
         if policy is not None:
-            extra['policy'] = policy.name
+            extra |= {'policy': policy.name, 'fault_split': ','.join(policy.splits)}
         try:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:

@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import PolicyVariant
+from mtv_world_ros.bench.expert.faults.catalogue import PolicyVariant
 from mtv_world_ros.bench.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.bench.tasks.tasks import Task, task_named
 from mtv_world_ros.bench.world.recorded_scene import dump_scene, SCENE, scene_of

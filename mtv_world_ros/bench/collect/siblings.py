@@ -17,7 +17,7 @@ from tqdm import tqdm
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed, Job
 from mtv_world_ros.bench.collect.record import RecordConfig, simulate
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import EXPERT, FAULTS, PolicyVariant
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, kind_named, PolicyVariant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import Task, task_named
 from mtv_world_ros.bench.world.simulator import SimEpisode
@@ -189,7 +189,7 @@ def find_boundary(
         kind: of the fault.
         succeeds: whether a variant succeeds; may raise PolicyError where there is no plan.
     """
-    fault = FAULTS[kind]
+    fault = FAULTS[kind_named(kind)]
     if fault.typical == fault.largest:
         return 'it is there or not, and has no size'
     if fault.none:

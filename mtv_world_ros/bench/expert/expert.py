@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mtv_world_ros.bench.expert.faulty_way_points import pushed, WayPointFaults
-from mtv_world_ros.bench.expert.way_points import Pull, WayPoint
+from mtv_world_ros.bench.expert.faults.second_arm import Visit
+from mtv_world_ros.bench.expert.faults.variant_faults import WayPointFaults
+from mtv_world_ros.bench.expert.way_points import WayPoint
 from mtv_world_ros.bench.shapes import Grasp, SHAPES
 from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.bench.world.physics import physics_named
@@ -22,13 +23,8 @@ from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
 
-#: how long an arm stays where it crowds another, before scaling [s]; by how much of the whole way
-#: its share is reduced until it reaches so far
-_STAYS_S, _LESS = 0.4, 0.05
-#: time in which an arm strikes what another carries, before scaling [s]
-_SLAP_S = 0.3
-#: how long after this arm another one follows it, before scaling [s]
-_TAIL_S = 0.4
+#: by how much of the whole way the share of an arm is reduced until it reaches so far
+_LESS = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,12 +207,6 @@ def _rise(height: float) -> FloatArray:
     return np.array([0.0, 0.0, height])
 
 
-def _flat(way: FloatArray) -> FloatArray:
-    """Unit vector (3,) of a way in the plane; none where there is no way."""
-    flat = way * (1, 1, 0)
-    return flat / max(float(np.linalg.norm(flat)), 1e-9)
-
-
 def _missed_move(task: Task, rng: np.random.Generator) -> int:
     return int(rng.integers(len(task.moves)))
 
@@ -277,14 +267,20 @@ class Expert:
             objects = [np.asarray(item.position) for item in now.values()]
             is_wrong = faults is not None and number == faults.move_of(len(task.moves))
             wrong = faults if is_wrong else None
+            others = [arm for arm in self._tools if arm != pick.arm]
+            draws = None
             if wrong is not None:
-                stops = wrong.applied(stops, pick.yaw, objects)
+                rests = self.workcell.home_tools[others[0]] if others else None
+                draws = wrong.draws(pick.yaw, objects, rests)
+                stops = wrong.applied(stops, draws)
                 usual = usual if wrong.keeps_tempo else stops
             pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
-            others = [arm for arm in self._tools if arm != pick.arm]
             comes: list[tuple[FloatArray, int]] = []
-            if wrong is not None and others:
-                stops, comes = self._company(pick.arm, others[0], stops, wrong, objects, pace)
+            if wrong is not None and draws is not None and others:
+                times = self._timed(stops, self.workcell.home_tools[pick.arm])
+                visits = wrong.visits(stops, draws, self._rests(others[0]), times)
+                waits, comes = self._visits(others[0], visits, pace)
+                stops = [replace(stops[0], seconds=times[0] + waits), *stops[1:]]
             rows = self._follow(pick.arm, stops, pace)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
             start = max(1, busy - overlap, free.get(pick.arm, 1))
@@ -417,281 +413,18 @@ class Expert:
         wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
         return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
 
-    def _company(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        faults: WayPointFaults,
-        objects: list[FloatArray],
-        pace: tuple[float, float],
-    ) -> tuple[list[WayPoint], list[tuple[FloatArray, int]]]:
-        """Way points of a move, and what another arm does meanwhile: rows, and how late."""
-        comes: list[tuple[FloatArray, int]] = []
-        if faults.squeezed:
-            first, came = self._squeeze(arm, other, stops, faults.squeezed, pace)
-            stops, comes = [*first, *stops], [came]
-        for phase, share in faults.crowds.items():
-            comes.append(self._crowd(arm, other, stops, phase, share, pace))
-        if faults.poached:
-            comes.append(self._poach(arm, other, stops, faults.poached, pace))
-        for pull in faults.pulls(stops, objects):
-            comes.append(self._pull(arm, other, stops, pull, pace))
-        comes += self._crossings(arm, other, stops, faults, objects, pace)
-        return stops, comes
-
-    def _crossings(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        faults: WayPointFaults,
-        objects: list[FloatArray],
-        pace: tuple[float, float],
-    ) -> list[tuple[FloatArray, int]]:
-        """What another arm does in this one's way, as `_company` has it."""
-        comes: list[tuple[FloatArray, int]] = []
-        if faults.slapped:
-            comes.append(self._slap(arm, other, stops, faults.slapped, pace))
-        if places := faults.roams(objects):
-            comes.append((self._roam(other, places, pace), 0))
-        if faults.tailed:
-            rows = self._tail(arm, other, stops, faults.tailed, pace)
-            comes.append((rows, self._late(_TAIL_S, pace)))
-        if faults.hindered:
-            comes.append(self._hinder(arm, other, stops, faults.hindered, pace))
-        return comes
-
-    def _crowd(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        phase: str,
-        share: float,
-        pace: tuple[float, float],
-    ) -> tuple[FloatArray, int]:
-        """Rows of another arm that comes where this one is in a phase, and how late they begin.
-
-        It goes a share of the way, or as much of it as it reaches, and is there just then.
-        """
-        met = [s.phase for s in stops].index(phase)
-        arrives = sum(self._timed(stops[:met], self.workcell.home_tools[arm]))
-        return self._visit(other, stops[met].position, share, pace, arrives=arrives)
-
-    def _poach(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        size: float,
-        pace: tuple[float, float],
-    ) -> tuple[FloatArray, int]:
-        """Rows of another arm that takes what this one put down, and how late they begin.
-
-        It lifts it, carries it towards where it rests itself, and lets it fall. Where it does not
-        reach so far, it closes nearer to there.
-        """
-        met, home = [s.phase for s in stops].index('open'), self.workcell.home_tools[other]
-        let_go, flat, rise = stops[met], np.array([1, 1, 0]), _rise(self._config.retreat)
-
-        def ways(share: float) -> list[WayPoint]:
-            short = (1 - share) * (home - let_go.position) * flat
-            down = replace(let_go, seconds=None).moved(short)
-            back = (home - down.position) * flat
-            pull = size * back / max(float(np.linalg.norm(back)), size)
-            over, shut = down.moved(rise), replace(down, opening=0.0, seconds=self._config.close_s)
-            lifted = replace(over, opening=0.0)
-            carried = lifted.moved(pull)
-            opened = replace(carried, opening=1.0, seconds=self._config.open_s)
-            return [over, down, shut, lifted, carried, opened, self._rests(other)]
-
-        rows, _ = self._as_far_as_it_reaches(other, ways, 1.0, pace)
-        leaves = sum(self._timed(stops[: met + 2], self.workcell.home_tools[arm]))
-        return rows, self._late(leaves, pace)
-
-    def _pull(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        pull: Pull,
-        pace: tuple[float, float],
-    ) -> tuple[FloatArray, int]:
-        """Rows of another arm that closes on something and pulls, and how late they begin.
-
-        Where it does not reach so far, it closes nearer to where it rests.
-        """
-        home, flat = self.workcell.home_tools[other], np.array([1, 1, 0])
-        rise, config = _rise(pull.rise), self._config
-
-        def ways(share: float) -> list[WayPoint]:
-            short = (1 - share) * (home - pull.position) * flat
-            down = WayPoint('above', pull.position + short, 0.0, 1.0)
-            back = (home - down.position) * flat
-            way = pull.size * back / max(float(np.linalg.norm(back)), pull.size)
-            shut = replace(down, opening=0.0, seconds=config.close_s)
-            pulled = replace(shut, seconds=None).moved(way)
-            opened = replace(pulled, opening=1.0, seconds=config.open_s)
-            left = replace(opened, seconds=None).moved(rise)
-            return [down.moved(rise), down, shut, pulled, opened, left, self._rests(other)]
-
-        arrives = sum(self._timed(stops[: pull.before], self.workcell.home_tools[arm]))
-        return self._in_time(other, ways, 1.0, pace, arrives, 3)
-
-    def _squeeze(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        size: float,
-        pace: tuple[float, float],
-    ) -> tuple[list[WayPoint], tuple[FloatArray, int]]:
-        """Way points of an arm that squeezes its object against another one's hand.
-
-        And rows of that one, which pushes from its side, and how late they begin. Where it does
-        not reach so far, it pushes nearer to where it rests.
-        """
-        own, home = (self.workcell.home_tools[one] for one in (arm, other))
-        to, rise = _flat(home - own), _rise(self._config.above_grasp[0])
-        at = replace(next(stop for stop in stops if stop.phase == 'close'), seconds=None)
-
-        def ways(share: float) -> list[WayPoint]:
-            there = at.moved((1 - share) * (home - at.position) * (1, 1, 0))
-            return [*pushed(there, size, rise, -to), self._rests(other)]
-
-        first = pushed(at, size, rise, to)
-        rows, done = self._as_far_as_it_reaches(other, ways, 1.0, pace)
-        # both are down beside it at the same time: the one that is sooner there starts later
-        (over, down, *_), (far, near, *_) = self._timed(first, own), self._timed(done, home)
-        late = over + down - far - near
-        first[0] = replace(first[0], seconds=over + max(-late, 0.0))
-        return first, (rows, self._late(late, pace))
-
-    def _slap(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        size: float,
-        pace: tuple[float, float],
-    ) -> tuple[FloatArray, int]:
-        """Rows of another arm that strikes what this one carries, and how late they begin.
-
-        That is when it is over its goal. Where the other does not reach so far, it strikes nearer
-        to where it rests.
-        """
-        over, home = max([s.phase for s in stops].index('open') - 2, 0), self._rests(other)
-        met = stops[over]
-
-        def ways(share: float) -> list[WayPoint]:
-            at = met.moved((1 - share) * (home.position - met.position) * (1, 1, 0))
-            to = _flat(at.position - home.position)
-            _, back, hit, _ = pushed(replace(at, seconds=None), size, _rise(0.0), to)
-            return [back, replace(hit, seconds=_SLAP_S), home]
-
-        arrives = sum(self._timed(stops[: over + 1], self._rests(arm).position))
-        return self._in_time(other, ways, 1.0, pace, arrives)
-
-    def _roam(self, other: str, places: list[FloatArray], pace: tuple[float, float]) -> FloatArray:
-        """Rows of another arm that roams through places, low and open, as far as it reaches."""
-        home, rise = self._rests(other), _rise(self._config.retreat)
-
-        def ways(share: float) -> list[WayPoint]:
-            ends = (home.position * (1, 1, 0) + place * (0, 0, 1) for place in places)
-            low = [
-                replace(home, phase='above', position=end + share * (place - end))
-                for place, end in zip(places, ends, strict=True)
-            ]
-            return [low[0].moved(rise), *low, low[-1].moved(rise), home]
-
-        return self._as_far_as_it_reaches(other, ways, 1.0, pace)[0]
-
-    def _tail(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        share: float,
-        pace: tuple[float, float],
-    ) -> FloatArray:
-        """Rows of another arm that does what this one does, a share of the way to each place.
-
-        Or as much of the way as it reaches, in the same time.
-        """
-        seconds = self._timed(stops, self.workcell.home_tools[arm])
-        same = [replace(s, seconds=time) for s, time in zip(stops, seconds, strict=True)]
-        home = replace(self._rests(other), seconds=seconds[-1])
-
-        def ways(share: float) -> list[WayPoint]:
-            shorts = [(1 - share) * (home.position - s.position) * (1, 1, 0) for s in same[:-1]]
-            return [*(s.moved(way) for s, way in zip(same, shorts, strict=False)), home]
-
-        return self._as_far_as_it_reaches(other, ways, share, pace)[0]
-
-    def _hinder(
-        self,
-        arm: str,
-        other: str,
-        stops: list[WayPoint],
-        share: float,
-        pace: tuple[float, float],
-    ) -> tuple[FloatArray, int]:
-        """Rows of another arm that stands half-way in this one's way, and how late they begin.
-
-        It goes a share of the way there, or as much of it as it reaches, is there as this one has
-        closed, and stays until that is over its goal.
-        """
-        phases = [s.phase for s in stops]
-        closed = phases.index('close')
-        over = max(phases.index('open') - 2, closed)
-        middle = (stops[closed].position + stops[over].position) / 2
-        times = self._timed(stops, self.workcell.home_tools[arm])
-        stays = max(sum(times[closed + 1 : over + 1]), _STAYS_S)
-        arrives = sum(times[: closed + 1])
-        return self._visit(other, middle, share, pace, arrives=arrives, stays=stays, opening=0.0)
-
-    def _visit(
-        self,
-        arm: str,
-        place: FloatArray,
-        share: float,
-        pace: tuple[float, float],
-        *,
-        arrives: float,
-        stays: float = _STAYS_S,
-        opening: float = 1.0,
-    ) -> tuple[FloatArray, int]:
-        """Rows of an arm that goes to a place (3,) and back, and how late they begin.
-
-        It goes a share of the way, or as much of it as it reaches, arrives at a time before
-        scaling [s], and stays there so long [s].
-        """
-        home = self._rests(arm)
-
-        def ways(share: float) -> list[WayPoint]:
-            there = home.position + share * (place - home.position)
-            near = replace(home, phase='above', position=there, opening=opening)
-            return [near, replace(near, seconds=stays), home]
-
-        return self._in_time(arm, ways, share, pace, arrives)
-
-    def _in_time(
-        self,
-        arm: str,
-        ways: Callable[[float], list[WayPoint]],
-        share: float,
-        pace: tuple[float, float],
-        arrives: float,
-        num: int = 1,
-    ) -> tuple[FloatArray, int]:
-        """Rows of `_as_far_as_it_reaches`, and how late they begin.
-
-        So late that the first `num` of its way points are done at a time before scaling [s].
-        """
-        rows, done = self._as_far_as_it_reaches(arm, ways, share, pace)
-        takes = sum(self._timed(done[:num], self.workcell.home_tools[arm]))
-        return rows, self._late(arrives - takes, pace)
+    def _visits(
+        self, other: str, visits: Sequence[Visit], pace: tuple[float, float]
+    ) -> tuple[float, list[tuple[FloatArray, int]]]:
+        """How long the first arm waits for another one [s], and rows of that and how late."""
+        waits, comes = 0.0, list[tuple[FloatArray, int]]()
+        for visit in visits:
+            rows, done = self._as_far_as_it_reaches(other, visit.ways, visit.share, pace)
+            takes = sum(self._timed(done[: visit.done], self.workcell.home_tools[other]))
+            late = visit.meets - takes + visit.is_timed * waits
+            waits = max(waits, -late) if visit.waits else waits
+            comes.append((rows, self._late(late, pace)))
+        return waits, comes
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
         """Rows before something begins, of a time before scaling [s]; none if it is too late."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import parse_variant, refuse_kinds
+from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, refuse_kinds
 from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.geometry.robot.model import RobotModel

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import parse_variant, PolicyVariant
-from mtv_world_ros.bench.expert.faulty_commands import with_faults
-from mtv_world_ros.bench.expert.faulty_way_points import WayPointFaults
+from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, PolicyVariant
+from mtv_world_ros.bench.expert.faults.variant_faults import (
+    refuse_robot,
+    WayPointFaults,
+    with_faults,
+)
 from mtv_world_ros.bench.shapes import SHAPES
 from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, START, Task, task_named
 from mtv_world_ros.bench.world.placement import goals_of
@@ -92,6 +95,7 @@ class ScriptedPolicy:
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
         self._first_ns = None
+        refuse_robot(self.variant, self._expert.robot)
         faults = WayPointFaults(self.variant, fault_generator(seed))
         plan = self._draw_plan(rng, faults)
         self._plan = with_faults(plan, self.variant, self._expert.robot, rng)
@@ -134,8 +138,8 @@ class ScriptedPolicy:
 
     def _draw_plan(self, rng: np.random.Generator, faults: WayPointFaults) -> JointTrajectory:
         is_wrong, is_miss = rng.uniform(size=2) < (
-            self.variant.size('wrong'),
-            self.variant.size('miss'),
+            self.variant.size('wrong_object'),
+            self.variant.size('grasp_missed'),
         )
         reason = ''
         for _ in range(_MAX_DRAWS):
@@ -156,7 +160,7 @@ class ScriptedPolicy:
     ) -> Iterator[tuple[Task, Scene]]:
         """What it may set out to do, in order of preference."""
         if not is_wrong:
-            size = self.variant.size('meddle')
+            size = self.variant.size('goal_object_moved_after')
             yield self._meddled(size, rng) if size else (self.task, self.scene)
             return
         number = int(rng.integers(len(self.task.moves)))
@@ -218,12 +222,16 @@ class ScriptedPolicy:
         return replace(
             scene,
             objects=tuple(
-                replace(item, position=moved(item.position, self.variant.size('shift')))
+                replace(
+                    item, position=moved(item.position, self.variant.size('object_position_noise'))
+                )
                 if item.role in subjects
                 else item
                 for item in scene.objects
             ),
-            goals=tuple(moved(goal, self.variant.size('place')) for goal in scene.goals),
+            goals=tuple(
+                moved(goal, self.variant.size('goal_position_noise')) for goal in scene.goals
+            ),
         )
 
 

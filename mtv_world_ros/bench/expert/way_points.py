@@ -1,8 +1,11 @@
-"""Way points that an arm goes by."""
+"""Way points that an arm goes by, and what is drawn for one move."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 
@@ -35,18 +38,26 @@ class WayPoint:
 Stops = list[WayPoint]
 
 
-@dataclass(frozen=True, slots=True)
-class Pull:
-    """What another arm closes on, pulls towards where it rests itself, and lets go.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Draws:
+    """What is drawn for one move that goes wrong: to which side, and errors of way points.
 
     Attributes:
-        position: (3,) where it closes [m].
-        rise: from how high above it comes, and how far it rises again [m].
-        before: number of this arm's way points that are done by then.
-        size: how far it pulls [m].
+        yaw: of the grasp [rad]; the fingers travel along it.
+        sign: +1 or -1.
+        angle: of a direction in the plane [rad].
+        errors: (N, 3) of way points, standard normal.
+        openings: (N,) the same of openings.
+        play: draws anew for every plan that is tried.
+        objects: (3,) centre of every object of the scene [m].
+        other_home: (3,) where another arm's tool rests [m].
     """
 
-    position: FloatArray
-    rise: float
-    before: int
-    size: float
+    yaw: float
+    sign: float
+    angle: float
+    errors: FloatArray
+    openings: FloatArray
+    play: np.random.Generator
+    objects: Sequence[FloatArray]
+    other_home: FloatArray | None = None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mtv_world_ros.bench.collect.contact_sheet import titled
-from mtv_world_ros.bench.expert.faults import EXPERT
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT
 from mtv_world_ros.bench.ranking.optimism import is_contact, name_of, read_last_frames
 from mtv_world_ros.bench.ranking.rollout_jobs import Result
 from mtv_world_ros.data_types import ByteArray

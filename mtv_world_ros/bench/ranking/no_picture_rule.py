@@ -13,12 +13,13 @@ import numpy as np
 
 from mtv_world_ros.bench.shapes import SHAPES
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import block_size, centroids, locate
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.success.relations import FLOOR_M
-from mtv_world_ros.success.situation import CannotTell, TruePoses
+from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, match_task, TaskSpec
 
 #: a tool that closes this near to an object's centre, in the plane and in height, takes it [m]

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.special import expit, logit
 
-from mtv_world_ros.bench.expert.faults import EXPERT, FAULTS, parse_variant
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, in_order, parse_variant
 from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
 from mtv_world_ros.lab.evaluation.metrics.policy_agreement import rate_agreement, rates
@@ -115,7 +115,7 @@ class Optimism:
     def kinds(self) -> tuple[str, ...]:
         """The policies' fault kinds, in the catalogue's order."""
         met = {kind for result in self.results for kind in kinds_of(result)}
-        return tuple(kind for kind in FAULTS if kind in met)
+        return tuple(in_order(met))
 
     def rollouts(self, kind: str | None) -> list[Result]:
         """Returns the rollouts of policies with a fault kind; None = all rollouts."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from mtv_world_ros.bench.expert.faults import FAULTS
+from mtv_world_ros.bench.expert.faults.catalogue import FAULTS
 from mtv_world_ros.bench.ranking.optimism import (
     COLUMNS,
     JUDGES,

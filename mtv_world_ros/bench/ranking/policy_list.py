@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import parse_variant
+from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.config import expected, ListOf, Positive, read_yaml, Schema, validated

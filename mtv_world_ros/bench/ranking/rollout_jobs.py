@@ -9,13 +9,22 @@ from typing import Any
 
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import EXPERT, parse_variant
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, parse_variant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.data_types import SuccessEstimate
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.success.verdict import verdict
 
+#: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
+BENCHMARK_TASKS = (
+    'place_block_a2b_left',
+    'stack_blocks_two',
+    'place_bread_plate',
+    'place_cup_plate',
+    'move_object_two',
+    'collect_toy',
+)
 #: from the expert to one that never finishes; in between, faults of several kinds and sizes
 DEFAULT_POLICIES = (
     'expert',

@@ -27,10 +27,9 @@ from mtv_world_ros.bench.ranking.worlds import (
 from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import ObjectMasks, SuccessEstimate
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import CannotTell, ConfigError
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.policies.policy import Policy
-from mtv_world_ros.success.situation import CannotTell
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
 MakePolicy = Callable[[str, str, int, Expert], Policy]

@@ -57,7 +57,7 @@ def check_type(msgtype: str) -> str:
     """Returns `msgtype` if it is known.
 
     Raises:
-        EpisodeError: it is not among the standard message packages.
+        EpisodeError: the type is not among the standard message packages.
     """
     known = typestore().fielddefs
     if msgtype not in known:

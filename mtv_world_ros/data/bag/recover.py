@@ -24,7 +24,7 @@ class Recovered:
         path: the whole one.
         num_messages: by topic.
         seconds: from the first message to the last.
-        lost: what could not be read, one line each.
+        lost: one line for each part that could not be read.
     """
 
     source: Path

@@ -80,7 +80,7 @@ class VideoFrames:
     """Frames of packets, decoded when asked for, in order best (`episode.Frames`).
 
     Args:
-        topic: where they come from, for error texts.
+        topic: of the packets, for error texts.
         packets: in the order of their stamps; the first one is a key frame.
     """
 

@@ -217,7 +217,7 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
 
     Raises:
         ConfigError: there is no such file.
-        RobotError: it is not a URDF that can be used.
+        RobotError: the file is not a usable URDF.
     """
     try:
         text = read_text(path, 'urdf_bytes')
@@ -235,10 +235,10 @@ def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
 
     Args:
         text: the URDF.
-        what: what it is, for errors.
+        what: kind of file, for error texts.
 
     Raises:
-        RobotError: it is not a URDF that can be used.
+        RobotError: the file is not a usable URDF.
     """
     try:
         root = ElementTree.fromstring(text)

@@ -38,7 +38,7 @@ class GuessedRobot:
 
     Attributes:
         values: of the YAML.
-        notes: what was guessed and from what, and what was left out.
+        notes: one line a guess, with its grounds, and one a joint that was left out.
     """
 
     values: dict[str, Any]

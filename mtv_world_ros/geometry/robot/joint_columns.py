@@ -152,7 +152,7 @@ def to_positions(
     """Returns (T, J) positions [rad or m] of a feature's values (T, C).
 
     Args:
-        values: as in the dataset.
+        values: joint values in the dataset's units.
         names: of the columns; empty where the dataset does not name them.
         joints: in the robot's order.
         feature: its name, for error texts.
@@ -206,7 +206,7 @@ def column_number(
     """Returns which of a feature's `count` columns a name or number is.
 
     Raises:
-        ConfigError: it has none; the text says what needs it.
+        ConfigError: the column is missing; names what needs it.
     """
     if isinstance(column, int):
         if 0 <= column < count:

@@ -323,7 +323,7 @@ class _Setter:
         joint: its number.
         first: first of its numbers in a configuration.
         velocity: its velocity's.
-        endless: it has two numbers, cosine and sine.
+        endless: whether the joint turns without limits; its position is then cosine and sine.
         column: of the robot's joint.
         multiplier: of that.
         offset: added.
@@ -374,7 +374,7 @@ def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
     """Refuses a joint whose limits are equal; a URDF without stops has 0 and 0.
 
     Raises:
-        RobotError: what to write instead.
+        RobotError: names the entry and what to write instead.
     """
     if lower == upper:
         raise RobotError(
@@ -393,7 +393,7 @@ def check_positions(
     Args:
         robot: the robot.
         positions: (T, J) in its joint order [rad or m].
-        tolerance: how far outside is still accepted [rad or m].
+        tolerance: excess over a limit that is still accepted [rad or m].
 
     Raises:
         TrajectoryError: names the first joint outside or not finite, its value and the limits.

@@ -52,7 +52,7 @@ class RobotShape:
 
     Attributes:
         parts: of its links.
-        source: where they are from, in words.
+        source: origin of the shapes, for reports.
         is_known: False where rods stand for the links.
         missing: shapes of the URDF that are not among the parts, and why.
     """

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 import re
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_describer,
@@ -175,15 +176,42 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         _score(arguments, entry, selection, truth, folder)
         for entry, folder in zip(entries, folders, strict=True)
     ]
-    text = write_comparison(summaries, arguments.out)
-    if alone:
-        print(summaries[0].markdown())
-    print(text)
+    write_comparison(summaries, arguments.out)
+    for entry, summary in zip(entries, summaries, strict=True):
+        print(f'{entry.label}: {in_short(summary.metrics())}')
+    print(f'tables: {" ".join(str(folder / "tables.md") for folder in folders)}')
     if arguments.report:
         from mtv_world_ros.lab.evaluation.report.html import write_report
 
         print(f'report: {write_report(folders, arguments.out / "report.html")}')
     return 0
+
+
+#: (number, words, the same of what knows nothing): the first that was measured is shown
+_J = (
+    ('j_moving', 'J of moving objects', 'j_copy_moving'),
+    ('j_object_mean', 'J of objects', 'j_copy_mean'),
+)
+
+
+def in_short(metrics: Mapping[str, Any]) -> str:
+    """Returns the one line of an evaluation that is printed; all else is in its report."""
+    from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_EPISODES
+    from mtv_world_ros.lab.evaluation.report.headline import cell
+
+    numbers, count = metrics['overall'], int(metrics['num_episodes'])
+    said = [
+        f'{words} {cell(numbers, key)} (first frame held: {cell(numbers, held)})'
+        for key, words, held in _J
+        if numbers.get(key) is not None
+    ][:1]
+    psnr = numbers.get('psnr')
+    said += [f'PSNR {cell(numbers, "psnr")} dB'] if isinstance(psnr, float) else []
+    said = said or ['no object was found and no picture compared: give --quality psnr']
+    few = f'; no intervals below {MIN_EPISODES} episodes' if count < MIN_EPISODES else ''
+    failed = metrics['num_episodes_failed']
+    lost = f'; {failed} episodes failed, see the report' if failed else ''
+    return f'{", ".join(said)}, {count} episode{"s" * (count > 1)}{few}{lost}'
 
 
 def _slug(label: str) -> str:

@@ -14,24 +14,27 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
         'fit-contact',
-        help='find friction, weight and grip: a checkpoint then also foresees by rigid bodies',
-        description='Finds how fingers grip, what rubs and how heavy objects are: the settings '
-        'with which rigid bodies, shaped as the masks show them, end nearest to where objects '
-        'ended in recorded episodes. Writes CHECKPOINT/object_motion/contact.json, with which '
-        'motions of rigid bodies are foreseen beside those of the networks.',
+        help='find how arms follow, friction, weight and grip: what foresight is told',
+        description='Finds how arms follow their commands, how fingers grip, what rubs and how '
+        'heavy objects are: the numbers with which solids, shaped as the masks show them, end '
+        'nearest to where objects ended in recorded episodes. Writes '
+        'OUT/object_motion/arm_response.json and contact.json, with which a checkpoint foresees '
+        "where objects go. OUT may be the checkpoint's folder.",
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument(
         '--checkpoint',
+        '--out',
+        dest='checkpoint',
         type=Path,
         required=True,
-        metavar='DIR',
-        help='of train-motion, which has found how its arms follow',
+        metavar='OUT',
+        help='folder of a checkpoint, or any',
     )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--episodes', type=int, default=200, help='at most, spread evenly')
-    parser.add_argument('--motions', type=int, default=4, help='that are foreseen later')
+    parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
     parser.add_argument('--workers', type=int, default=1, help='processes')
     add_overwrite(parser)
     parser.set_defaults(handler=_fit)
@@ -40,39 +43,40 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.recorded_policies import refuse_test_kinds
-    from mtv_world_ros.errors import CheckpointError
+    from mtv_world_ros.foresight.arms import Arms
+    from mtv_world_ros.foresight.loading import (
+        CONTACT_FILE,
+        load_response,
+        save_contact,
+        save_response,
+    )
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
         first_settings,
         fit_contact,
         read_recordings,
     )
+    from mtv_world_ros.lab.training.object_motion.response_fit import found_response
     from mtv_world_ros.lab.training.training_run import find_episodes, spread
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.model.object_motion.contact_motions import check_robot
-    from mtv_world_ros.model.object_motion.predictor import (
-        CONTACT_FILE,
-        load_response,
-        save_contact,
-    )
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
     file = robot_path(arguments.robot)
     robot = load_robot(file)
-    response = load_response(folder, robot)
-    if response is None:
-        raise CheckpointError(
-            f"'{folder}' does not say how arms follow their commands; run "
-            "'mtv-world train-motion' first"
-        )
-    first = first_settings(robot, response).model_copy(update={'num_motions': arguments.motions})
-    check_robot(first, robot, response)
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
+    response = load_response(folder, robot)
+    if response is None:
+        response, told = found_response(paths, Arms(robot, None).robot)
+        print(told)
+    arms = Arms(robot, response)
+    for note in arms.notes:
+        print(note)
     recordings, skipped = read_recordings(paths, robot, arguments.views)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
+    first = first_settings(arms).model_copy(update={'num_motions': arguments.motions})
     settings = fit_contact(
         recordings,
         file,
@@ -81,6 +85,9 @@ def _fit(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         report=partial(print, flush=True),
     )
+    folder.mkdir(parents=True, exist_ok=True)
+    if response is not None:
+        save_response(response, folder)
     save_contact(settings, folder)
     print(f'{len(recordings)} episodes, {len(skipped)} left out: {folder / CONTACT_FILE}')
     return 0

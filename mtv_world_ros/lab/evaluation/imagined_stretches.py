@@ -12,7 +12,6 @@ from mtv_world_ros.data_types import (
     ByteArray,
     FloatArray,
     JointTrajectory,
-    Observation,
     SuccessEstimate,
     WorldModelSpec,
 )
@@ -159,7 +158,7 @@ def _begin(
 ) -> ImaginedEpisode:
     """An episode that has seen all that was recorded before the stretch, as a node's has."""
     episode = pipeline.begin(
-        _seen(recording, 0),
+        recording.observation(0),
         instruction=recording.instruction,
         seed=seed,
         num_seeds=num_seeds,
@@ -171,18 +170,7 @@ def _begin(
     rows = frame_indices(recording, 0, pipeline.spec, round(seconds * pipeline.spec.fps))
     if rows is not None:  # else there are gaps
         episode.observe(recording.frames[:, rows[1:]], recording.positions[rows])
-    return episode.branch(_seen(recording, stretch.start))
-
-
-def _seen(recording: Recording, frame: int) -> Observation:
-    """What the robot saw at a recorded frame."""
-    frames, cameras = recording.seen_at(frame)
-    return Observation(
-        cameras=cameras,
-        frames=frames,
-        positions=recording.positions[frame],
-        stamp_ns=recording.stamp_ns + round(float(recording.times[frame]) * 1e9),
-    )
+    return episode.branch(recording.observation(stretch.start))
 
 
 def predicted_frames(chunks: list[Prediction]) -> ByteArray:

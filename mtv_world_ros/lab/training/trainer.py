@@ -179,8 +179,8 @@ class Trainer:
             self._object_motion = loaded.object_motion
         elif loaded.object_motion is not None and self.processes.is_main:
             tqdm.write(
-                f"the object motion network of '{folder}' is left out: it is of robot "
-                f"'{theirs.robot}' with {len(theirs.spec.views)} views; train-motion makes one"
+                f"what foresees objects in '{folder}' is left out: it is of robot "
+                f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit-contact"
             )
         given = loaded.transformer.state_dict()
         given = with_new_source(given, self.weights.worker.state_dict())
@@ -336,7 +336,7 @@ class Trainer:
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
         if self.config.lora.rank:
             return export_adapter(folder, self.weights, card, self.base)
-        # what `train-motion` put there stays
+        # what `fit-contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
         motion = mine if mine.is_dir() else self._object_motion
         parts = (self.config, self.encoders, self.actions, motion, self.robot)

@@ -88,7 +88,8 @@ class Recorder(Node):
 
         Raises:
             ConfigError: a topic has no publisher in time.
-            EpisodeError: the disk is full; the bag holds what was recorded until then.
+            EpisodeError: it was stopped before recording began; or the disk is full: the bag
+                holds what was recorded until then.
         """
         begin_s = time.monotonic()
         while not self._stopping and time.monotonic() < self._end_s:
@@ -116,6 +117,12 @@ class Recorder(Node):
             return
         if not (writer.num_messages or self._is_announced()):
             writer.abort()
+            if self._stopping:
+                silent = ', '.join(self._pending or [s.topic_name for s in self._taken])
+                raise EpisodeError(
+                    f"stopped before recording began, '{writer.path}' was not made: "
+                    f'{silent or "no topic"} had not been connected yet'
+                )
             return
         writer.close()
         counts = {topic: self._counts[topic] for topic, *_ in self._declared}

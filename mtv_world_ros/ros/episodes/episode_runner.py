@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import json
+from math import isfinite
 from pathlib import Path
 import sys
 import time
@@ -24,10 +25,11 @@ from mtv_world_ros.ros.episodes.recorder_process import predicted_topics, Record
 from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded_start
 from mtv_world_ros.ros.messages.conversions import values_of
 from mtv_world_ros.ros.peers import Peers
-from mtv_world_ros.ros.policy.loop import GOOD_ENDS
+from mtv_world_ros.ros.policy.loop import ESTIMATE, GOOD_ENDS
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.status_publisher import StatusPublisher
+from mtv_world_ros.success.verdict import verdict_word
 
 #: topics of what an episode starts from lie under this name, apart from a robot's own
 START = 'start'
@@ -117,7 +119,7 @@ class EpisodeRunner(Node):
         if how not in (*GOOD_ENDS, 'max_seconds'):
             self._status.fault(how, seen.get('text', ''))
         kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
-        return {**result, **{key: seen.get(key, '') for key in kept}}
+        return {**result, **{key: seen.get(key, '') for key in kept}, **_estimate(seen)}
 
     def _live_out(self, number: int, start: EpisodeStart) -> dict[str, str]:
         """Starts an episode and waits for its end; returns what was reported of that."""
@@ -245,6 +247,16 @@ class EpisodeRunner(Node):
             self._status.publish_diagnostics({'episodes': len(self._results)})
             if self._live is not None:
                 self._live.refresh()
+
+
+def _estimate(seen: Mapping[str, str]) -> dict[str, Any]:
+    """What the world model says of the episode's end: numbers that are null where it abstains."""
+    numbers = {key: float(seen.get(key, 'nan')) for key in ESTIMATE[:3]}
+    return {
+        **{key: value if isfinite(value) else None for key, value in numbers.items()},
+        'verdict': verdict_word(numbers['success']),
+        'reasons': seen.get(ESTIMATE[3], ''),
+    }
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:

@@ -40,7 +40,7 @@ class Recording:
         """Starts the recorder and waits until it is connected to every topic.
 
         Raises:
-            EpisodeError: it ended.
+            EpisodeError: the recorder ended.
         """
         logs = self._out / 'logs'
         logs.mkdir(parents=True, exist_ok=True)
@@ -64,7 +64,7 @@ class Recording:
         """Refuses to go on without the recorder.
 
         Raises:
-            EpisodeError: it ended, e.g. because the disk is full.
+            EpisodeError: the recorder ended, e.g. because the disk is full.
         """
         if self._process is not None and self._process.poll() is not None:
             status, text = self._process.returncode, last_line(self._log, 'its log is empty')
@@ -74,7 +74,7 @@ class Recording:
         """Lets the recorder take what is still on its way, and waits for the closed bag.
 
         Raises:
-            EpisodeError: it ended; the bag holds what it had got.
+            EpisodeError: the recorder ended; the bag holds what had been received.
         """
         bag, self._bag = self._bag, None
         if bag is None:

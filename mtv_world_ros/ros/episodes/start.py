@@ -27,12 +27,12 @@ class EpisodeStart:
     """One moment, as the robot's drivers publish it.
 
     Attributes:
-        source: where it comes from.
+        source: recorded episode, or live topics.
         task: name of the task, if known.
         scene_seed: seed of the scene; -1 = not known.
         recording: folder of the recorded episode; empty = there is none.
         recording_ns: stamp of this moment in it [ns].
-        instruction: what the robot is told, if known.
+        instruction: text for the robot, if known.
         calibration_file: every view's pose; empty = the one the nodes have.
         images: image by view.
         camera_infos: CameraInfo by view.

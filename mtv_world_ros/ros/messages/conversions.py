@@ -24,7 +24,7 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
     """Returns the trajectory, see `read_plan`.
 
     Raises:
-        Rejection: it cannot be used.
+        Rejection: the message cannot be used.
     """
     with refused_plan():
         return read_plan(message)

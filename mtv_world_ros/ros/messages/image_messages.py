@@ -115,7 +115,7 @@ def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
     """Returns `info` for the images that were received: K and P of them, no ROI, no binning.
 
     Args:
-        info: as received.
+        info: the received CameraInfo.
         camera: at the images' size.
     """
     window = window_of(info)

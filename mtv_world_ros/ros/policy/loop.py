@@ -19,6 +19,8 @@ from mtv_world_ros.ros.policy.predicted_frames import chunk_stamps, PredictedFra
 
 #: ends of an episode that are no fault
 GOOD_ENDS = ('done', 'max_chunks', 'stopped')
+#: of the world model's reports of chunks: what the last one says is what an episode amounts to
+ESTIMATE = ('success', 'success_low', 'success_high', 'success_reasons')
 #: what an episode waits for, and how it ends where that does not come
 _OVERDUE = {
     'resetting': 'late',
@@ -87,6 +89,7 @@ class PolicyLoop:
         self.phase = 'idle'
         self.episode = 0
         self.num_chunks = 0
+        self._estimate: dict[str, str] = {}
         self._ticket = 0
         self._sent: set[str] = set()
         self._deadline_s = float('inf')
@@ -106,6 +109,7 @@ class PolicyLoop:
         self._policy: Policy | None = None
         self.episode += 1
         self.num_chunks = 0
+        self._estimate = {}
         self._observation = None
         self._frames.clear()
 
@@ -124,7 +128,7 @@ class PolicyLoop:
             self._out.fault(how, text)
         self.phase = 'idle'
         self._ticket += 1  # what the policy still answers is too late
-        self._out.report('ended', {**self._values(), 'how': how, 'text': text})
+        self._out.report('ended', {**self._values(), **self._estimate, 'how': how, 'text': text})
 
     def on_answers(self) -> None:
         """Takes what the policy said."""
@@ -248,6 +252,7 @@ class PolicyLoop:
 
     def _report_chunk(self, said: Mapping[str, str], num_frames: int) -> None:
         now_s, chunk = time.monotonic(), self._chunk
+        self._estimate = {key: said[key] for key in ESTIMATE if key in said}
         stages = {key: value for key, value in said.items() if key.startswith('stage_s.')}
         values = {
             **self._values(),

@@ -24,7 +24,7 @@ class Answer:
         ticket: of the question.
         trajectory: the commands; None where the episode is over, or the question was a reset.
         error: why there is no answer; empty where there is one.
-        seconds: how long it took [s].
+        seconds: duration of the policy's answer [s].
     """
 
     ticket: int

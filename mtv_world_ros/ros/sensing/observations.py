@@ -111,7 +111,7 @@ class ObservationBuffer:
         """Stores an image.
 
         Raises:
-            Rejection: it cannot be read.
+            Rejection: the image cannot be read.
         """
         image_messages.check(message)
         self._images[view].append((to_ns(message.header.stamp), message))
@@ -122,7 +122,7 @@ class ObservationBuffer:
         """Stores the first CameraInfo of a view and watches the later ones.
 
         Raises:
-            Rejection: it is not calibrated, or it just changed.
+            Rejection: the view is not calibrated, or its calibration just changed.
         """
         self._intrinsics.add(view, message)
 
@@ -313,7 +313,7 @@ class Intrinsics:
         """Stores the first info of a view and watches the later ones.
 
         Raises:
-            Rejection: it is not calibrated, or it just changed.
+            Rejection: the view is not calibrated, or its calibration just changed.
         """
         if view not in self._infos:
             self._take(view, message)

@@ -36,7 +36,7 @@ class Goal:
     """A goal that was accepted.
 
     Attributes:
-        handle: what rclpy knows of it.
+        handle: rclpy's goal handle.
         request: the plan that it became; None = it waits to become one.
         start: (J,) positions that the plan starts from, in the robot's order [rad or m].
         violation: name of the code and text of a tolerance that is violated.

@@ -58,8 +58,8 @@ class Fidelity:
     Attributes:
         names: O names.
         jaccard: (V, O) mean J over the compared frames, NaN = not scored.
-        copy: the same of the chunk's first masks held.
-        num_frames: that were compared.
+        copy: J of the chunk's first masks, held.
+        num_frames: number of compared frames.
     """
 
     names: tuple[str, ...]

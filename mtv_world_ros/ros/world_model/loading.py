@@ -98,7 +98,7 @@ def check_calibration(
     """Refuses a `calibration_file` that is wrong or lacks a view, before it is taken.
 
     Raises:
-        Rejection: it cannot be used.
+        Rejection: the calibration cannot be used.
     """
     for parameter in changed:
         if parameter.name == 'calibration_file':

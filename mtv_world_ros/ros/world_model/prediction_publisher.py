@@ -187,7 +187,7 @@ class FrameQueue:
     Args:
         node: owner of the timer.
         publish: publishes a frame and notes it.
-        wait_s: how long a frame still has to wait [s], from the one before.
+        wait_s: time until a frame is due, from the one before [s].
         on_sent: called with a chunk when its last frame is out, or when the rest was dropped.
         on_error: called with what publishing raised; the rest of the chunk is dropped.
     """

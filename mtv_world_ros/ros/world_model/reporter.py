@@ -52,8 +52,8 @@ class Reporter:
     Args:
         node: owner of the publishers and the logger.
         settings: the present parameters.
-        state: what else `/diagnostics` shows, asked each time.
-        missing: what the node needs and does not get, in words, asked each time.
+        state: further rows of `/diagnostics`, called for each message.
+        missing: inputs that the node lacks, as text, called for each message.
     """
 
     def __init__(
@@ -234,7 +234,7 @@ class Tally:
         Args:
             now_s: now [s].
             num_policies: publishers of trajectories.
-            missing: what the node needs and does not get, in words.
+            missing: inputs that the node lacks, as text.
         """
         level, texts = DiagnosticStatus.WARN, []
         if self._last is not None and now_s - self._last[0] < _WARN_S:

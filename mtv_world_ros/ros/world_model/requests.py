@@ -28,13 +28,13 @@ class RequestMaker:
 
     Attributes:
         imagine: whether rollouts go on from the last predicted frames.
-        instruction: what the robot is told.
+        instruction: text for the robot.
         num_requests: made so far.
         robot: whose joints trajectories move.
 
     Args:
         robot: whose joints trajectories move.
-        buffer: where real observations come from.
+        buffer: newest real images and joint states.
         settings: the present parameters.
         last_scene: the last predicted frames; None = there are none yet.
     """

@@ -58,7 +58,7 @@ class Rollouts:
         node: owner of all inputs and outputs.
         pipeline: the main path.
         settings: the present parameters.
-        reporter: is told what happens.
+        reporter: publishes results and diagnostics.
 
     Raises:
         MtvWorldError: a parameter or a file it names cannot be used; nothing is left on the node.

@@ -45,13 +45,13 @@ class Request:
         scene: the newest scene when it came in; its frames are real, or predicted.
         imagine: whether to start from the last predicted frames if there are newer ones, and
             whether the next request shall.
-        instruction: what the robot was told.
+        instruction: text for the robot.
         objects: names of the objects; empty = those the instruction names.
         seed: of the noise of the first chunk after a reset; in imagine mode every further chunk
             counts one up, over requests too.
         num_seeds: rollouts that the estimate is the mean of; the first one's frames are shown.
         num_inference_steps: denoising steps a chunk.
-        limits: what is too old or too long.
+        limits: greatest age and length of a plan.
         received_s: when it came in [s], of `time.monotonic`.
         received_ns: the same by the node's clock [ns].
         limit_tolerance: joints may exceed their limits by this [rad or m].
@@ -101,7 +101,7 @@ class Ended:
     Attributes:
         request: the plan.
         state: `done`, `preempted`, `rejected`, `failed` or `reset`.
-        num_chunks: that were predicted.
+        num_chunks: number of predicted chunks.
         last: the last one of them: what was known of the plan; None = nothing.
         reason: why it was rejected or failed.
         text: the same in words, or why it was pre-empted if not by a newer plan.
@@ -435,10 +435,10 @@ def from_observation(
         trajectory: its times count from `stamp_ns`.
         stamp_ns: when it starts [ns]; 0 = at the observation.
         observation_ns: stamp of the observation [ns].
-        limits: what is too old and what too long.
+        limits: greatest age and length of a plan.
 
     Raises:
-        Rejection: it starts too long ago, has ended already, or ends too late.
+        Rejection: the plan starts too long ago, has ended already, or ends too late.
     """
     offset = (stamp_ns - observation_ns) / NANO if stamp_ns else 0.0
     end = offset + float(trajectory.times[-1])

@@ -29,7 +29,7 @@ class Describer(Protocol):
 
         Args:
             first_frame: (H, W, 3) uint8 RGB, a real frame, never a predicted one.
-            instruction: what the robot was told.
+            instruction: text for the robot.
 
         Raises:
             DescriptionError: naming them failed.
@@ -64,9 +64,9 @@ def name_objects(
     the instruction names by colour.
 
     Args:
-        instruction: what the robot was told.
+        instruction: text for the robot.
         given: names that a user gave for every scene.
-        describer: what names the objects if the user asked for one.
+        describer: names the objects; None = the user chose none.
         first_frame: returns a real frame (H, W, 3) uint8 RGB; needed by a describer.
         stored: names in the episode's metadata.
 

@@ -20,7 +20,7 @@ class ObjectList:
     Args:
         by_instruction: objects per instruction; letter case, spacing and a full stop do not count.
         others: objects for every other instruction; None = there is no other.
-        source: where the list stands, for messages.
+        source: file of the list, for messages.
     """
 
     def __init__(

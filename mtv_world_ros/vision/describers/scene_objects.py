@@ -27,7 +27,7 @@ class SceneObject:
         name: noun phrase of at most `MAX_WORDS` words, unique in the scene; what a segmenter
             looks for.
         colour: its main colour.
-        category: what kind of thing it is, `block`.
+        category: kind of object, e.g. `block`.
         role: one of `ROLES`: what is moved, what things stand on, what things go into.
         box: left, top, right, bottom in thousandths of the image's width and height.
     """

@@ -144,7 +144,7 @@ class Chat(Protocol):
 
         Args:
             frame: (H, W, 3) uint8 RGB, shown with the first turn.
-            turns: what user, model, user, ... said; an odd number.
+            turns: texts of user, model, user, ... in turn; an odd number.
 
         Raises:
             DescriptionError: the model gave no answer, or a refusal.
@@ -157,7 +157,7 @@ class VlmDescriber:
 
     Args:
         chat: the model.
-        cache: where answers are kept; None = nowhere.
+        cache: of answers; None = none are kept.
     """
 
     def __init__(self, chat: Chat, cache: DescriptionCache | None = None) -> None:

@@ -39,7 +39,7 @@ def stated_normalisation(config: dict[str, Any], default: Normalisation) -> Norm
     """Returns what a preprocessor_config.json states, else the model family's own.
 
     Raises:
-        CheckpointError: it states something else than three channels.
+        CheckpointError: the preprocessor is not for images of three channels.
     """
     mean = tuple(config.get('image_mean') or default.mean)
     std = tuple(config.get('image_std') or default.std)
@@ -83,7 +83,7 @@ def prepare(
         frame: (H, W, 3) uint8 RGB.
         size: height and width that the model wants [px].
         normalisation: of the model.
-        device: where the tensor shall be.
+        device: of the returned tensor.
     """
     import torch
 
@@ -200,7 +200,7 @@ def choose_boxes(
         boxes: (Q, 4) corners of candidates [px].
         scores: (Q, O) how well each fits each name, in [0, 1].
         names: O names.
-        config: which are believed.
+        config: score thresholds of detections.
     """
     owner = scores.argmax(1)
     chosen = np.full((len(names), 4), np.nan)

@@ -1,4 +1,4 @@
-"""Segmenters that are told names: found in the first frame, carried on by a SAM tracker."""
+"""Segmenters prompted by names: objects are detected once, then tracked by SAM."""
 
 from __future__ import annotations
 

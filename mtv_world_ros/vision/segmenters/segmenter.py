@@ -80,7 +80,7 @@ def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
 
     Args:
         first: masks of the start frame.
-        masks: what was followed from them.
+        masks: masks that were tracked from the first ones.
     """
     status = tuple(
         tuple(

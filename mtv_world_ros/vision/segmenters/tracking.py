@@ -102,7 +102,7 @@ def track(
     Args:
         pixels: (T, H, W) pixels of the object's colour.
         first: (H, W) its mask just before frame 0, where known.
-        config: how pieces are joined and followed.
+        config: thresholds for joining and tracking pieces of a colour.
         taken: (T, H, W) pixels that another object of the same colour holds.
         out: (T, H, W) all False, takes the masks; None = a new array.
     """
@@ -191,7 +191,7 @@ def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray)
     Args:
         patch: pixels of the object's colour.
         state: of the track so far.
-        config: how pieces are joined and followed.
+        config: thresholds for joining and tracking pieces of a colour.
         mask: (H, W) all False; the object is set in it.
 
     Returns:

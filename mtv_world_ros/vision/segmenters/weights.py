@@ -84,7 +84,7 @@ def import_transformers() -> Any:
     """Returns the package `transformers`.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: the package is not installed.
     """
     try:
         import transformers

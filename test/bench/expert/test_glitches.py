@@ -5,30 +5,30 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mtv_world_ros.bench.expert import glitches
-from mtv_world_ros.bench.expert.glitches import Commands, with_glitches
+from mtv_world_ros.assembly import robot_path
+from mtv_world_ros.bench.expert.faults import glitches
+from mtv_world_ros.bench.expert.faults.glitches import with_glitches
+from mtv_world_ros.bench.expert.faults.signals import Commands
+from mtv_world_ros.geometry.robot.file import load_robot
 
-PERIOD, GRIPPERS = 0.02, [3, 7]
+PERIOD, GRIPPERS = 0.02, [6, 13]
 
 
-def commands(num_arms: int = 2) -> Commands:
-    """Two arms of three joints and a gripper each; the second rests, the first moves evenly."""
-    positions = np.zeros((400, 8))
+def commands(name: str = 'yam_bimanual') -> Commands:
+    """The second arm, if there is one, rests; the first moves evenly and closes its gripper."""
+    robot = load_robot(robot_path(name))
+    positions = np.zeros((400, len(robot.joint_names)))
     positions[:, :3] = np.linspace(0.0, 1.0, 400)[:, None] * [0.5, 1.0, -0.5]
-    positions[:, 3] = np.where(np.arange(400) < 200, 0.04, 0.0)
-    return Commands(
-        positions=positions,
-        period=PERIOD,
-        grippers=GRIPPERS,
-        closed=np.zeros(2),
-        travel=np.full(2, 0.04),
-        num_arms=num_arms,
-    )
+    tool = robot.tools[0]
+    gripper = robot.joint_names.index(tool.gripper_joint)
+    ends = (tool.gripper_open, tool.gripper_closed)
+    positions[:, gripper] = np.interp(np.arange(400), (195, 200), ends)
+    return Commands(positions, PERIOD, robot)
 
 
 def test_the_same_seed_gives_the_same_glitches_and_points_tell_them_all():
     given = commands()
-    one, same, other = (with_glitches(given, 4, np.random.default_rng(s)) for s in (1, 1, 2))
+    one, same, other = (with_glitches(given, 4, np.random.default_rng(s)) for s in (3, 3, 4))
     np.testing.assert_array_equal(one, same)
     assert np.abs(one - other).max() > 1e-3
     assert one.shape == given.positions.shape and np.isfinite(one).all()
@@ -43,10 +43,13 @@ def test_the_same_seed_gives_the_same_glitches_and_points_tell_them_all():
 @pytest.mark.parametrize('seed', range(6))
 def test_grippers_jerk_within_their_range_and_joints_stay_or_the_other_way_round(seed):
     given, rng = commands(), np.random.default_rng(seed)
-    arms = [j for j in range(8) if j not in GRIPPERS]
+    arms = [j for j in range(14) if j not in GRIPPERS]
     jerked = glitches._gripper(given, rng)
     np.testing.assert_array_equal(jerked[:, arms], given.positions[:, arms])
-    assert jerked[:, GRIPPERS].min() >= 0 and jerked[:, GRIPPERS].max() <= 0.04
+    assert (
+        jerked[:, GRIPPERS].min() >= 0
+        and jerked[:, GRIPPERS].max() <= given.robot.tools[0].gripper_open + 1e-9
+    )
     assert np.abs(jerked - given.positions).max() > 0
     for glitch in (glitches._joints, glitches._other_arm):
         off = glitch(given, rng)
@@ -71,8 +74,9 @@ def test_time_stands_jumps_or_runs_and_brings_nothing_that_was_not_commanded():
 
 
 def test_an_arm_at_rest_moves_along_and_one_arm_alone_has_joints_that_are_off():
-    rest = slice(4, 7)
+    rest = slice(7, 13)
     moved = [glitches._other_arm(commands(), np.random.default_rng(s))[:, rest] for s in range(8)]
     assert min(np.abs(other).max() for other in moved) > 0.1
-    alone = glitches._other_arm(commands(num_arms=1), np.random.default_rng(0))
-    assert np.abs(alone - commands().positions).max() > 1e-4
+    one = commands('franka')
+    alone = glitches._other_arm(one, np.random.default_rng(0))
+    assert np.abs(alone - one.positions).max() > 1e-4

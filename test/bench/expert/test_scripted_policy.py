@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.bench.expert.faults import parse_variant, PolicyVariant
+from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, PolicyVariant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.data_types import Observation
@@ -68,9 +68,9 @@ def test_names_and_variants_are_the_same_thing():
 @pytest.mark.parametrize(
     ('name', 'says'),
     [
-        ('exprt', r"'exprt' is no scripted policy \(did you mean 'expert'\?\).*expert-noise-0.02"),
-        ('expert-noise', "'expert-noise' is no scripted policy; .*faults are noise, miss"),
-        ('expert-nois-0.1', r"unknown fault 'nois' \(did you mean 'noise'\?\); known are noise"),
+        ('exprt', r"'exprt' is no scripted policy \(did you mean 'expert'\?\).*joint_noise-0.02"),
+        ('expert-noise', "'expert-noise' is no scripted policy; .*mtv-world faults"),
+        ('expert-nois-0.1', r"unknown fault 'nois' \(did you mean 'noise'\?\); known are the 162"),
         ('expert-miss-0.1-miss-0.2', "fault 'miss' is given twice"),
         ('expert-miss-1.5', "'miss' is 1.5; it must be 0 to 1"),
         ('expert-noise--1', 'is no scripted policy'),

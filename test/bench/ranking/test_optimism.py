@@ -3,7 +3,12 @@ from math import isnan, nan
 import numpy as np
 import pytest
 
-from mtv_world_ros.bench.expert.faults import FAULTS, kinds_of, parse_variant
+from mtv_world_ros.bench.expert.faults.catalogue import (
+    FAULTS,
+    kinds_of,
+    parse_variant,
+    policies_of,
+)
 from mtv_world_ros.bench.ranking.flip_sheet import flip_sheet
 from mtv_world_ros.bench.ranking.optimism import (
     area_interval,
@@ -16,13 +21,12 @@ from mtv_world_ros.bench.ranking.optimism import (
     read_last_frames,
 )
 from mtv_world_ros.bench.ranking.optimism_tables import optimism_tables
-from mtv_world_ros.bench.ranking.policy_sets import POLICY_SETS
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
 
 
 @pytest.mark.parametrize('split', ['train', 'calibrate', 'test'])
 def test_a_policy_set_covers_its_split_and_no_other(split):
-    names = POLICY_SETS[split]
+    names = policies_of(split)
     kinds = {kind for name in names for kind in parse_variant(name).kinds}
     assert kinds == set(kinds_of(split))
     assert len(names) >= 13 and names[0] == 'expert' and len(set(names)) == len(names)
@@ -57,13 +61,13 @@ def test_false_successes_abstentions_and_flips_are_counted(optimism):
 
 
 def test_a_kind_is_measured_against_the_expert(optimism):
-    assert optimism.kinds == ('high', 'elsewhere')
+    assert optimism.kinds == ('grasp_height', 'goal_offset')
     high, elsewhere = (optimism.scores('imagined', kind) for kind in optimism.kinds)
     assert high['false_success'].value == 1.0 and high['auroc'].value == 1.0
     assert high['pearson'].count == 2 and high['flips'].count == 8
     assert elsewhere['false_success'].value == 0.0 and elsewhere['abstention'].value == 0.5
     assert elsewhere['contact_flips'].count == 0 and isnan(elsewhere['contact_flips'].value)
-    rule = optimism.scores('no_picture', 'high')
+    rule = optimism.scores('no_picture', 'grasp_height')
     assert rule['false_success'].value == 0.25
     assert rule['flips'].count == 0 and isnan(rule['over_rule'].value)
 
@@ -75,7 +79,7 @@ def test_tables_fit_a_console(optimism):
         assert len(tables) == 1 + len(by_model)
         lines = '\n'.join(table.markdown() for table in tables).splitlines()
         assert max(map(len, lines)) <= 100
-    assert '.67 [.34 .88] 12' in '\n'.join(lines) and 'elsewhere *' in '\n'.join(lines)
+    assert '.67 [.34 .88] 12' in '\n'.join(lines) and 'goal_offset *' in '\n'.join(lines)
     assert optimism_tables({}) == []
 
 
@@ -180,4 +184,4 @@ def test_arms_that_end_elsewhere_do_not_count():
 
 
 def test_contact_is_in_the_catalogue():
-    assert not FAULTS['elsewhere'].contact and FAULTS['lean'].contact
+    assert not FAULTS['goal_offset'].contact and FAULTS['grasp_lean'].contact

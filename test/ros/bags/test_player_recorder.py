@@ -309,6 +309,19 @@ def test_a_recorder_stops_soon_though_publishers_go_on(recorded, tmp_path):
         assert bag.message_count > 150
 
 
+def test_a_recorder_that_is_stopped_before_it_records_says_so(launch, tmp_path):
+    recorder = launch('recorder', tmp_path / 'bag', '/nobody_publishes_this')
+    time.sleep(0.5)
+    while recorder.poll() is None and not list(tmp_path.glob('.bag.*')):
+        time.sleep(0.02)  # it waits for the publisher from here on
+    time.sleep(0.5)
+    code, said = finish(recorder, signal.SIGINT)
+    assert (code, 'Traceback' in said) == (1, False), said
+    assert "stopped before recording began, '" in said
+    assert '/nobody_publishes_this had not been connected yet' in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_killed_recorder_loses_no_more_than_a_second(recorded, tmp_path):
     recorder, client, sent = recorded
     recorder.kill()

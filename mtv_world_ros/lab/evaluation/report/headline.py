@@ -92,7 +92,8 @@ def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
     return {
         'words': words,
         'verdicts': [
-            (mark(index, evaluations), _doubts(found)) for index, found in enumerate(evaluations)
+            (mark(index, evaluations), _doubts(found), _few(found))
+            for index, found in enumerate(evaluations)
         ],
         'meanings': [
             text
@@ -146,6 +147,14 @@ def _doubts(found: Evaluated) -> list[str]:
         for key, words in _MARGINS.items()
         if (doubt := _doubt(numbers, key, f'{view}: margin over {words}'))
     ]
+
+
+def _few(found: Evaluated) -> str:
+    """Why nothing can be told at all, in words; empty = it can."""
+    count = int(found.metrics['num_episodes'])
+    if count >= MIN_EPISODES:
+        return ''
+    return f'Cannot tell from {count} episode{"s" * (count > 1)}: give at least {MIN_EPISODES}.'
 
 
 def _doubt(numbers: Mapping[str, Any], key: str, words: str) -> str:

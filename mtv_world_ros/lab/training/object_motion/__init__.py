@@ -1,1 +1,1 @@
-"""Training of the object motion network from recorded episodes."""
+"""How arms follow, and numbers of contact, fitted to recorded episodes."""

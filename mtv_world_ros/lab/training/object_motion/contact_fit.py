@@ -18,6 +18,12 @@ import numpy as np
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.engine import Engine
+from mtv_world_ros.foresight.futures import draw_futures
+from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
@@ -26,22 +32,16 @@ from mtv_world_ros.lab.training.object_motion.tracks import (
     fine_commands,
     first_frame,
     FirstFrame,
+    object_ways,
     read_each,
     recorded_positions,
-    tracks_of,
 )
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse
-from mtv_world_ros.model.object_motion.contact_motions import ContactMotions
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.network import COMMANDS_A_STEP
-from mtv_world_ros.model.object_motion.rigid_bodies import finger_travels
 from mtv_world_ros.parallel import run_all
 
 #: what is tried: each number by these factors, round by round
 _FITTED = (
     'finger_stiffness',
     'finger_damping',
-    'pad_stiffness',
     'grip_friction',
     'table_friction',
     'density',
@@ -76,13 +76,16 @@ class ContactRecording:
     grippers: FreeGrippers
     ways: FloatArray
 
-    def errors(
-        self, robot: RobotModel, response: ArmResponse, settings: ContactSettings
-    ) -> FloatArray:
+    def errors(self, engine: Engine, settings: ContactSettings) -> FloatArray:
         """Returns (1 + T, O) how far objects are from where they were [m], NaN = not known."""
+        known = [number for number, solid in enumerate(self.solids) if solid is not None]
+        solids = [solid for solid in self.solids if solid is not None]
         alone = settings.model_copy(update={'num_motions': 1})
-        motions = ContactMotions(settings=alone, response=response, solids=self.solids)
-        points = motions.advance(robot, self.positions, COMMANDS_A_STEP)[0].points[0]
+        batch = engine.begin(draw_futures(alone, solids, engine.arms.drives))
+        motion, state = batch.advance(self.positions, COMMANDS_A_STEP)
+        points = np.full(self.ways.shape, np.nan)
+        if not state.lost:
+            points[:, known] = motion.points[0]
         return np.linalg.norm(points - points[0] - self.ways, axis=-1)
 
 
@@ -90,12 +93,11 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     """Reads what an episode says about contact.
 
     Raises:
-        EpisodeError: see `tracks_of`.
+        EpisodeError: see `object_ways`.
     """
     episode = read_episode(path, views=tuple(views))
-    track = tracks_of(episode, robot, views)[0]
+    ways = object_ways(episode, robot, views)
     frame = first_frame(episode, robot, views)
-    known = track.known[0] & track.known
     times, positions = fine_commands(episode, robot, views)
     assert episode.masks is not None and episode.joint_states is not None
     stamps = episode.masks[views[0]].stamps_ns[0] + times * 1e9
@@ -112,7 +114,7 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
         ),
         positions=positions,
         grippers=FreeGrippers.of(robot, positions, recorded),
-        ways=np.where(known[..., None], track.points - track.points[0], np.nan),
+        ways=ways,
     )
 
 
@@ -123,34 +125,31 @@ def read_recordings(
     return read_each(paths, lambda path: read_contact(path, robot, views))
 
 
-def first_settings(robot: RobotModel, response: ArmResponse) -> ContactSettings:
+def first_settings(arms: Arms) -> ContactSettings:
     """Returns what a search begins with: fingers as their joints follow, objects of plastic."""
-    travels = finger_travels(robot)
-    grips = []
-    for joint, travel in travels.items():
-        column = robot.joint_names.index(joint)
-        fingers = 1 + sum(mimic.source == joint for mimic in robot.mimics)
-        stiffness = 1 / response.compliance[column] / fingers / travel**2
-        grips.append(
-            stiffness * np.array([1.0, response.damping[column], response.armature[column]])
-        )
-    stiffness, damping, mass = np.mean(grips, axis=0) if grips else (200.0, 10.0, 0.05)
+    drives = arms.drives
+    stiffness, damping, mass = 200.0, 10.0, 0.05
+    if drives.fingers.any():
+        way = drives.travels[drives.fingers] ** 2
+        numbers = (drives.stiffness, drives.damping, drives.armature)
+        found = [float(np.mean(one[drives.fingers] / way)) for one in numbers]
+        stiffness, damping, mass = (max(one, 1e-6) for one in found)
     return ContactSettings(
-        finger_stiffness=float(stiffness),
-        finger_damping=float(damping),
-        finger_mass_kg=float(mass),
-        pad_stiffness=1e4,
+        finger_stiffness=stiffness,
+        finger_damping=damping,
+        finger_mass_kg=mass,
         grip_friction=1.0,
         table_friction=0.5,
         density=300.0,
         tray_kg=0.4,
+        num_motions=16,
     )
 
 
 def fit_contact(
     recordings: Sequence[ContactRecording],
     robot_file: Path,
-    response: ArmResponse,
+    response: ArmResponse | None,
     first: ContactSettings,
     workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
@@ -171,7 +170,7 @@ def fit_contact(
 
     Raises:
         TrainingError: no recording says where an object went.
-        RobotError: see `RigidBodies`.
+        RobotError: see `Arms`.
     """
     if not any(np.isfinite(recording.ways).any() for recording in recordings):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
@@ -185,8 +184,8 @@ def fit_contact(
             found[number, episode] = loss
         return found
 
-    robot = load_robot(robot_file)
-    best = fit_fingers([recording.grippers for recording in recordings], robot, response, first)
+    arms = Arms(load_robot(robot_file), response)
+    best = fit_fingers([recording.grippers for recording in recordings], arms, first)
     swing = 'swing' if best.fingers_swing else 'do not swing'
     report(f'fingers {swing}: {best.model_dump(mode="json", include=set(_OF_FINGERS))}')
     fitted = [name for name in _FITTED if not (best.fingers_swing and name in _OF_FINGERS)]
@@ -227,14 +226,17 @@ class _Trial:
     """Tries settings on recordings, in a process of its own."""
 
     def __init__(
-        self, robot_file: Path, response: ArmResponse, recordings: Sequence[ContactRecording]
+        self,
+        robot_file: Path,
+        response: ArmResponse | None,
+        recordings: Sequence[ContactRecording],
     ) -> None:
-        self._robot = load_robot(robot_file)
-        self._response, self._recordings = response, recordings
+        self._engine = Engine(Arms(load_robot(robot_file), response))
+        self._recordings = recordings
 
     def __call__(self, job: tuple[int, int, ContactSettings]) -> float:
         """Returns the mean logarithm of errors, between the bounds [log m]; NaN = not known."""
         _, episode, settings = job
-        errors = self._recordings[episode].errors(self._robot, self._response, settings)
+        errors = self._recordings[episode].errors(self._engine, settings)
         errors = errors[np.isfinite(errors)]
         return float(np.log(np.clip(errors, _LEAST_M, _MOST_M)).mean()) if len(errors) else np.nan

@@ -10,26 +10,25 @@ Shape letters: T periods of commands, G grippers, F fingers, K candidates, J joi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
+from mtv_world_ros.foresight.scene import Scene
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.model.object_motion.contact_motions import driven
-from mtv_world_ros.model.object_motion.contact_settings import ContactSettings
-from mtv_world_ros.model.object_motion.finger_swing import FingerDrives
-from mtv_world_ros.model.object_motion.rigid_bodies import RigidBodies
 
-#: steps in a period
-_SUBSTEPS = 10
 #: a gripper that is commanded to close by more than this share of its travel may touch something
 _CLOSES = 0.02
 #: errors of grippers above this share of their travel are as bad: they touch something
 _MOST = 0.15
 #: candidates of a round, and the factors within which they are drawn
-_CANDIDATES, _FACTORS = 64, (10.0, 3.0, 1.5, 1.2)
+_CANDIDATES, _FACTORS = 48, (10.0, 3.0, 1.5, 1.2)
+#: episodes that are looked at, and shortest ones [periods]
+_MOST_EPISODES, _SHORTEST = 12, 10
 #: fingers swing if that explains at least this share of the errors
 _EXPLAINS = 0.25
 
@@ -64,10 +63,7 @@ class FreeGrippers:
 
 
 def fit_fingers(
-    grippers: Sequence[FreeGrippers],
-    robot: RobotModel,
-    response: ArmResponse,
-    settings: ContactSettings,
+    grippers: Sequence[FreeGrippers], arms: Arms, settings: ContactSettings
 ) -> ContactSettings:
     """Returns settings with the numbers of fingers that explain what grippers reported.
 
@@ -75,94 +71,43 @@ def fit_fingers(
 
     Args:
         grippers: of some episodes.
-        robot: from a URDF.
-        response: how its arms follow.
+        arms: of the robot, with how they follow.
         settings: where the search begins.
     """
-    swinging = settings.model_copy(update={'fingers_swing': True})
-    swings = [found for one in grippers if (found := _swing(one, robot, response, swinging))]
-    if not swings:
+    known = [one for one in grippers if len(one.positions) >= _SHORTEST]
+    known = [one for one in known if np.isfinite(one.recorded).any()]
+    known = known[:: max(1, len(known) // _MOST_EPISODES)][:_MOST_EPISODES]
+    if not known:
         return settings
+    scene = Scene.compiled(arms, ())
+    swinging = settings.model_copy(update={'fingers_swing': True})
     rng = np.random.default_rng(3)
     names = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
-    best = np.array([getattr(settings, name) for name in names])
+    best, least = swinging, np.inf
     for factor in _FACTORS:
         drawn = rng.uniform(-1, 1, size=(_CANDIDATES, 3))
         drawn[0] = 0.0
-        candidates = best * factor**drawn
-        losses = np.sum([one.losses(*candidates.T[..., None]) for one in swings], axis=0)
-        best = candidates[losses.argmin()]
-    if losses.min() > (1 - _EXPLAINS) * sum(one.unexplained for one in swings):
-        return settings
-    return swinging.model_copy(update=dict(zip(names, best.tolist(), strict=True)))
+        middle = np.array([getattr(best, name) for name in names])
+        for numbers in (middle * factor**drawn).tolist():
+            tried = swinging.model_copy(update=dict(zip(names, numbers, strict=True)))
+            loss = _loss(scene, tried, known)
+            if loss < least:
+                best, least = tried, loss
+    geared = settings.model_copy(update={'fingers_swing': False})
+    return best if least < (1 - _EXPLAINS) * _loss(scene, geared, known) else settings
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Swing:
-    """What hands do to fingers in an episode.
-
-    Attributes:
-        drives: of a stiffness, damping and drive of 1 each, whose mass is that of the fingers.
-        pulls: (T * n, F) of the hands.
-        ways: (1 + T * n, F) of fingers that do not swing.
-        means: (F, G) from fingers to grippers, as shares of their travel.
-        dips: (1 + T, G) recorded, less what is expected, as shares; NaN = not known.
-    """
-
-    drives: FingerDrives
-    pulls: FloatArray
-    ways: FloatArray
-    means: FloatArray
-    dips: FloatArray
-
-    @property
-    def unexplained(self) -> float:
-        """The loss of fingers that do not swing."""
-        return self._loss(np.zeros_like(self.dips))
-
-    def hung(self, stiffness: FloatArray, damping: FloatArray, mass: FloatArray) -> FingerDrives:
-        """Returns the drives (K, F) of candidates (K, 1) [N/m, N s/m, kg], of a finger's metre."""
-        unit = self.drives
-        return replace(
-            unit,
-            stiffness=unit.stiffness * stiffness,
-            damping=unit.damping * damping,
-            mass=unit.mass + unit.stiffness * mass,
-        )
-
-    def losses(self, stiffness: FloatArray, damping: FloatArray, mass: FloatArray) -> FloatArray:
-        """Returns (K,) losses of candidates, see `hung`."""
-        drives = self.hung(stiffness, damping, mass)
-        start = np.zeros((2, len(stiffness), self.ways.shape[1]))
-        swings, _ = drives.swings(self.pulls, self.ways, PERIOD_S / _SUBSTEPS, start)
-        return np.array([self._loss(one[::_SUBSTEPS] @ self.means) for one in swings])
-
-    def _loss(self, dips: FloatArray) -> float:
-        return float(np.nansum(np.minimum(np.abs(dips - self.dips), _MOST)))
-
-
-def _swing(
-    grippers: FreeGrippers, robot: RobotModel, response: ArmResponse, settings: ContactSettings
-) -> _Swing | None:
-    """None: nothing is known of any gripper for long enough."""
-    if len(grippers.positions) < _SUBSTEPS or not np.isfinite(grippers.recorded).any():
-        return None
-    unit = settings.model_copy(update={'finger_stiffness': 1.0, 'finger_damping': 1.0})
-    arms = RigidBodies(robot, response, (), unit, PERIOD_S, grippers.positions[0]).arms
-    where, _ = replace(response, floor=None).follow(robot, grippers.positions)
-    ways, _, _, pulls = driven(arms, where, _SUBSTEPS)
-    drives = arms.finger_drives
-    travels = {
-        robot.joint_names.index(tool.gripper_joint): abs(tool.gripper_open - tool.gripper_closed)
-        for tool in robot.tools
-        if tool.gripper_joint is not None
-    }
-    columns = list(travels)
-    scale = np.array(list(travels.values()))
-    return _Swing(
-        drives=replace(drives, mass=drives.mass - drives.stiffness * settings.finger_mass_kg),
-        pulls=pulls,
-        ways=ways[:, arms.fingers],
-        means=arms.shares(columns) / scale,
-        dips=(grippers.recorded - where)[:, columns] / scale,
-    )
+def _loss(scene: Scene, settings: ContactSettings, grippers: Sequence[FreeGrippers]) -> float:
+    """How far grippers report to be from where they are expected, in their travels."""
+    planner, arms = CoursePlanner(scene, settings), scene.arms
+    names, loss = arms.robot.joint_names, 0.0
+    for one in grippers:
+        course, _ = planner.plan(one.positions, planner.begin(one.positions[0]))
+        expected = arms.drives.joints(course.positions[::SUBSTEPS], len(names))
+        for tool in arms.robot.tools:
+            if tool.gripper_joint is not None:
+                column = names.index(tool.gripper_joint)
+                travel = abs(tool.gripper_open - tool.gripper_closed)
+                off = np.abs(expected[:, column] - one.recorded[:, column]) / travel
+                loss += float(np.nansum(np.minimum(off, _MOST)))
+    return loss

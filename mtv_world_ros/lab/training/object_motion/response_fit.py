@@ -20,10 +20,10 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import measured_positions, stitched_commands
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.foresight.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.model.object_motion.arm_response import ArmResponse, PERIOD_S
 
 #: commands and measured positions of an episode, both (T, J), `PERIOD_S` apart
 Recording = tuple[FloatArray, FloatArray]

@@ -1,0 +1,54 @@
+"""Puts a world model of your own into the main path.
+
+    python examples/own_world_model.py [EPISODE]
+
+A world model has `spec` and `predict`; drawing, masks and the estimate stay what they are. This
+one holds the first frame: the baseline that every model has to beat.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros import load_pipeline
+from mtv_world_ros.data.recording import commands_from, load_recording
+from mtv_world_ros.data_types import ByteArray, WorldModelSpec
+from mtv_world_ros.files import share_path
+from mtv_world_ros.pipeline import Pipeline
+
+
+@dataclass(frozen=True)
+class HeldFrame:
+    """Predicts that nothing happens."""
+
+    spec: WorldModelSpec
+
+    def predict(
+        self, start_frame: ByteArray, trajectory_frames: ByteArray, **options: object
+    ) -> ByteArray:
+        """Returns (V, T, H, W, 3) uint8 RGB frames: the (V, H, W, 3) start frame, T times."""
+        del trajectory_frames, options  # positions, seed, steps, ...: see `WorldModel`
+        return np.repeat(start_frame[:, None], self.spec.num_frames, axis=1)
+
+
+def imagined(pipeline: Pipeline) -> float:
+    """Estimate at the end of the recorded commands."""
+    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+    *_, last = episode.extend(commands_from(recording, 0))
+    return last.success.probability
+
+
+parser = argparse.ArgumentParser()
+parser.add_argument(
+    'episode', type=Path, nargs='?', default=share_path('resource', 'demo_episode')
+)
+options = parser.parse_args()
+
+bundled = load_pipeline('bundled')
+recording = load_recording(options.episode, bundled.spec, bundled.robot)
+held = replace(bundled, world_model=HeldFrame(bundled.spec), object_motion=None)
+print(f'bundled model: success {imagined(bundled):.2f}; held frame: {imagined(held):.2f}')

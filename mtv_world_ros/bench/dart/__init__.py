@@ -1,0 +1,1 @@
+"""A second engine, DART, as another truth than MuJoCo."""

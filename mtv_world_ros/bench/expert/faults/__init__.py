@@ -1,0 +1,1 @@
+"""What can be wrong with a scripted policy: the catalogue, and what carries it out."""

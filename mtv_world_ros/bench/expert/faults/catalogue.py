@@ -1,0 +1,278 @@
+"""The fault catalogue: what can be wrong with a scripted policy, and its sizes.
+
+The kinds are data, in `config/faults`. A policy's name says its faults and their sizes:
+`expert-joint_noise-0.02`, `expert-grasp_height-0.03-gripper_delay-0.3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+import re
+from typing import Any, Literal
+
+import numpy as np
+
+from mtv_world_ros.bench.expert.faults.drawn import drawn_names, drawn_values, is_drawn
+from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
+from mtv_world_ros.errors import nearest, PolicyError
+from mtv_world_ros.files import share_path
+
+EXPERT = 'expert'
+#: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
+SPLITS = ('train', 'calibrate', 'test')
+#: in the order of the catalogue, which random policies depend on
+_FILES = (
+    *('timing', 'height', 'lateral', 'wrist', 'opening', 'release', 'collision', 'object'),
+    *('speed', 'joint', 'regrasp'),
+)
+Steps = ListOf[dict[str, dict[str, Any]]]
+
+
+class FaultKind(Schema):
+    """One way in which a policy fails.
+
+    Attributes:
+        aliases: other names, which earlier recordings have.
+        family: what it is an error of.
+        split: `train`, `calibrate` or `test`.
+        typical: a size at which success and failure are about as frequent.
+        largest: largest size.
+        unit: of the size.
+        none: the size at which there is no fault.
+        text: what the size means.
+        contact: whether its failures are failures of contact, which do not show in the arm's path
+            alone.
+        needs: what a robot needs for it.
+        keeps_tempo: added way points take time of their own; else they share the move's.
+        ranked: sizes in the rankings of its split.
+        edits: steps that change the way points of a move.
+        second_arm: what another arm does meanwhile.
+        commands: steps that change the commands of the whole plan.
+    """
+
+    aliases: ListOf[str] = ()
+    family: str
+    split: Literal['train', 'calibrate', 'test']
+    typical: float
+    largest: float
+    unit: str = ''
+    none: float = 0.0
+    text: str
+    contact: bool = True
+    needs: ListOf[Literal['gripper', 'two_arms']] = ()
+    keeps_tempo: bool = False
+    ranked: ListOf[float] = ()
+    edits: Steps = ()
+    second_arm: dict[str, Any] = {}
+    commands: Steps = ()
+
+
+def _read() -> dict[str, FaultKind]:
+    kinds: dict[str, FaultKind] = {}
+    for name in _FILES:
+        path = share_path('config', 'faults', f'{name}.yaml')
+        for kind, values in read_yaml(path, 'fault file', 'config/faults').items():
+            kinds[kind] = validated(FaultKind, values, f"{path}: '{kind}'")
+    return kinds
+
+
+class _Catalogue(dict[str, FaultKind]):
+    """Kinds by name; drawn ones are made when they are asked for."""
+
+    def __missing__(self, name: str) -> FaultKind:
+        if not is_drawn(name):
+            raise KeyError(name)
+        return FaultKind(**drawn_values(name))
+
+
+#: kinds by name
+FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
+_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, *fault.aliases)}
+_ALL = f"the {len(FAULTS)} kinds that 'mtv-world faults' prints"
+
+
+def kind_named(name: str) -> str:
+    """Returns the kind of a name or an alias.
+
+    Raises:
+        PolicyError: no such kind; the text names the nearest known one.
+    """
+    if is_drawn(name):
+        return name
+    if name not in _NAMES:
+        raise PolicyError(
+            f"unknown fault kind '{name}'{nearest(name, _NAMES)}; known are the splits "
+            f'{", ".join(SPLITS)} and {_ALL}'
+        )
+    return _NAMES[name]
+
+
+def kinds_named(text: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split, or of a comma-separated list, as they are called there.
+
+    Raises:
+        PolicyError: no such split or kind; the text names the nearest known one.
+    """
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    if not names or names[0] in SPLITS or ':' in text:
+        return kinds_of(text.strip())
+    for name in names:
+        kind_named(name)
+    return names
+
+
+def kinds_of(split: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split, or of `drawn:SEED`.
+
+    Raises:
+        PolicyError: no such split.
+    """
+    word, _, seed = split.partition(':')
+    if word == 'drawn' and seed.isdecimal() and len(seed) < 10:
+        return drawn_names(int(seed))
+    if split not in SPLITS:
+        raise PolicyError(
+            f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
+            f'{", ".join(SPLITS)} and drawn:SEED'
+        )
+    return tuple(name for name, kind in FAULTS.items() if kind.split == split)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyVariant:
+    """The expert's faults; none is the expert.
+
+    Attributes:
+        sizes: (name or alias of a kind, size), each kind once, in the catalogue's order.
+    """
+
+    sizes: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in self.sizes:
+            largest = FAULTS[kind_named(name)].largest
+            if not (isfinite(value) and 0 <= value <= largest):
+                raise PolicyError(f"policy fault '{name}' is {value}; it must be 0 to {largest:g}")
+
+    @classmethod
+    def of(cls, sizes: Mapping[str, float]) -> PolicyVariant:
+        """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
+        names = in_order(sizes)
+        given = ((name, float(sizes[name])) for name in names)
+        return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].none))
+
+    def size(self, kind: str) -> float:
+        """Returns the size of one fault."""
+        return dict(self.faults).get(kind_named(kind), FAULTS[kind_named(kind)].none)
+
+    @property
+    def faults(self) -> tuple[tuple[str, float], ...]:
+        """(kind, size) of its faults."""
+        return tuple((kind_named(name), size) for name, size in self.sizes)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of its faults."""
+        return tuple(kind for kind, _ in self.faults)
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits of its faults."""
+        return tuple(sorted({FAULTS[kind].split for kind in self.kinds}))
+
+    @property
+    def name(self) -> str:
+        """The name that `parse_variant` reads, with the names that it was given."""
+        return '-'.join([EXPERT, *(f'{name}-{size:g}' for name, size in self.sizes)])
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Returns names of kinds in the order of the catalogue; drawn kinds follow."""
+    order = {kind: number for number, kind in enumerate(FAULTS)}
+    return sorted(names, key=lambda name: (order.get(kind_named(name), len(order)), name))
+
+
+def parse_variant(text: str) -> PolicyVariant:
+    """Returns the variant of a name: `expert`, then any of its faults, each with its size.
+
+    Raises:
+        PolicyError: no such name, a fault twice or without a size, a size out of range.
+    """
+    name = text.strip()
+    if not re.fullmatch(rf'{EXPERT}(-[a-z][a-z_0-9]*-\d*\.?\d+)*', name):
+        raise PolicyError(
+            f"'{text}' is no scripted policy{_near(name)}; they are called '{EXPERT}', followed "
+            f"by faults with their sizes, like '{EXPERT}-joint_noise-0.02' or "
+            f"'{EXPERT}-gripper_delay-0.3-grasp_missed-0.5'; {_ALL}"
+        )
+    sizes: dict[str, float] = {}
+    for fault, size in re.findall(r'-([a-z][a-z_0-9]*)-([\d.]+)', name):
+        if fault not in _NAMES and not is_drawn(fault):
+            raise PolicyError(
+                f"policy '{text}': unknown fault '{fault}'{nearest(fault, _NAMES)}; known are "
+                f'{_ALL}'
+            )
+        if kind_named(fault) in map(kind_named, sizes):
+            raise PolicyError(f"policy '{text}': fault '{fault}' is given twice")
+        sizes[fault] = float(size)
+    PolicyVariant(tuple(sizes.items()))  # sizes that mean no fault are checked, too
+    return PolicyVariant.of(sizes)
+
+
+def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVariant:
+    """Returns a random policy: the expert, or one or two faults of sizes around the typical one.
+
+    Args:
+        kinds: to choose from.
+        rng: draws.
+    """
+    count = int(rng.choice([0, 1, 2], p=[0.12, 0.5, 0.38]))
+    chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
+    sizes = {}
+    for kind in map(str, chosen):
+        fault = FAULTS[kind_named(kind)]
+        size = min(fault.typical * 2 ** rng.normal(0.0, 0.9), fault.largest)
+        sizes[kind] = float(f'{size:.3g}')
+    return PolicyVariant.of(sizes)
+
+
+def policies_of(split: str) -> tuple[str, ...]:
+    """Returns the policies of a ranking: the expert, and kinds of a split in their sizes.
+
+    Raises:
+        PolicyError: no such split.
+    """
+    faults = ((kind, size) for kind in kinds_of(split) for size in FAULTS[kind].ranked)
+    return (EXPERT, *(PolicyVariant.of({kind: size}).name for kind, size in faults))
+
+
+def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
+    """Refuses policies with faults of a split.
+
+    Args:
+        names: of policies.
+        split: whose kinds must not be there.
+        what: they are not for, in words.
+
+    Raises:
+        PolicyError: names the policies and their kinds.
+    """
+    found = {
+        name: bad
+        for name in names
+        if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == split])
+    }
+    if found:
+        told = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
+        raise PolicyError(
+            f'fault kinds of the split {split} are not for {what}: {told}; choose kinds of '
+            f'{", ".join(s for s in SPLITS if s != split)} (config/faults)'
+        )
+
+
+def _near(name: str) -> str:
+    """Of the first word alone: what follows may be right."""
+    first = name.split('-')[0]
+    return '' if first == EXPERT else nearest(first, [EXPERT])

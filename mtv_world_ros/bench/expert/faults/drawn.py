@@ -1,0 +1,129 @@
+"""Fault kinds that nobody designed: steps drawn from a seed, with phase, direction and size.
+
+A drawn kind is called `drawn_SEED_NUMBER`, and its name alone gives it again. It belongs to the
+split `test`: nothing learns from it.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+#: kinds of a set
+NUM_DRAWN = 12
+#: the sizes of a drawn kind are factors of what was drawn: in rankings, and the largest
+RANKED, LARGEST = (0.6, 1.2), 3.0
+_NAME = re.compile(r'drawn_(\d{1,9})_(\d{1,3})')
+#: way points that are changed together; where rows are inserted, like which way point, and in
+#: which phase
+_GROUPS = (
+    *(('above', 'grasp', 'close'), ('grasp', 'close'), ('close',), ('lift', 'carry')),
+    *(('carry', 'lower', 'open', 'retreat'), ('open', 'retreat'), ('retreat',)),
+)
+_MOMENTS = (
+    *(('start', 'grasp', 'above'), ('before close', 'grasp', 'above')),
+    *(('after lift', 'lift', 'carry'), ('before open', 'lower', 'carry')),
+    *(('after open', 'open', 'retreat'), ('after retreat', 'retreat', 'retreat')),
+)
+_DIRECTIONS = ('up', 'along', 'across', 'anywhere', 'drawn', 'other')
+#: primitives of commands, their options, and the range of what is drawn
+_COMMANDS: tuple[tuple[str, dict[str, Any], tuple[float, float]], ...] = (
+    ('delay', {}, (0.2, 0.8)),
+    ('delay', {'only': 'opening'}, (0.3, 1.0)),
+    ('lead', {}, (0.2, 0.6)),
+    ('lag', {'joints': 'grippers'}, (0.2, 0.8)),
+    ('lag', {'joints': 'wrists'}, (0.1, 0.3)),
+    ('give_way', {'by': 'speed'}, (0.2, 0.6)),
+    ('give_way', {'by': 'reach'}, (0.3, 0.7)),
+    ('pause', {}, (0.4, 1.2)),
+    ('jump', {'between': [0.2, 0.7], 'back': True, 'seconds': 0.4}, (1.0, 2.0)),
+    ('delay_each', {}, (0.15, 0.4)),
+    ('error', {'of': 'offsets'}, (0.02, 0.06)),
+    ('error', {'of': 'tremors'}, (0.02, 0.04)),
+    ('error', {'of': 'grippers'}, (0.05, 0.12)),
+    ('quantise', {}, (0.06, 0.14)),
+    ('limit_speed', {}, (0.3, 0.3)),
+)
+
+
+def drawn_names(seed: int) -> tuple[str, ...]:
+    """Returns the names of the kinds of a seed."""
+    return tuple(f'drawn_{seed}_{number}' for number in range(NUM_DRAWN))
+
+
+def is_drawn(name: str) -> bool:
+    """Returns whether it is the name of a drawn kind."""
+    return _NAME.fullmatch(name) is not None
+
+
+def drawn_values(name: str) -> dict[str, Any]:
+    """Returns the entry of a drawn kind, as `config/faults` has those of the others.
+
+    Steps are one edit of way points, or two, or one of them and one of commands.
+    """
+    match = _NAME.fullmatch(name)
+    assert match is not None, name
+    rng = np.random.default_rng([int(match[1]), int(match[2])])
+    edits, commands, said = [], [], []
+    for is_edit in ((True,), (True, True), (True, False), (False,))[int(rng.integers(4))]:
+        step, text = _edit(rng) if is_edit else _command(rng)
+        (edits if is_edit else commands).append(step)
+        said.append(text)
+    return {
+        'family': 'drawn',
+        'split': 'test',
+        'typical': 1.0,
+        'largest': LARGEST,
+        'text': f'factor of what was drawn: {"; ".join(said)}',
+        'needs': ['gripper'],
+        'keeps_tempo': True,
+        'ranked': list(RANKED),
+        'edits': edits,
+        'commands': commands,
+    }
+
+
+def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
+    """A step that changes way points, and what it is in words."""
+    way = str(rng.choice(_DIRECTIONS))
+    far = _round(rng.uniform(0.2, 0.8) if way == 'other' else rng.uniform(0.015, 0.06))
+    group = list(_GROUPS[int(rng.integers(len(_GROUPS)))])
+    at, like, phase = _MOMENTS[int(rng.integers(len(_MOMENTS)))]
+    where = {'at': at, 'like': like, 'phase': phase}
+    angle, opening = _round(rng.uniform(0.2, 0.7)), _round(rng.uniform(0.2, 0.7))
+    match int(rng.integers(6)):
+        case 0 | 1:
+            by = f'{", ".join(group)} are {far:g} m off, {way}'
+            return {'edit': {'phases': group, 'by': {way: [0.0, far]}}}, by
+        case 2:
+            turn = str(rng.choice(['lean', 'yaw']))
+            text = f'{turn} of {", ".join(group)} is {angle:g} rad off'
+            change = {'add': [0.0, angle], 'side': 'drawn'}
+            return {'edit': {'phases': group, turn: change}}, text
+        case 3:
+            text = f'the gripper is at least {opening:g} open at {", ".join(group)}'
+            return {'edit': {'phases': group, 'opening': {'least': [0.0, opening]}}}, text
+        case 4:
+            row = {'by': {way: [0.0, far]}, 'opening': float(rng.integers(2))}
+            options = {**where, 'seconds': None, 'rows': [row, {}]}
+            return {'insert': options}, f'{at}, it goes {far:g} m aside, {way}, and back'
+        case _:
+            seconds = _round(rng.uniform(0.15, 0.3))
+            rows = [{'by': {'drawn': [0.0, sign * far]}} for sign in (1, -1, 1)]
+            options = {**where, 'seconds': seconds, 'rows': [*rows, {}]}
+            return {'insert': options}, f'{at}, it goes to and fro by {far:g} m'
+
+
+def _command(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
+    """A step that changes commands, and what it is in words."""
+    name, options, (least, most) = _COMMANDS[int(rng.integers(len(_COMMANDS)))]
+    typical = _round(rng.uniform(least, most))
+    of = ' '.join(str(v) for v in options.values() if isinstance(v, str))
+    step = {name: {**options, 'scale': typical}}
+    return step, f'{name} {of}'.strip() + f' by {typical:g}'
+
+
+def _round(value: float) -> float:
+    return float(f'{value:.2g}')

@@ -1,0 +1,144 @@
+"""What a second arm does in a move of another one: a visit to a place, at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.bench.expert.faults.edits import changed, made_of, Move
+from mtv_world_ros.bench.expert.faults.surroundings import FLAT, UP
+from mtv_world_ros.bench.expert.way_points import Draws, Stops, WayPoint
+from mtv_world_ros.data_types import FloatArray
+
+#: shortest stay where it waits for the other one [s]
+_STAYS_S = 0.4
+#: a second arm roams: standard deviation of how far off objects, how low at least, and how high
+#: it comes and leaves [m]
+_BESIDE_M, _LEAST_M, _ROAM_RISE_M = 0.04, 0.02, 0.07
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Visit:
+    """What a second arm does meanwhile.
+
+    Attributes:
+        ways: its way points up to where it rests, by the share of the way there that it goes.
+        share: of the way; it goes less far where it does not reach so far.
+        meets: time from the begin of the move, before scaling [s].
+        done: number of its way points that are done then.
+        waits: the first arm waits at its first way point if the second one takes longer.
+        is_timed: by a way point of the first arm.
+    """
+
+    ways: Callable[[float], Stops]
+    share: float
+    meets: float
+    done: int
+    waits: bool = False
+    is_timed: bool = True
+
+
+def visit_of(
+    spec: Mapping[str, Any],
+    stops: Stops,
+    size: float,
+    draws: Draws,
+    home: WayPoint,
+    times: Sequence[float],
+) -> Visit:
+    """Returns the visit that an entry of `config/faults` describes.
+
+    Args:
+        spec: `to`, a place by name; `share` of the way there (1); `level`: not so far in the
+            plane alone; `like`, a way point of the first arm that it is like (where it rests),
+            with changes; `rows` relative to it; `done` of them `before` or `after` a way point of
+            the first arm, or `after` some of its way points, or `late` [s]. Or `roams`, or
+            `follows`.
+        stops: way points of the first arm.
+        size: of the fault.
+        draws: what is drawn for the move.
+        home: where the second arm rests.
+        times: of the first arm's way points, before scaling [s].
+    """
+    move = Move(stops, size, draws)
+    ways = partial(_rows_of, spec, stops, size, draws, home, times)
+    if spec.get('roams'):
+        ways = partial(_roaming, _roamed(round(size), draws), home)
+    elif spec.get('follows'):
+        ways = partial(_following, stops, home, times)
+    number = move.index(spec['before']) if 'before' in spec else spec.get('after', 0)
+    if isinstance(number, str):
+        number = move.index(number) + 1
+    return Visit(
+        ways=ways,
+        share=move.length(spec.get('share', 1.0)),
+        meets=sum(times[:number]) + spec.get('late', 0.0),
+        done=spec.get('done', 0),
+        waits=bool(spec.get('waits')),
+        is_timed=bool({'before', 'after'} & spec.keys()),
+    )
+
+
+def _rows_of(
+    spec: Mapping[str, Any],
+    stops: Stops,
+    size: float,
+    draws: Draws,
+    home: WayPoint,
+    times: Sequence[float],
+    share: float,
+) -> Stops:
+    move = Move(stops, size, draws)
+    place = move.place(spec['to'])
+    there = replace(home, phase='above', position=home.position + share * (place - home.position))
+    if spec.get('level'):
+        short = (1 - share) * (home.position - place) * FLAT
+        there = replace(there, position=place + short)
+    if 'like' in spec:
+        there = replace(move.stop(spec['like']), position=there.position)
+    move.there, move.home = there, home
+    move.there = changed(there, move, **spec.get('but', {}))
+    rows = []
+    for row in spec['rows']:
+        is_until = row.get('seconds') == 'meanwhile'
+        rows.append({**row, 'seconds': _between(move, times)} if is_until else row)
+    return [*made_of(move, rows, 'there', (1,), {}), home]
+
+
+def _between(move: Move, times: Sequence[float]) -> float:
+    """Time from where the first arm has closed until it is over its goal [s]."""
+    closed = move.index('close')
+    over = max(move.index('over'), closed)
+    return max(sum(times[closed + 1 : over + 1]), _STAYS_S)
+
+
+def _roamed(count: int, draws: Draws) -> list[FloatArray]:
+    """Places (3,) near objects [m], drawn."""
+    places, rng = list[FloatArray](), draws.play
+    for _ in range(count):
+        x, y, z = draws.objects[int(rng.integers(len(draws.objects)))]
+        beside = rng.normal(0.0, _BESIDE_M, 2)
+        places.append(np.array([x + beside[0], y + beside[1], max(z, _LEAST_M)]))
+    return places
+
+
+def _roaming(places: Sequence[FloatArray], home: WayPoint, share: float) -> Stops:
+    """Through places, low and open, a share of the way to each."""
+    low = []
+    for place in places:
+        begin = home.position * FLAT + place * UP
+        at = begin + share * (place - begin)
+        low.append(replace(home, phase='above', position=at))
+    rise = _ROAM_RISE_M * UP
+    return [low[0].moved(rise), *low, low[-1].moved(rise), home]
+
+
+def _following(stops: Stops, home: WayPoint, times: Sequence[float], share: float) -> Stops:
+    """To the same places at the same times, a share of the way to each in the plane."""
+    same = [replace(s, seconds=time) for s, time in zip(stops, times, strict=True)]
+    moved = [s.moved((1 - share) * (home.position - s.position) * FLAT) for s in same[:-1]]
+    return [*moved, replace(home, seconds=times[-1])]

@@ -1,0 +1,154 @@
+"""What the faults of a policy variant make of a move's way points and of a plan's commands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mtv_world_ros.bench.expert.faults.catalogue import FAULTS, PolicyVariant
+from mtv_world_ros.bench.expert.faults.commands import COMMANDS, Commands
+from mtv_world_ros.bench.expert.faults.edits import edited
+from mtv_world_ros.bench.expert.faults.second_arm import Visit, visit_of
+from mtv_world_ros.bench.expert.way_points import Draws, Stops, WayPoint
+from mtv_world_ros.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.errors import PolicyError
+from mtv_world_ros.geometry.robot.model import RobotModel
+
+#: way points of a move at most
+_MOST_STOPS = 40
+
+
+class WayPointFaults:
+    """The faults of a variant that change the way points of one move.
+
+    Which move, and to which side, is drawn from a generator of its own: siblings of a scene differ
+    by the kind and the size of their fault alone.
+
+    Args:
+        variant: whose faults.
+        rng: draws move and side.
+    """
+
+    def __init__(self, variant: PolicyVariant, rng: np.random.Generator) -> None:
+        # what a second arm does begins before all else
+        kinds = [(FAULTS[kind], size) for kind, size in variant.faults]
+        self._faults = sorted(kinds, key=lambda fault: bool(fault[0].second_arm))
+        self._move, self._angle = float(rng.uniform()), float(rng.uniform(0, 2 * np.pi))
+        self._sign = float(rng.choice((-1.0, 1.0)))
+        self._errors = rng.normal(size=(_MOST_STOPS, 3))
+        self._openings = rng.normal(size=_MOST_STOPS)
+        self._play = np.random.default_rng(rng.integers(2**32))
+
+    @property
+    def keeps_tempo(self) -> bool:
+        """Whether added way points take time of their own; else they share the move's."""
+        return any(fault.keeps_tempo for fault, _ in self._faults)
+
+    def move_of(self, num_moves: int) -> int:
+        """Returns the number of the move that goes wrong."""
+        return int(self._move * num_moves)
+
+    def draws(
+        self, yaw: float, objects: Sequence[FloatArray], other_home: FloatArray | None = None
+    ) -> Draws:
+        """Returns what is drawn for the move.
+
+        Args:
+            yaw: of its grasp [rad]; the fingers travel along it.
+            objects: (3,) centre of every object of the scene [m].
+            other_home: (3,) where another arm's tool rests [m].
+        """
+        return Draws(
+            yaw=yaw,
+            sign=self._sign,
+            angle=self._angle,
+            errors=self._errors,
+            openings=self._openings,
+            play=self._play,
+            objects=objects,
+            other_home=other_home,
+        )
+
+    def applied(self, stops: Stops, draws: Draws) -> Stops:
+        """Returns the way points of a move with all faults, in the catalogue's order."""
+        for fault, size in self._faults:
+            stops = edited(fault.edits, stops, size, draws)
+        return stops
+
+    def visits(
+        self, stops: Stops, draws: Draws, home: WayPoint, times: Sequence[float]
+    ) -> list[Visit]:
+        """Returns what a second arm does meanwhile.
+
+        Args:
+            stops: way points of the move, with its faults.
+            draws: what is drawn for it.
+            home: where the second arm rests.
+            times: of the way points, before scaling [s].
+        """
+        visits = (
+            visit_of(fault.second_arm, stops, size, draws, home, times)
+            for fault, size in self._faults
+            if fault.second_arm
+        )
+        return sorted(visits, key=lambda visit: (not visit.waits, not visit.is_timed, visit.meets))
+
+
+def with_faults(
+    plan: JointTrajectory, variant: PolicyVariant, robot: RobotModel, rng: np.random.Generator
+) -> JointTrajectory:
+    """Returns the plan (T, J) as a variant carries it out; joints stay within their limits.
+
+    Args:
+        plan: equally spaced.
+        variant: its faults of commands are applied.
+        robot: whose joints they are.
+        rng: draws the noise.
+
+    Raises:
+        PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
+            that has none.
+    """
+    refuse_robot(variant, robot)
+    commands = Commands(np.array(plan.positions), float(plan.times[1] - plan.times[0]), robot)
+    order = list(COMMANDS)
+    steps = [
+        (order.index(name), size * options.get('scale', 1.0), options)
+        for kind, size in variant.faults
+        for step in FAULTS[kind].commands
+        for name, options in step.items()
+    ]
+    for number, size, options in sorted(steps, key=lambda step: step[0]):
+        given = {key: value for key, value in options.items() if key != 'scale'}
+        commands = commands.at(COMMANDS[order[number]](commands, size, rng, **given))
+    return JointTrajectory(
+        joint_names=plan.joint_names,
+        times=commands.times,
+        positions=commands.positions,
+        velocities=np.gradient(commands.positions, commands.period, axis=0),
+    )
+
+
+def refuse_robot(variant: PolicyVariant, robot: RobotModel) -> None:
+    """Refuses faults that a robot cannot have.
+
+    Raises:
+        PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
+            that has none.
+    """
+    of_two, of_grippers = (
+        [name for name, kind in zip(dict(variant.sizes), variant.kinds, strict=True)
+         if need in FAULTS[kind].needs]
+        for need in ('two_arms', 'gripper')
+    )  # fmt: skip
+    if of_two and len(robot.tools) < 2:
+        raise PolicyError(
+            f"policy '{variant.name}': {', '.join(of_two)} takes two arms, robot '{robot.name}' "
+            f'has {len(robot.tools)}; leave it out'
+        )
+    if of_grippers and all(tool.gripper_joint is None for tool in robot.tools):
+        raise PolicyError(
+            f"policy '{variant.name}': {', '.join(of_grippers)} takes a gripper, robot "
+            f"'{robot.name}' has none; leave it out"
+        )

@@ -1,0 +1,80 @@
+"""`mtv-world imagine` says whether the policy succeeded, and why an episode failed."""
+
+import json
+
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.cli.imagine import episode_table
+from mtv_world_ros.files import share_path
+
+DEMO = share_path('resource', 'demo_episode')
+
+
+def run(out, policy, *more):
+    command = ['imagine', '--policy', str(policy), '--episodes', str(DEMO), '--out', str(out)]
+    return main([*command, *more])
+
+
+def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
+    """The first command of docs/policies.md; its chunks more than a grasp and a place."""
+    assert run(tmp_path, 'expert', '--max-chunks', '3') == 0
+    said = capsys.readouterr().out
+    assert 'success rate: 1 of 1 = 1.00' in said and f'mtv-world view {tmp_path}' in said
+    (episode,) = json.loads((tmp_path / 'episodes.json').read_text())
+    assert episode['verdict'] == 'success' and episode['success'] >= 0.75
+    assert episode['success_low'] <= episode['success'] <= episode['success_high']
+    assert 'foreseen motions succeed' in episode['reasons']
+    assert (tmp_path / 'episode_00000' / 'comparison.mp4').stat().st_size > 1000
+    assert main(['view', str(tmp_path), '--save', str(tmp_path / 'all.rrd')]) == 0
+
+
+def test_a_policy_that_fails_ends_with_1_and_its_reason_on_the_screen(
+    tmp_path, capsys, monkeypatch
+):
+    (tmp_path / 'failing_policy.py').write_text(
+        """
+class Failing:
+    name = 'failing'
+
+    def reset(self, *, seed):
+        pass
+
+    def act(self, observation, instruction):
+        raise ValueError('actions have shape (7,), expected (50, 14)')
+"""
+    )
+    (tmp_path / 'failing.yaml').write_text('kind: python\nfactory: failing_policy:Failing\n')
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert run(tmp_path / 'out', tmp_path / 'failing.yaml') == 1
+    printed = capsys.readouterr()
+    assert 'episode 0 failed: policy_failed: ' in printed.err
+    assert 'actions have shape (7,), expected (50, 14)' in printed.err
+    assert 'success rate: no verdict in 1 episodes' in printed.out
+
+
+def test_a_policy_server_that_is_down_is_named(tmp_path, capsys):
+    text = share_path('config', 'policies', 'openpi.yaml').read_text()
+    text = text.replace('localhost:8000', 'localhost:1').replace('timeout_s: 60.0', 'timeout_s: 1')
+    (tmp_path / 'down.yaml').write_text(text)
+    assert run(tmp_path / 'out', tmp_path / 'down.yaml') == 1
+    assert 'localhost:1' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('verdicts', 'said'),
+    [
+        # Wilson's intervals of 7 of 10 and 0 of 5, from R's binom.confint(method = 'wilson')
+        (['success'] * 7 + ['failure'] * 3, '7 of 10 = 0.70 [0.40 0.89]'),
+        (['failure'] * 5, '0 of 5 = 0.00 [0.00 0.43]'),
+        (['success', 'open', 'abstains'], '1 of 1 = 1.00 [0.21 1.00]; 2 without a verdict'),
+        (['abstains'], 'no verdict in 1 episodes'),
+    ],
+)
+def test_the_success_rate_has_wilsons_interval(verdicts, said):
+    row = {'episode': 0, 'how': 'done', 'num_chunks': 1, 'episode_s': 1.0, 'bag': 'b'}
+    row |= {'success': None, 'success_low': None, 'success_high': None, 'reasons': 'a; b'}
+    lines = episode_table([{**row, 'verdict': verdict} for verdict in verdicts])
+    assert said in lines[-1]
+    assert lines[2].strip() == 'a' and lines[3].strip() == 'b'

@@ -1,0 +1,69 @@
+"""The estimate on real frames, and the names at the door of the package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import subprocess
+import sys
+
+import pytest
+
+import mtv_world_ros
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.files import share_path
+
+
+@pytest.fixture(scope='module')
+def pipeline():
+    return mtv_world_ros.load_pipeline(segmenter='colour', num_threads=1)
+
+
+@pytest.fixture(scope='module')
+def recording(pipeline):
+    return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)
+
+
+def test_a_recorded_success_is_judged_as_one_and_its_beginning_is_not(pipeline, recording):
+    assert recording.outcome == 'success'
+    assert mtv_world_ros.judge(pipeline, recording).probability > 0.75
+    early = recording.times < 3.0  # the arm still carries the block
+    cut = replace(
+        recording,
+        times=recording.times[early],
+        frames=recording.frames[:, early],
+        positions=recording.positions[early],
+    )
+    assert mtv_world_ros.judge(pipeline, cut).probability < 0.5
+
+
+def test_a_recording_with_a_gap_is_refused(pipeline, recording):
+    times = recording.times.copy()
+    times[40:] += 2.0
+    with pytest.raises(EpisodeError, match='has a gap'):
+        mtv_world_ros.judge(pipeline, replace(recording, times=times))
+
+
+def test_what_the_robot_saw_at_a_frame_is_an_observation(recording):
+    seen = recording.observation(7)
+    assert seen.stamp_ns == recording.stamp_ns + round(float(recording.times[7]) * 1e9)
+    assert (seen.positions == recording.positions[7]).all()
+    assert tuple(camera.view for camera in seen.cameras) == ('low', 'high')
+
+
+def test_five_names_are_at_the_door_and_imported_when_they_are_asked_for():
+    assert sorted(mtv_world_ros.__all__) == [
+        'ImaginedEpisode', 'Pipeline', 'judge', 'load_pipeline', 'read_episode',
+    ]  # fmt: skip
+    assert {*mtv_world_ros.__all__} <= {*dir(mtv_world_ros)}
+    code = (
+        'import sys, mtv_world_ros\n'
+        "assert not [n for n in sys.modules if n.startswith('mtv_world_ros.')]\n"
+        "assert 'numpy' not in sys.modules\n"
+        'for name in mtv_world_ros.__all__: assert callable(getattr(mtv_world_ros, name)), name\n'
+        'from mtv_world_ros import *\n'
+        'assert judge is mtv_world_ros.judge\n'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True)
+    with pytest.raises(AttributeError, match="has no attribute 'juge'"):
+        _ = mtv_world_ros.juge
