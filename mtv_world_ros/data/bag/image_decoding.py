@@ -154,6 +154,11 @@ def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
     Raises:
         ObservationError: as `check_compressed`, or the file is damaged.
     """
+    mosaic = layout.partition(';')[0].strip()
+    if mosaic.startswith('bayer_') and mosaic in ENCODINGS:
+        image = _decode(layout, data, cv2.IMREAD_UNCHANGED)
+        if image.ndim == 2:  # image_transport compresses the mosaic as it is
+            return np.asarray(cv2.cvtColor(image, ENCODINGS[mosaic][1] or 0), np.uint8)
     if data[:4].tobytes() != _PNG:
         check_compressed(layout, data)
         return _check_jpeg(layout, data)

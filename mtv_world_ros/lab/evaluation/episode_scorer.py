@@ -45,7 +45,7 @@ STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class EvaluationJob:
     """One episode to score.
 
     Attributes:
@@ -114,7 +114,7 @@ class EpisodeScorer:
         self.pipeline = instruments.pipeline
         self._load = lru_cache(maxsize=2)(self._read)
 
-    def score(self, job: Job) -> EpisodeResult:
+    def score(self, job: EvaluationJob) -> EpisodeResult:
         """Imagines and scores an episode.
 
         Raises:
@@ -167,7 +167,7 @@ class EpisodeScorer:
         pipeline = self.pipeline
         return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
 
-    def _donor(self, job: Job) -> Recording | None:
+    def _donor(self, job: EvaluationJob) -> Recording | None:
         """The episode that lends its actions; None if there is none that can be read."""
         if job.donor is None or 'shuffled' not in self.config.actions:
             return None

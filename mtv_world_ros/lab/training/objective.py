@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from mtv_world_ros.lab.training.training_config import ObjectiveConfig
 
 
-class Draws:
+class NoiseDraws:
     """Random numbers per clip of a batch; they depend only on seed, step and clip number.
 
     Args:
@@ -62,7 +62,7 @@ class Loss(NamedTuple):
         return self.total / self.weight
 
 
-def draw_sigmas(draws: Draws, config: ObjectiveConfig) -> Tensor:
+def draw_sigmas(draws: NoiseDraws, config: ObjectiveConfig) -> Tensor:
     """Returns (B,) noise levels in (0, 1], shifted towards high noise.
 
     `sigma' = s * sigma / (1 + (s - 1) * sigma)` as in Wan's schedule.

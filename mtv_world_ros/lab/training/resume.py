@@ -16,7 +16,7 @@ from torch import Tensor
 from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
-from mtv_world_ros.lab.training.averaged_weights import Weights
+from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 
 #: folder of the state in that of the training
@@ -45,7 +45,10 @@ def disk_errors_named(folder: Path) -> Iterator[None]:
 
 
 def save_state(
-    folder: Path, weights: Weights, optimizer: torch.optim.Optimizer, card: Mapping[str, Any]
+    folder: Path,
+    weights: AveragedWeights,
+    optimizer: torch.optim.Optimizer,
+    card: Mapping[str, Any],
 ) -> None:
     """Replaces the state in `folder/state` atomically.
 
@@ -135,7 +138,7 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
         )
 
 
-def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer) -> None:
+def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Optimizer) -> None:
     """Loads the tensors of the saved state.
 
     Raises:

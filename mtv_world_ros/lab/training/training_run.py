@@ -427,7 +427,7 @@ _BEST = 'best.json'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
+class HeldOutScores:
     """Score of a checkpoint on held-out episodes.
 
     Attributes:
@@ -440,7 +440,7 @@ class Judged:
 
 
 #: scores the checkpoint in a folder at a step; injected, since training does not import evaluation
-Judge = Callable[[Path, int], Judged]
+Judge = Callable[[Path, int], HeldOutScores]
 
 
 class HeldOut:

@@ -45,7 +45,7 @@ _COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p', 'binning_x', 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class SensedScene:
     """An observation and where it came from.
 
     Attributes:
@@ -93,6 +93,8 @@ class ObservationBuffer:
             camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
         }
         self._received: dict[str, float] = {}
+        #: frame of the images of each view, as they came first
+        self._frames: dict[str, str] = {}
         self._joints: dict[str, deque[tuple[int, float]]] = {
             name: deque(maxlen=_NUM_SAMPLES) for name in joint_names
         }
@@ -157,6 +159,7 @@ class ObservationBuffer:
         """Forgets images and joint states (the clock jumped); camera infos stay."""
         for samples in (*self._images.values(), *self._joints.values()):
             samples.clear()
+        self._frames.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
         """Takes changed camera infos as the valid ones from now on.
@@ -168,6 +171,7 @@ class ObservationBuffer:
             Rejection: a new one is not calibrated.
         """
         self._intrinsics.accept(cameras)
+        self._frames.clear()
 
     def ages(self, now_ns: int) -> Mapping[str, float]:
         """Age [s] of the newest image of each view and of the oldest joint; NaN = none yet."""
@@ -200,7 +204,7 @@ class ObservationBuffer:
             said.append(f'no fresh joint_states of {", ".join(names)}')
         return said
 
-    def observe(self, now_ns: int) -> Scene:
+    def observe(self, now_ns: int) -> SensedScene:
         """Makes an observation of the newest images that belong together.
 
         Raises:
@@ -208,6 +212,7 @@ class ObservationBuffer:
         """
         limits = self._limits()
         images = self._pick_images(now_ns, limits)
+        self._check_frames([message.header.frame_id for _, message in images])
         stamp_ns = min(stamp for stamp, _ in images)
         shown = [image_messages.to_rgb(message) for _, message in images]
         size = _common_size(shown, self._size)
@@ -224,7 +229,20 @@ class ObservationBuffer:
             positions=self._positions(stamp_ns, now_ns, limits),
             stamp_ns=stamp_ns,
         )
-        return Scene(observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns)
+        return SensedScene(
+            observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns
+        )
+
+    def _check_frames(self, frames: Sequence[str]) -> None:
+        """Refuses images that come from another camera than those before, as after a swap."""
+        for view, frame in zip(self.views, frames, strict=True):
+            before = self._frames.setdefault(view, frame)
+            if frame != before:
+                raise Rejection(
+                    Reason.CAMERA_POSE_CHANGED,
+                    f"images of view '{view}' are in the frame '{frame}' now, before in "
+                    f"'{before}': was another camera connected? call ~/reset to accept it",
+                )
 
     def _posed(self, camera: CameraModel, image: Image | CompressedImage) -> CameraModel:
         """The camera with its pose at the image's time."""

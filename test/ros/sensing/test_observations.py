@@ -150,3 +150,18 @@ def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros
         assert refused.value.reason == reason
         add()
     assert buffer.observe(NOW).observation.stamp_ns == NOW
+
+
+def test_cameras_that_swap_their_views_are_refused_until_a_reset(make_buffer, ros):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    buffer.observe(NOW)
+    for view, other in (('low', 'high'), ('high', 'low')):
+        buffer.add_image(view, ros.make_image(other, NOW + MS))
+    with pytest.raises(Rejection, match="'high_optical_frame' now, before") as refused:
+        buffer.observe(NOW + MS)
+    assert refused.value.reason is Reason.CAMERA_POSE_CHANGED
+    buffer.accept_cameras(list(buffer._intrinsics._calibrated.values()))
+    buffer.observe(NOW + MS)

@@ -65,7 +65,7 @@ class Dot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
+class ChartLine:
     """Values over time, with a band around them where it is known.
 
     Attributes:
@@ -140,7 +140,7 @@ def _draw_dot(axes: Axes, row: int, dot: Dot) -> None:
 
 
 def line_chart(
-    title: str, lines: Sequence[Line], seconds: Sequence[float], y_label: str
+    title: str, lines: Sequence[ChartLine], seconds: Sequence[float], y_label: str
 ) -> Markup:
     """Returns values in [0, 1] over time.
 

@@ -57,7 +57,7 @@ ALL = Group()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
+class EvaluationSummary:
     """All episodes of one checkpoint.
 
     Attributes:
@@ -84,7 +84,7 @@ class Summary:
 
     def with_distances(
         self, distances: Mapping[tuple[str | None, str], Mapping[str, Estimate]]
-    ) -> Summary:
+    ) -> EvaluationSummary:
         """Returns the same with FID and FVD."""
         return replace(self, distances=distances)
 

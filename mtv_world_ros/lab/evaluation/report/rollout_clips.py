@@ -30,7 +30,7 @@ _CRFS = (24, 30, 36, 42)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Clip:
+class RolloutClip:
     """Files of one rollout.
 
     Attributes:
@@ -56,7 +56,7 @@ def make_clip(
     max_bytes: int,
     tile_width: int = _VIDEO_TILE,
     with_sheet: bool = True,
-) -> Clip:
+) -> RolloutClip:
     """Returns a rollout's video and contact sheet.
 
     Args:
@@ -72,7 +72,7 @@ def make_clip(
         video = encode_video(frames, rollout.fps, crf=crf)
         if len(video) <= max_bytes:
             break
-    return Clip(
+    return RolloutClip(
         video=video,
         num_frames=len(frames),
         width=frames.shape[2],

@@ -36,7 +36,7 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Batch:
+class ClipBatch:
     """Clips with their trajectory videos.
 
     Attributes:
@@ -65,7 +65,7 @@ class Batch:
     step: int = 0
     numbers: Sequence[int] = ()
 
-    def parts(self, count: int) -> Iterator[Batch]:
+    def parts(self, count: int) -> Iterator[ClipBatch]:
         """Yields its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
@@ -134,7 +134,7 @@ class BatchSource:
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None
-        self._ahead: tuple[int, Future[Batch]] | None = None
+        self._ahead: tuple[int, Future[ClipBatch]] | None = None
 
     @property
     def starts(self) -> list[tuple[Recording, np.ndarray]]:
@@ -146,7 +146,7 @@ class BatchSource:
         """Clips that can be cut."""
         return sum(len(starts) for _, starts in self._starts)
 
-    def batch(self, step: int) -> Batch:
+    def batch(self, step: int) -> ClipBatch:
         """Returns the batch of a step, and starts preparing the next one."""
         if self._ahead is not None and self._ahead[0] == step:
             result = self._ahead[1].result()
@@ -161,13 +161,13 @@ class BatchSource:
         if self._workers is not None:
             self._workers.close()
 
-    def _make(self, step: int) -> Batch:
+    def _make(self, step: int) -> ClipBatch:
         if self._workers is None:
             samples = [self._clip(step, number) for number in self._numbers]
         else:
             samples = self._workers.clips(step, self._numbers)
         encoded = [s.actions for s in samples if s.actions is not None]
-        return Batch(
+        return ClipBatch(
             step=step,
             numbers=self._numbers,
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
