@@ -142,7 +142,7 @@ class EpisodeMaker:
             )
         raise SimulatorError(
             f'{episode} was {"no clean miss" if job.miss else "no success"} in {len(attempts)} '
-            'attempts; see sim/expert/expert.py'
+            'attempts; see bench/expert/expert.py'
         )
 
     def boundary_search(self) -> BoundarySearch:
