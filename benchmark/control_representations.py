@@ -45,7 +45,7 @@ from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
 from mtv_world_ros.lab.evaluation.references import ACTIONS
 from mtv_world_ros.lab.evaluation.report.comparison import write_comparison
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
 from mtv_world_ros.lab.evaluation.report.tables import estimates_json
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.lab.training.training_config import (
@@ -145,7 +145,7 @@ def seconds_of(log: list[dict[str, Any]]) -> float:
     return sum(now for now, after in zip(seconds, [*seconds[1:], 0.0], strict=True) if after < now)
 
 
-def score_row(name: str, options: argparse.Namespace) -> Summary:
+def score_row(name: str, options: argparse.Namespace) -> EvaluationSummary:
     """Scores a row's checkpoint with all kinds of actions."""
     checkpoint = options.work / name / 'checkpoint'
     load = partial(

@@ -10,7 +10,7 @@ import numpy as np
 from page import table
 
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
 from mtv_world_ros.lab.evaluation.report.tables import cell
 
 
@@ -57,7 +57,7 @@ _ABOUT = (
 )
 
 
-def difference(one: Summary, other: Summary, seed: int) -> Estimate:
+def difference(one: EvaluationSummary, other: EvaluationSummary, seed: int) -> Estimate:
     """J moving of one minus that of the other, over the episodes that both scored."""
     means = [{r.episode: r.means(None)['j_moving'] for r in s.results} for s in (one, other)]
     shared = [means[0][name] - means[1][name] for name in means[0] if name in means[1]]
@@ -71,7 +71,7 @@ def difference(one: Summary, other: Summary, seed: int) -> Estimate:
     )
 
 
-def body(summaries: dict[str, Summary], rows: dict[str, Any], seed: int) -> str:
+def body(summaries: dict[str, EvaluationSummary], rows: dict[str, Any], seed: int) -> str:
     """The tables: a line per row and view, and the trajectory video against the others."""
     lines = []
     for name, summary in summaries.items():
@@ -129,7 +129,7 @@ def verdict(gaps: dict[str, Estimate]) -> str:
     )
 
 
-def budget(options: argparse.Namespace, rows: dict[str, Any], summary: Summary) -> str:
+def budget(options: argparse.Namespace, rows: dict[str, Any], summary: EvaluationSummary) -> str:
     """What every row was given."""
     trained = next(iter(rows.values()))['trained_on']
     changes = f', {" ".join(options.set)}' if options.set else ''

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from page import publish, table
 
-from mtv_world_ros.bench.collect.dataset_card import CARD_FILE, EpisodeEntry, read_entry, TASKS_SET
+from mtv_world_ros.bench.collect.dataset_card import CARD_FILE, CardEntry, read_entry, TASKS_SET
 from mtv_world_ros.bench.collect.dataset_readme import commands
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed
 from mtv_world_ros.bench.collect.episode_maker import CollectConfig
@@ -75,7 +75,7 @@ def _successes(task: str, seed: int, attempts: int) -> int:
 
 def _row(
     name: str,
-    entries: Sequence[EpisodeEntry],
+    entries: Sequence[CardEntry],
     measures: Sequence[EpisodeMeasures],
     others: str,
 ) -> list[str]:

@@ -32,10 +32,10 @@ from mtv_world_ros.assembly import assemble_segmenter, robot_path
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.training.clips.batches import Batch, BatchSource
+from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
 from mtv_world_ros.lab.training.clips.fit_actions import kept_actions, transformer_arguments
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.lab.training.objective import Draws
+from mtv_world_ros.lab.training.objective import NoiseDraws
 from mtv_world_ros.lab.training.trainer import batch_loss, Trainer
 from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.lab.training.training_run import load_recordings, spread
@@ -87,7 +87,7 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     return trainer, source
 
 
-def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[Batch], None]:
+def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[ClipBatch], None]:
     """A step as accelerate's own examples make it: automatic mixed precision, AdamW, EMA."""
     config, settings = trainer.config, trainer.config.optimizer
     half = dtype == torch.bfloat16
@@ -104,9 +104,9 @@ def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[Batch], None]:
     model, optimizer = accelerator.prepare(made, optimizer)
     averaged = EMAModel(model.parameters(), decay=settings.ema_decay)
 
-    def step(batch: Batch) -> None:
+    def step(batch: ClipBatch) -> None:
         for part in batch.parts(settings.accumulation):
-            draws = Draws(0, part.step, part.numbers)
+            draws = NoiseDraws(0, part.step, part.numbers)
             loss = batch_loss(model, trainer.encoders, part, config, draws, trainer.device)
             accelerator.backward(loss.mean / settings.accumulation)
         accelerator.clip_grad_norm_(model.parameters(), settings.max_grad_norm)

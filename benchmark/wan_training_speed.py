@@ -27,7 +27,7 @@ from wan_bench import Bench
 
 from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.training.base import Base
-from mtv_world_ros.lab.training.clips.batches import Batch
+from mtv_world_ros.lab.training.clips.batches import ClipBatch
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.lab.training.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.lab.training.trainer import Trainer
@@ -46,11 +46,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--threads', type=int, default=2)
 
 
-def random_clip(bench: Bench) -> Batch:
+def random_clip(bench: Bench) -> ClipBatch:
     """A clip of noise with everything that the preset shows of its past."""
     frames, settings = bench.frames, bench.config.history
     start, count = frames[:, :, 0], settings.num_frames
-    return Batch(
+    return ClipBatch(
         frames=frames,
         start_frame=start,
         trajectory=frames,

@@ -33,7 +33,7 @@ from mtv_world_ros.model.card import read_card
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import resize_frames
-from mtv_world_ros.vision.describers.scene_objects import SceneObject
+from mtv_world_ros.vision.describers.scene_objects import DescribedObject
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
@@ -752,7 +752,7 @@ def test_a_describer_is_asked_once_about_the_first_real_frame(
     class Describer:
         def describe(self, first_frame, instruction):
             shown.append((first_frame, instruction))
-            return (SceneObject(id='a', name='blue block'),)
+            return (DescribedObject(id='a', name='blue block'),)
 
     asking = replace(pipeline, describer=Describer())
     observed = ObservedEpisode(asking)

@@ -408,23 +408,6 @@ def _origin(recording: Recording) -> Origin | None:
     return Origin(recording.frames[:, 0], recording.positions[0], recording.object_poses[0])
 
 
-def chunk_of(clip: Clip, chunk: int, num_frames: int) -> Clip:
-    """Returns chunk number `chunk` of a clip of several, with the frame before it.
-
-    Its first position is the command that was due then, as in a rollout of chained chunks.
-    """
-    first = chunk * num_frames
-    window = slice(first, first + num_frames + 1)
-    return replace(
-        clip,
-        times=clip.times[: num_frames + 1],
-        frames=clip.frames[:, window],
-        object_ids=None if clip.object_ids is None else clip.object_ids[:, window],
-        positions=clip.positions[window],
-        object_poses=None if clip.object_poses is None else clip.object_poses[window],
-    )
-
-
 def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray:
     """(len(times), J) positions: measured at frame `start`, commanded after it.
 

@@ -15,7 +15,7 @@ _PREFIXES = ('model.diffusion_model.', 'diffusion_model.', 'model.', 'vae.', 'pi
 
 
 @dataclass(frozen=True, slots=True)
-class Take:
+class TakenTensor:
     """Where a tensor comes from: a source, or one of several equal parts of it along axis 0."""
 
     source: str
@@ -32,7 +32,7 @@ class KeyMap:
         unused: names that the model has no use for, and why.
     """
 
-    takes: dict[str, Take]
+    takes: dict[str, TakenTensor]
     unused: dict[str, str] = field(default_factory=dict)
 
 
@@ -45,7 +45,7 @@ def transformer_keys(names: Iterable[str]) -> KeyMap:
         ours = convert_wan_transformer_to_diffusers({name: name for name in bare})
     else:
         ours = {name: name for name in bare}
-    return KeyMap({new: Take(bare[old]) for new, old in ours.items()})
+    return KeyMap({new: TakenTensor(bare[old]) for new, old in ours.items()})
 
 
 def autoencoder_keys(names: Iterable[str]) -> KeyMap:
@@ -56,7 +56,7 @@ def autoencoder_keys(names: Iterable[str]) -> KeyMap:
     from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
 
     ours = convert_wan_vae_to_diffusers({n: n for n in bare}) if original else {n: n for n in bare}
-    return KeyMap({new: Take(bare[old]) for new, old in ours.items()})
+    return KeyMap({new: TakenTensor(bare[old]) for new, old in ours.items()})
 
 
 _UMT5 = {
@@ -76,20 +76,20 @@ _UMT5 = {
 def text_encoder_keys(names: Iterable[str]) -> KeyMap:
     """umT5's encoder, of Wan's or transformers' names."""
     bare = _without_prefix(names)
-    takes: dict[str, Take] = {}
+    takes: dict[str, TakenTensor] = {}
     unused: dict[str, str] = {}
     for name, source in bare.items():
         block = re.fullmatch(r'blocks\.(\d+)\.(.+)\.weight', name)
         if block and block[2] in _UMT5:
-            takes[f'encoder.block.{block[1]}.{_UMT5[block[2]]}.weight'] = Take(source)
+            takes[f'encoder.block.{block[1]}.{_UMT5[block[2]]}.weight'] = TakenTensor(source)
         elif name == 'encoder.embed_tokens.weight' and 'shared.weight' in bare:
             unused[source] = 'the same as shared.weight'
         elif name in ('token_embedding.weight', 'encoder.embed_tokens.weight'):
-            takes['shared.weight'] = Take(source)
+            takes['shared.weight'] = TakenTensor(source)
         elif name == 'norm.weight':
-            takes['encoder.final_layer_norm.weight'] = Take(source)
+            takes['encoder.final_layer_norm.weight'] = TakenTensor(source)
         else:
-            takes[name] = Take(source)
+            takes[name] = TakenTensor(source)
     return KeyMap(takes, unused)
 
 
@@ -122,31 +122,31 @@ _CLIP_UNUSED = {
 
 def image_encoder_keys(names: Iterable[str]) -> KeyMap:
     """CLIP's image side, of Wan's or transformers' names."""
-    takes: dict[str, Take] = {}
+    takes: dict[str, TakenTensor] = {}
     unused: dict[str, str] = {}
     for name, source in _without_prefix(names).items():
         reason = next((why for start, why in _CLIP_UNUSED.items() if name.startswith(start)), '')
         if reason:
             unused[source] = reason
         elif name in _CLIP_ONCE:
-            takes[_CLIP_ONCE[name]] = Take(source)
+            takes[_CLIP_ONCE[name]] = TakenTensor(source)
         else:
             takes |= _clip_layer(name, source)
     return KeyMap(takes, unused)
 
 
-def _clip_layer(name: str, source: str) -> dict[str, Take]:
+def _clip_layer(name: str, source: str) -> dict[str, TakenTensor]:
     layer = re.fullmatch(r'visual\.transformer\.(\d+)\.(.+)\.(weight|bias)', name)
     if not layer:
-        return {name.removeprefix('vision_model.'): Take(source)}
+        return {name.removeprefix('vision_model.'): TakenTensor(source)}
     index, module, kind = layer.groups()
     ours = f'encoder.layers.{index}'
     if module == 'attn.to_qkv':
         return {
-            f'{ours}.self_attn.{part}_proj.{kind}': Take(source, number, 3)
+            f'{ours}.self_attn.{part}_proj.{kind}': TakenTensor(source, number, 3)
             for number, part in enumerate('qkv')
         }
-    return {f'{ours}.{_CLIP.get(module, module)}.{kind}': Take(source)}
+    return {f'{ours}.{_CLIP.get(module, module)}.{kind}': TakenTensor(source)}
 
 
 def _without_prefix(names: Iterable[str]) -> dict[str, str]:

@@ -78,6 +78,10 @@ def _put(request: dict[str, Any], key: Key, value: Any) -> None:
     request[key[-1]] = value
 
 
+#: a server that does not close the connection is waited for this long [s]
+_GOODBYE_S = 1.0
+
+
 class OpenPiPolicy:
     """Asks the server.
 
@@ -141,6 +145,8 @@ class OpenPiPolicy:
                 compression=None,
                 max_size=limits().answer_bytes,
                 open_timeout=config.timeout_s,
+                # one that sends on and on does not say goodbye either
+                close_timeout=min(config.timeout_s, _GOODBYE_S),
                 # a server that thinks does not answer pings
                 ping_interval=None,
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,

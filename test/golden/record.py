@@ -145,6 +145,25 @@ def plans() -> dict[str, Any]:
     return found
 
 
+def kinds() -> dict[str, Any]:
+    """Every fault kind in one scene: seed, commands, mean and deviation of each joint, a row."""
+    import numpy as np
+
+    robots, make = module('assembly'), module('scripted_policy').scripted_policy
+    load = import_module(modules()['file']).load_robot
+    expert = module('expert').Expert(load(robots.robot_path('yam_bimanual')))
+    found: dict[str, Any] = {}
+    for name in _policies():
+        for seed in range(9):
+            plan = _plan(make, name, 'stack_blocks_two', seed, expert)
+            if not plan.startswith(b'refused'):
+                break
+        at = np.frombuffer(plan, '<i8').reshape(-1, len(expert.home)) / 1e6
+        rows = (at.mean(axis=0), at.std(axis=0), at[len(at) // 2])
+        found[name] = [seed, len(at), *(row.round(5).tolist() for row in rows)]
+    return found
+
+
 def _plan(make: Callable[..., Any], name: str, task: str, seed: int, expert: Any) -> bytes:
     import numpy as np
 
@@ -280,7 +299,7 @@ def train() -> dict[str, str]:
 
 SECTIONS: dict[str, Callable[[], dict[str, Any]]] = {
     'help': helps, 'schemas': schemas, 'node': node, 'replay': replay, 'collect': collect,
-    'evaluate': evaluate, 'rank': rank, 'train': train, 'plans': plans,
+    'evaluate': evaluate, 'rank': rank, 'train': train, 'plans': plans, 'kinds': kinds,
 }  # fmt: skip
 
 
@@ -293,6 +312,8 @@ def main() -> int:
     for name in arguments.only.split(','):
         path, found = HERE / f'{name}.json', SECTIONS[name]()
         text = json.dumps(found, indent=1, ensure_ascii=False) + '\n'
+        if name == 'kinds':  # a line each
+            text = json.dumps(found).replace('], "', '],\n "') + '\n'
         if not arguments.check:
             path.write_text(text)
             continue

@@ -58,8 +58,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--faults',
         metavar='KINDS',
-        help='random faulty policies: the fault kinds of a split (train, calibrate, test), or a '
-        'comma-separated list of kinds; keeps successes and failures alike',
+        help='random faulty policies: the fault kinds of a split (train, calibrate, test), '
+        'drawn:SEED, or a comma-separated list of kinds; keeps successes and failures alike',
     )
     parser.add_argument(
         '--siblings',

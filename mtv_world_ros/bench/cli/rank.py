@@ -30,7 +30,7 @@ from mtv_world_ros.errors import ConfigError, PolicyError
 if TYPE_CHECKING:
     from mtv_world_ros.bench.ranking.policy_list import ListedPolicy
     from mtv_world_ros.bench.ranking.rollout_jobs import Job
-    from mtv_world_ros.bench.ranking.run_jobs import Checkpoint
+    from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -202,9 +202,9 @@ def _names(arguments: argparse.Namespace) -> list[str]:
     return names
 
 
-def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoint:
+def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> RankedCheckpoint:
     from mtv_world_ros.assembly import load_pipeline
-    from mtv_world_ros.bench.ranking.run_jobs import Checkpoint
+    from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint
 
     make_pipeline = partial(
         load_pipeline,
@@ -214,7 +214,7 @@ def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> Checkpoi
         **pipeline_choices(arguments),
     )
     settings = _settings(arguments, name)
-    return Checkpoint(make_pipeline=make_pipeline, out=out, settings=settings)
+    return RankedCheckpoint(make_pipeline=make_pipeline, out=out, settings=settings)
 
 
 def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:

@@ -14,8 +14,8 @@ from tqdm import tqdm
 from mtv_world_ros.bench.collect.contact_sheet import contact_sheet, SHEET_FILE
 from mtv_world_ros.bench.collect.dataset_card import (
     card_of,
+    CardEntry,
     check_same_set,
-    EpisodeEntry,
     read_entries,
     read_entry,
     remove_leftovers,
@@ -25,7 +25,12 @@ from mtv_world_ros.bench.collect.dataset_card import (
     ZERO_SHOT_SET,
 )
 from mtv_world_ros.bench.collect.dataset_readme import write_readme
-from mtv_world_ros.bench.collect.episode_jobs import Job, jobs_of, NUM_MISSED, zero_shot_jobs
+from mtv_world_ros.bench.collect.episode_jobs import (
+    CollectJob,
+    jobs_of,
+    NUM_MISSED,
+    zero_shot_jobs,
+)
 from mtv_world_ros.bench.collect.episode_maker import (
     CollectConfig,
     EpisodeMaker,
@@ -64,7 +69,7 @@ def collect(
     failures_of_ten: int = NUM_MISSED,
     sheets: bool = False,
     progress: bool = True,
-) -> list[EpisodeEntry]:
+) -> list[CardEntry]:
     """Makes the missing episodes of a data set, its card and its contact sheet.
 
     The same arguments give the same episodes, whatever the number of workers; episodes that
@@ -116,7 +121,7 @@ def collect(
     return [data_set.entries[job.path.name] for job in jobs]
 
 
-def _maker(config: CollectConfig) -> Callable[[Job], Spent]:
+def _maker(config: CollectConfig) -> Callable[[CollectJob], Spent]:
     return EpisodeMaker(config).make
 
 
@@ -132,7 +137,7 @@ def _sibling_jobs(
     workers: int,
     config: CollectConfig,
     progress: bool,
-) -> list[Job]:
+) -> list[CollectJob]:
     scenes = [
         SceneJob(task=task.name, index=index, seed=seed)
         for index in range(num_scenes)
@@ -176,7 +181,7 @@ class _DataSet:
     """A data set's folder: its episodes, card and contact sheets."""
 
     def __init__(
-        self, out: Path, kind: str, seed: int, config: CollectConfig, jobs: Sequence[Job]
+        self, out: Path, kind: str, seed: int, config: CollectConfig, jobs: Sequence[CollectJob]
     ) -> None:
         self._out, self._kind, self._seed = out, kind, seed
         self._config = plain_config(config)
@@ -186,7 +191,7 @@ class _DataSet:
         self._write_card()
 
     def make(
-        self, jobs: Sequence[Job], workers: int, config: CollectConfig, *, progress: bool
+        self, jobs: Sequence[CollectJob], workers: int, config: CollectConfig, *, progress: bool
     ) -> None:
         """Makes the missing episodes."""
         missing = [job for job in jobs if job.path.name not in self.entries]
@@ -207,7 +212,7 @@ class _DataSet:
                 self._write_card()
             raise
 
-    def _show(self, bar: Any, jobs: Sequence[Job]) -> None:
+    def _show(self, bar: Any, jobs: Sequence[CollectJob]) -> None:
         names = [job.path.name for job in jobs]
         outcomes = [self.entries[name].outcome for name in names if name in self.entries]
         success = outcomes.count('success')

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mtv_world_ros.bench.collect.dataset_card import EpisodeEntry
+from mtv_world_ros.bench.collect.dataset_card import CardEntry
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import ByteArray
 
@@ -51,7 +51,7 @@ def titled(text: str, picture: ByteArray) -> ByteArray:
     return np.concatenate([line, picture])
 
 
-def _row(out: Path, pair: Sequence[EpisodeEntry | None], num_frames: int, width: int) -> ByteArray:
+def _row(out: Path, pair: Sequence[CardEntry | None], num_frames: int, width: int) -> ByteArray:
     """A success and a failure of one task side by side; a missing one leaves its place empty."""
     strips = [entry and film_strip(out / entry.name, num_frames, width) for entry in pair]
     shape = next(strip.shape for strip in strips if strip is not None)
@@ -67,10 +67,10 @@ def _row(out: Path, pair: Sequence[EpisodeEntry | None], num_frames: int, width:
 
 
 def _pairs(
-    entries: Iterable[EpisodeEntry], count: int
-) -> list[tuple[EpisodeEntry | None, EpisodeEntry | None]]:
+    entries: Iterable[CardEntry], count: int
+) -> list[tuple[CardEntry | None, CardEntry | None]]:
     """The first `count` successes and failures of every task and kind."""
-    groups: dict[tuple[str, str], dict[str, list[EpisodeEntry]]] = {}
+    groups: dict[tuple[str, str], dict[str, list[CardEntry]]] = {}
     for entry in sorted(entries, key=lambda entry: entry.name):
         group = groups.setdefault((entry.zero_shot or '', entry.task), {o: [] for o in OUTCOMES})
         group[entry.outcome].append(entry)
@@ -84,7 +84,7 @@ def _pairs(
 
 def contact_sheet(
     out: Path,
-    entries: Iterable[EpisodeEntry],
+    entries: Iterable[CardEntry],
     *,
     pairs: int = 1,
     num_frames: int = 6,

@@ -25,7 +25,7 @@ GO_ON = 'finished episodes are kept, so run the same command again once there is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EpisodeEntry:
+class CardEntry:
     """One episode of a data set, as its MCAP file describes it.
 
     Attributes:
@@ -59,7 +59,7 @@ class EpisodeEntry:
     scene: str = ''
 
 
-def read_entry(path: Path) -> EpisodeEntry:
+def read_entry(path: Path) -> CardEntry:
     """Returns the entry of a finished episode folder.
 
     Raises:
@@ -77,7 +77,7 @@ def read_entry(path: Path) -> EpisodeEntry:
         images = [i for i, c in summary.channels.items() if '/image_raw' in c.topic]
         spans = summary.statistics.message_start_time, summary.statistics.message_end_time
         index, zero_shot = int(described['index']), described.get('zero_shot')
-        return EpisodeEntry(
+        return CardEntry(
             name=path.name,
             task=described['task'],
             index=index,
@@ -99,7 +99,7 @@ def read_entry(path: Path) -> EpisodeEntry:
         ) from error
 
 
-def read_entries(out: Path, wanted: Collection[str]) -> dict[str, EpisodeEntry]:
+def read_entries(out: Path, wanted: Collection[str]) -> dict[str, CardEntry]:
     """Returns the finished episodes of a data set by name, also those that are not wanted now.
 
     Raises:
@@ -155,7 +155,7 @@ def remove_leftovers(out: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _counts(entries: Sequence[EpisodeEntry]) -> dict[str, Any]:
+def _counts(entries: Sequence[CardEntry]) -> dict[str, Any]:
     successes = [entry for entry in entries if entry.outcome == 'success']
     attempts = sum(entry.attempt + 1 for entry in successes)
     return {
@@ -169,13 +169,13 @@ def _counts(entries: Sequence[EpisodeEntry]) -> dict[str, Any]:
     }
 
 
-def _by(key: str, entries: Sequence[EpisodeEntry]) -> dict[str, Any]:
+def _by(key: str, entries: Sequence[CardEntry]) -> dict[str, Any]:
     values = dict.fromkeys(getattr(entry, key) for entry in entries)
     return {value: _counts([e for e in entries if getattr(e, key) == value]) for value in values}
 
 
 def card_of(
-    kind: str, seed: int, config: dict[str, Any], entries: Iterable[EpisodeEntry]
+    kind: str, seed: int, config: dict[str, Any], entries: Iterable[CardEntry]
 ) -> dict[str, Any]:
     """Returns the card as plain data, in the order of the episodes' names."""
     listed = sorted(entries, key=lambda entry: entry.name)

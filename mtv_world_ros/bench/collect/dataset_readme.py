@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.bench.collect.contact_sheet import SHEET_FILE
-from mtv_world_ros.bench.collect.dataset_card import EpisodeEntry, write_file, ZERO_SHOT_SET
+from mtv_world_ros.bench.collect.dataset_card import CardEntry, write_file, ZERO_SHOT_SET
 from mtv_world_ros.bench.collect.episode_maker import CollectConfig, plain_config
 from mtv_world_ros.bench.tasks.tasks import TASKS
 from mtv_world_ros.data.bag.reader import BagReader
@@ -54,7 +54,7 @@ def _counts(
     return Table(head=head, rows=rows)
 
 
-def commands(card: Mapping[str, Any], entries: Iterable[EpisodeEntry]) -> list[str]:
+def commands(card: Mapping[str, Any], entries: Iterable[CardEntry]) -> list[str]:
     """Returns the commands that make the data set again; several where tasks differ in number."""
     config = card['config']
     plain = plain_config(CollectConfig(robot=_robot(config)))
@@ -139,7 +139,7 @@ def _topics(path: Path) -> tuple[Table, dict[str, str]]:
     return Table(head=('topic', 'type', 'messages'), rows=rows), bag.metadata[METADATA_NAME]
 
 
-def _objects(entries: Iterable[EpisodeEntry]) -> Table:
+def _objects(entries: Iterable[CardEntry]) -> Table:
     """Nouns and colours of all objects, by how often they occur."""
     nouns: Counter[str] = Counter()
     colours: dict[str, set[str]] = {}
@@ -154,7 +154,7 @@ def _objects(entries: Iterable[EpisodeEntry]) -> Table:
     return Table(head=('object', 'times', 'colours'), rows=rows)
 
 
-def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> str:
+def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> str:
     """Returns the text of the card.
 
     Args:
@@ -188,6 +188,6 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) 
     )
 
 
-def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[EpisodeEntry]) -> None:
+def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> None:
     """Writes `README.md`, whole or not at all."""
     write_file(out / README_FILE, readme(out, card, entries).encode())

@@ -19,7 +19,7 @@ NUM_MISSED = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class CollectJob:
     """One episode to make.
 
     Attributes:
@@ -76,7 +76,7 @@ def jobs_of(
     out: Path,
     num_of_ten: int = NUM_MISSED,
     policies: Sequence[str] = (),
-) -> list[Job]:
+) -> list[CollectJob]:
     """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
 
     Args:
@@ -110,7 +110,7 @@ def jobs_of(
 
 def zero_shot_jobs(
     kinds: Sequence[str], tasks: Sequence[Task], num_episodes: int, seed: int, out: Path
-) -> list[Job]:
+) -> list[CollectJob]:
     """Returns `num_episodes` in all; kinds take turns, and within a kind its tasks do."""
     chosen = {kind: tasks_of(kind, tasks) for kind in kinds}
     jobs = []
@@ -128,9 +128,9 @@ def _job(
     out: Path,
     kind: str | None = None,
     num_of_ten: int = NUM_MISSED,
-) -> Job:
+) -> CollectJob:
     name = f'{task.name}_{index:05d}'
-    return Job(
+    return CollectJob(
         task=task.name,
         index=index,
         seed=seed,

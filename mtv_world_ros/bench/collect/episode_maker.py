@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.bench.collect.dataset_card import GO_ON
-from mtv_world_ros.bench.collect.episode_jobs import episode_seed, Job
+from mtv_world_ros.bench.collect.episode_jobs import CollectJob, episode_seed
 from mtv_world_ros.bench.collect.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.bench.collect.siblings import BoundarySearch
 from mtv_world_ros.bench.expert.expert import Expert, ExpertConfig
@@ -108,7 +108,7 @@ class EpisodeMaker:
         self._config = config
         self._expert = Expert(self._robot, config.expert, config.physics)
 
-    def make(self, job: Job) -> Spent:
+    def make(self, job: CollectJob) -> Spent:
         """Simulates attempts until one is as wanted, and writes it.
 
         Raises:
@@ -142,7 +142,7 @@ class EpisodeMaker:
             )
         raise SimulatorError(
             f'{episode} was {"no clean miss" if job.miss else "no success"} in {len(attempts)} '
-            'attempts; see sim/expert/expert.py'
+            'attempts; see bench/expert/expert.py'
         )
 
     def boundary_search(self) -> BoundarySearch:
@@ -157,7 +157,7 @@ class EpisodeMaker:
             self._expert, physics, self._config.kinds, self._config.siblings, record
         )
 
-    def _attempt(self, job: Job, seed: int) -> tuple[SimEpisode, Take | None]:
+    def _attempt(self, job: CollectJob, seed: int) -> tuple[SimEpisode, Take | None]:
         """The episode of a seed; no take where its scene or plan is impossible."""
         config = self._config
         task, randomization = variant(
@@ -183,14 +183,16 @@ class EpisodeMaker:
             physics=self._config.physics,
         )
 
-    def _policy(self, job: Job, seed: int) -> PolicyVariant | None:
+    def _policy(self, job: CollectJob, seed: int) -> PolicyVariant | None:
         """What acts in place of the expert."""
         if self._config.kinds and not self._config.siblings:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
             return draw_variant(self._config.kinds, rng)
         return parse_variant(job.policy) if job.policy else None
 
-    def _write(self, job: Job, sim: SimEpisode, take: Take, seed: int, attempt: int) -> float:
+    def _write(
+        self, job: CollectJob, sim: SimEpisode, take: Take, seed: int, attempt: int
+    ) -> float:
         started = time.perf_counter()
         extra = {'attempt': str(attempt), 'index': str(job.index), **dict(job.more)}
         if job.zero_shot is not None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.bench.collect.episode_jobs import episode_seed, Job
+from mtv_world_ros.bench.collect.episode_jobs import CollectJob, episode_seed
 from mtv_world_ros.bench.collect.record import RecordConfig, simulate
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, kind_named, PolicyVariant
@@ -270,10 +270,10 @@ def _read(path: Path) -> dict[str, SearchedScene]:
 
 def sibling_jobs(
     found: Mapping[str, SearchedScene], scenes: Sequence[SceneJob], out: Path
-) -> list[Job]:
+) -> list[CollectJob]:
     """Returns the episodes to make, scene by scene."""
     return [
-        Job(
+        CollectJob(
             task=scene.task,
             index=scene.index,
             seed=scene.seed,

@@ -23,7 +23,7 @@ FOLDER = 'rollouts'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Checkpoint:
+class RankedCheckpoint:
     """A checkpoint that imagines the rollouts.
 
     Attributes:
@@ -39,7 +39,7 @@ class Checkpoint:
 
 def run_jobs(
     jobs: Sequence[Job],
-    checkpoints: Sequence[Checkpoint],
+    checkpoints: Sequence[RankedCheckpoint],
     *,
     config: RolloutConfig,
     workers: int = 1,
@@ -94,7 +94,11 @@ class _Store:
     """
 
     def __init__(
-        self, checkpoint: Checkpoint, config: RolloutConfig, jobs: Sequence[Job], overwrite: bool
+        self,
+        checkpoint: RankedCheckpoint,
+        config: RolloutConfig,
+        jobs: Sequence[Job],
+        overwrite: bool,
     ) -> None:
         self._out = checkpoint.out
         self._settings = {

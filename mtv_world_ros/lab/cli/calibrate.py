@@ -27,7 +27,7 @@ from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
-    from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+    from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
     from mtv_world_ros.lab.evaluation.results import EpisodeResult
     from mtv_world_ros.success.calibration import HorizonCurve
 
@@ -136,7 +136,7 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
     check_free(folder / CALIBRATION, arguments.overwrite, 'checkpoint')
 
 
-def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summary]:
+def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
@@ -184,7 +184,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Summar
 
 
 def _horizon(
-    runs: Sequence[Sequence[EpisodeResult]], summary: Summary, made: dict[str, str]
+    runs: Sequence[Sequence[EpisodeResult]], summary: EvaluationSummary, made: dict[str, str]
 ) -> HorizonCurve | None:
     """J of the objects that move against the horizon; None = nothing moves."""
     from mtv_world_ros.lab.evaluation.metrics.horizon import curve

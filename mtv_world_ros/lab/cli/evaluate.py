@@ -30,7 +30,7 @@ from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
-    from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+    from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
     from mtv_world_ros.pipeline import Pipeline
 
 
@@ -220,7 +220,7 @@ def _slug(label: str) -> str:
 
 def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, truth: str, out: Path
-) -> Summary:
+) -> EvaluationSummary:
     from mtv_world_ros.assembly import asked_describer, fingerprint, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel

@@ -361,12 +361,12 @@ def make_judge(
     Args:
         paths: of the episodes.
         out: gets a folder per step, with `metrics.json` and an MP4 per episode.
-        device: where to imagine.
+        device: of the model.
         dtype: of the model.
         base: checkpoint that adapters are used on.
-        source: how the episodes are read; None = they are this package's own.
-        segmenter: what finds the objects.
-        describer: what names them; None = the episodes, else their instructions.
+        source: topics and robot of the episodes; None = this package's own format.
+        segmenter: finds the objects' masks.
+        describer: names the objects; None = the episodes, else their instructions.
     """
     import torch
 
@@ -376,10 +376,10 @@ def make_judge(
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.lab.evaluation.results import rollout_path
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
-    from mtv_world_ros.lab.training.training_run import Judged
+    from mtv_world_ros.lab.training.training_run import HeldOutScores
     from mtv_world_ros.model.lora import ADAPTER
 
-    def judge(checkpoint: Path, step: int) -> Judged:
+    def judge(checkpoint: Path, step: int) -> HeldOutScores:
         folder = out / f'{step:07d}'
         is_adapter = (checkpoint / ADAPTER).is_file()
         pipeline = load_pipeline(
@@ -409,7 +409,7 @@ def make_judge(
                 value = estimates[name].value if name in estimates else math.nan
                 if math.isfinite(value):
                     numbers[name + suffix] = round(value, 4)
-        return Judged(score=numbers.get('j_moving', math.nan), numbers=numbers)
+        return HeldOutScores(score=numbers.get('j_moving', math.nan), numbers=numbers)
 
     return judge
 

@@ -38,7 +38,7 @@ from mtv_world_ros.rendering.video import (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scored:
+class ScoredDemo:
     """Chunks beside the recording.
 
     Attributes:
@@ -94,7 +94,7 @@ def run_demo(
 
 def _score(
     recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
-) -> Scored:
+) -> ScoredDemo:
     segmenter = assemble_segmenter('colour')
     rows: list[ScoreRow] = []
     shown: list[tuple[np.ndarray, ...]] = []
@@ -118,7 +118,7 @@ def _score(
     comparison = Comparison(
         views=views, times=times, real=real, trajectory=trajectory, imagined=imagined
     )
-    return Scored(comparison=comparison, rows=tuple(rows))
+    return ScoredDemo(comparison=comparison, rows=tuple(rows))
 
 
 def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def _report(
-    recording: Recording, predictions: Predictions, scored: Scored, views: tuple[str, ...]
+    recording: Recording, predictions: Predictions, scored: ScoredDemo, views: tuple[str, ...]
 ) -> dict[str, Any]:
     reports = [chunk.report for chunk in predictions.chunks]
     sent = [r for r in predictions.reports if r.get('state') == 'published']
@@ -221,7 +221,7 @@ class RecordedChunk:
     """A chunk as a subscriber saw it.
 
     Attributes:
-        report: what `~/report` said of it, as text by key.
+        report: rows of `~/report`, as text by key.
         stamps_ns: (T,) predicted times.
         predicted: (V, T, H, W, 3) uint8 RGB.
         trajectory: (V, T, H, W, 3) uint8 RGB.

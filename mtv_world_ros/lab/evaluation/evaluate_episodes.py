@@ -17,7 +17,7 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.recording import described_objects
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.files import check_same_settings, plain, write_json
-from mtv_world_ros.lab.evaluation.episode_scorer import EpisodeScorer, Instruments, Job
+from mtv_world_ros.lab.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
 from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import (
     distances,
     feature_path,
@@ -28,7 +28,7 @@ from mtv_world_ros.lab.evaluation.metrics.frechet.features import clip_features,
 from mtv_world_ros.lab.evaluation.metrics.image_quality import image_quality
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.lab.evaluation.references import round_trip
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import Group, Summary
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.parallel import score_all, threads_each
@@ -70,7 +70,7 @@ def evaluate(
     describer: Describer | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
-) -> Summary:
+) -> EvaluationSummary:
     """Scores a pipeline and writes `metrics.json`, `rows.csv` and `tables.md`.
 
     Episodes that were scored before with the same settings are taken from `out/episodes`.
@@ -80,7 +80,7 @@ def evaluate(
         pipeline: imagines and segments.
         episode_paths: recorded episodes.
         out: folder for the results.
-        config: what is imagined and how it is scored.
+        config: stretches to imagine and scores to compute.
         name: identifies the checkpoint; only results of the same name are taken over, and none
             without a name.
         label: of its rows in tables that compare checkpoints.
@@ -116,7 +116,7 @@ def evaluate(
         reason = next(iter(failed.items()), ('', 'none was given'))
         raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
     results.sort(key=lambda result: result.episode)
-    summary = Summary(
+    summary = EvaluationSummary(
         name=name,
         label=label,
         spec=pipeline.spec,
@@ -139,13 +139,15 @@ def result_names(paths: Sequence[Path]) -> dict[Path, str]:
     }
 
 
-def make_jobs(paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int) -> list[Job]:
+def make_jobs(
+    paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int
+) -> list[EvaluationJob]:
     """Returns the episodes in an order in which each lends its actions to the next."""
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
     names = result_names(paths)
     return [
-        Job(
+        EvaluationJob(
             path=path,
             name=names[path],
             donor=shuffled[index - 1] if len(shuffled) > 1 else None,
@@ -190,7 +192,7 @@ def _progress(results: Sequence[EpisodeResult]) -> str:
 
 
 def _distances(
-    summary: Summary, out: Path, config: EvaluationConfig
+    summary: EvaluationSummary, out: Path, config: EvaluationConfig
 ) -> dict[tuple[str | None, str], dict[str, Estimate]]:
     """FID and FVD by (zero-shot set, view), the set None for all episodes."""
     if config.fid_weights is None and config.fvd_weights is None:
@@ -230,7 +232,9 @@ class _Run:
             'segmenter': pipeline.segmenter.name,
         }
 
-    def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, EpisodeResult | str]]:
+    def results(
+        self, jobs: Sequence[EvaluationJob]
+    ) -> Iterator[tuple[EvaluationJob, EpisodeResult | str]]:
         """Yields jobs with their result, or why there is none."""
         left = []
         for job in map(self._described, jobs):
@@ -250,7 +254,7 @@ class _Run:
             write_json(self._file(job), values)
             yield job, EpisodeResult.from_json(outcome)
 
-    def _described(self, job: Job) -> Job | tuple[Job, str]:
+    def _described(self, job: EvaluationJob) -> EvaluationJob | tuple[EvaluationJob, str]:
         """The episode with its objects named, or why they could not be."""
         if self.describer is None:
             return job
@@ -261,7 +265,9 @@ class _Run:
             return job, str(error)
         return replace(job, objects=found)
 
-    def _scored(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, dict[str, Any] | str]]:
+    def _scored(
+        self, jobs: Sequence[EvaluationJob]
+    ) -> Iterator[tuple[EvaluationJob, dict[str, Any] | str]]:
         if self.parallel is None or self.parallel.workers == 1:
             here = partial(make_scorer, lambda: self.pipeline, self.config, self.out)
             return score_all(jobs, here, 1, 1)
@@ -269,10 +275,10 @@ class _Run:
         workers = self.parallel.workers
         return score_all(jobs, there, workers, self.parallel.threads or threads_each(workers))
 
-    def _file(self, job: Job) -> Path:
+    def _file(self, job: EvaluationJob) -> Path:
         return self.out / 'episodes' / f'{job.name}.json'
 
-    def _settings_of(self, job: Job) -> dict[str, Any]:
+    def _settings_of(self, job: EvaluationJob) -> dict[str, Any]:
         return {
             **self.settings,
             'path': str(job.path),
@@ -281,7 +287,7 @@ class _Run:
             'objects': list(job.objects),
         }
 
-    def _stored(self, job: Job) -> EpisodeResult | None:
+    def _stored(self, job: EvaluationJob) -> EpisodeResult | None:
         """The result of an earlier run; None if it is of other settings or another version."""
         features = self.config.fid_weights or self.config.fvd_weights
         if not self.name or (features and not feature_path(self.out, job.name).is_file()):

@@ -10,7 +10,7 @@ from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
 
 
-class Weights:
+class AveragedWeights:
     """A transformer in the number format of forward and backward, with its trained parameters.
 
     Parameters without `requires_grad` stay unchanged and take no further memory.

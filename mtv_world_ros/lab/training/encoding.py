@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mtv_world_ros.lab.training.clips.batches import Batch
+from mtv_world_ros.lab.training.clips.batches import ClipBatch
 from mtv_world_ros.lab.training.objective import (
-    Draws,
     latent_weights,
+    NoiseDraws,
     pixel_weights,
     pooled_weights,
 )
@@ -83,7 +83,7 @@ class EncodedBatch:
 
 @torch.no_grad()
 def encode_batch(
-    encoders: Encoders, batch: Batch, objective: ObjectiveConfig, device: torch.device
+    encoders: Encoders, batch: ClipBatch, objective: ObjectiveConfig, device: torch.device
 ) -> EncodedBatch:
     """Returns a batch of clips in latents, on a device."""
     frames = batch.frames.to(device)
@@ -96,7 +96,7 @@ def encode_batch(
     )
 
 
-def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> Conditioning:
+def condition_batch(encoders: Encoders, batch: ClipBatch, device: torch.device) -> Conditioning:
     """Returns the conditioning of a batch."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
     if batch.actions is None:
@@ -114,7 +114,7 @@ def condition_batch(encoders: Encoders, batch: Batch, device: torch.device) -> C
 
 
 def _with_past(
-    encoders: Encoders, latents: Conditioning, batch: Batch, device: torch.device
+    encoders: Encoders, latents: Conditioning, batch: ClipBatch, device: torch.device
 ) -> Conditioning:
     """Adds anchor and history, in models that take them."""
     settings = encoders.history
@@ -136,7 +136,7 @@ def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor
 
 
 def drop_conditions(
-    conditioning: Conditioning, augment: AugmentConfig, draws: Draws
+    conditioning: Conditioning, augment: AugmentConfig, draws: NoiseDraws
 ) -> Conditioning:
     """Drops control, reference, start slot or CLIP tokens in random samples, each independently.
 

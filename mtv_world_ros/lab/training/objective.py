@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from mtv_world_ros.lab.training.training_config import ObjectiveConfig
 
 
-class Draws:
+class NoiseDraws:
     """Random numbers per clip of a batch; they depend only on seed, step and clip number.
 
     Args:
@@ -62,7 +62,7 @@ class Loss(NamedTuple):
         return self.total / self.weight
 
 
-def draw_sigmas(draws: Draws, config: ObjectiveConfig) -> Tensor:
+def draw_sigmas(draws: NoiseDraws, config: ObjectiveConfig) -> Tensor:
     """Returns (B,) noise levels in (0, 1], shifted towards high noise.
 
     `sigma' = s * sigma / (1 + (s - 1) * sigma)` as in Wan's schedule.
@@ -148,8 +148,8 @@ def sample_loss(
 
     Args:
         predicted: (B, V, C, T, h, w).
-        clean: the same shape.
-        weights: the same shape, positive.
+        clean: the clean latents, of the same shape.
+        weights: positive weights, of the same shape.
         delta: error from which on the Huber loss is linear; None = the squared error.
         by_sample: (B,) weights of samples; None = equal.
     """

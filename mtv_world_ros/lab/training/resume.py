@@ -16,7 +16,7 @@ from torch import Tensor
 from mtv_world_ros.bounded_input import check_finite, read_json
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
-from mtv_world_ros.lab.training.averaged_weights import Weights
+from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 
 #: folder of the state in that of the training
@@ -45,12 +45,15 @@ def disk_errors_named(folder: Path) -> Iterator[None]:
 
 
 def save_state(
-    folder: Path, weights: Weights, optimizer: torch.optim.Optimizer, card: Mapping[str, Any]
+    folder: Path,
+    weights: AveragedWeights,
+    optimizer: torch.optim.Optimizer,
+    card: Mapping[str, Any],
 ) -> None:
     """Replaces the state in `folder/state` atomically.
 
     Raises:
-        DiskError: it could not be written; the old state stays.
+        DiskError: the state could not be written; the old one stays.
     """
     tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
     tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
@@ -67,7 +70,7 @@ def read_card(folder: Path) -> dict[str, Any] | None:
     """Returns the metadata of the saved state; None if there is none.
 
     Raises:
-        TrainingError: it is damaged.
+        TrainingError: the state is damaged.
     """
     recover_folder(folder / STATE)
     file = folder / STATE / _CARD
@@ -94,7 +97,7 @@ def check_architecture(folder: Path, config: TrainingConfig) -> None:
     """Checks that a preset has the architecture of the state in a folder, if there is one.
 
     Raises:
-        TrainingError: it has another one; names the first difference.
+        TrainingError: the architectures differ; names the first difference.
     """
     held, mine = read_card(folder), architecture(config)
     if held is None or 'lora.rank' not in held:  # of a version that did not keep it
@@ -135,11 +138,11 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
         )
 
 
-def load_state(folder: Path, weights: Weights, optimizer: torch.optim.Optimizer) -> None:
+def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Optimizer) -> None:
     """Loads the tensors of the saved state.
 
     Raises:
-        TrainingError: it is damaged, or of another model.
+        TrainingError: the state is damaged, or of another model.
     """
     card, file = read_card(folder), folder / STATE / _TENSORS
     assert card is not None

@@ -15,9 +15,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.lab.training.averaged_weights import Weights
+from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.base import Base
-from mtv_world_ros.lab.training.clips.batches import Batch, BatchSource
+from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
 from mtv_world_ros.lab.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.lab.training.distributed import memory_errors_named, Processes
 from mtv_world_ros.lab.training.encoding import (
@@ -30,8 +30,8 @@ from mtv_world_ros.lab.training.latent_cache.latent_clips import CachedSource
 from mtv_world_ros.lab.training.objective import (
     add_noise,
     draw_sigmas,
-    Draws,
     Loss,
+    NoiseDraws,
     sample_loss,
     sigma_weights,
 )
@@ -102,7 +102,7 @@ class Trainer:
 
     Args:
         config: the preset.
-        folder: where state, logs and checkpoints go.
+        folder: of state, logs and checkpoints.
         seed: of weights, noise and batches.
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
@@ -144,7 +144,7 @@ class Trainer:
         check_history(config.history, self.encoders.autoencoder, transformer.config)
         if settings.gradient_checkpointing:
             transformer.enable_gradient_checkpointing()
-        self.weights = Weights(transformer, self.device, dtype, settings.ema_decay)
+        self.weights = AveragedWeights(transformer, self.device, dtype, settings.ema_decay)
         self.optimizer = torch.optim.AdamW(
             self.weights.parameters,
             lr=settings.learning_rate,
@@ -243,13 +243,13 @@ class Trainer:
                 on_save(self.step)
                 saved = time.monotonic()
 
-    def loss(self, batch: Batch | EncodedBatch) -> Loss:
+    def loss(self, batch: ClipBatch | EncodedBatch) -> Loss:
         """The loss of a batch, or of a part of one."""
-        draws = Draws(self.seed, batch.step, batch.numbers)
+        draws = NoiseDraws(self.seed, batch.step, batch.numbers)
         worker = self.weights.worker
         return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
 
-    def gradients(self, batch: Batch | EncodedBatch) -> float:
+    def gradients(self, batch: ClipBatch | EncodedBatch) -> float:
         """Leaves the gradients of a step in the float32 weights and returns the step's loss.
 
         Args:
@@ -277,7 +277,7 @@ class Trainer:
         torch._foreach_div_(found, weight)
         return total / weight
 
-    def train_step(self, batch: Batch | EncodedBatch) -> StepReport:
+    def train_step(self, batch: ClipBatch | EncodedBatch) -> StepReport:
         """Makes a step with this process's part of its clips."""
         loss = self.gradients(batch)
         settings, parameters = self.config.optimizer, self.weights.parameters
@@ -315,7 +315,7 @@ class Trainer:
         """Continues from the saved state; returns whether there was one.
 
         Raises:
-            TrainingError: it is damaged, or of another model, seed, control or base.
+            TrainingError: the state is damaged, or of another model, seed, control or base.
         """
         card = read_card(self.folder)
         if card is None:
@@ -350,7 +350,7 @@ class Trainer:
 
 
 def export_adapter(
-    folder: Path, weights: Weights, card: CheckpointCard, base: Base | None
+    folder: Path, weights: AveragedWeights, card: CheckpointCard, base: Base | None
 ) -> None:
     """Writes the averaged adapter in float32, with the weights trained beside it and its card."""
     save_adapter(weights.worker, folder, weights=weights.averages(), card=_with_text(card, base))
@@ -358,7 +358,7 @@ def export_adapter(
 
 def export_checkpoint(
     folder: Path,
-    weights: Weights,
+    weights: AveragedWeights,
     card: CheckpointCard,
     base: Base | None,
     config: TrainingConfig,
@@ -392,9 +392,9 @@ def _with_text(card: CheckpointCard, base: Base | None) -> CheckpointCard:
 def batch_loss(
     transformer: MultiViewWanTransformer,
     encoders: Encoders,
-    batch: Batch | EncodedBatch,
+    batch: ClipBatch | EncodedBatch,
     config: TrainingConfig,
-    draws: Draws,
+    draws: NoiseDraws,
     device: torch.device,
 ) -> Loss:
     """Returns the loss of a batch, as sums over its clips.
@@ -405,10 +405,10 @@ def batch_loss(
         batch: clips, or what a latent cache holds of them.
         config: the preset.
         draws: of its clips; noise levels, noise and what is dropped come from them.
-        device: where to compute.
+        device: of the computation.
     """
     objective, dtype = config.objective, transformer.dtype
-    if isinstance(batch, Batch):
+    if isinstance(batch, ClipBatch):
         batch = encode_batch(encoders, batch, objective, device)
     clean = batch.clean
     sigmas = draw_sigmas(draws, objective)
@@ -442,7 +442,7 @@ def batch_loss(
     return sample_loss(predicted, target, batch.weights, objective.huber_delta, by_sigma)
 
 
-def _kept(draws: Draws, config: TrainingConfig, device: torch.device) -> Tensor | None:
+def _kept(draws: NoiseDraws, config: TrainingConfig, device: torch.device) -> Tensor | None:
     """(B,) bool, False where a sample goes without its actions."""
     if config.video.control != EE_MLP:
         return None

@@ -70,7 +70,7 @@ def embed_reference(
     Args:
         transformer: its `ref_conv` (phi of the paper) is used.
         reference: (B, V, C, H, W) latents of the start image.
-        start_control: the same of the control frame 0.
+        start_control: latents of the control frame 0.
         anchor: the same of the rollout's first frame; None = the start image is the reference.
         temb: (B, D) embedding of the video's noise level.
     """
@@ -271,20 +271,27 @@ def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
 
     Args:
         time_proj: (B, 1, 6, D), or (B, 2, 6, D) of the video's and the history's noise level.
-        grid: which token is which.
+        grid: view, time, row and column of each token.
 
     Returns:
         (B, 6, D), or (B, S, 6, D). The reference shares the video's level, as in Wan.
     """
     if not grid.num_history:
         return time_proj[:, 0]
-    batch, views, frames, height, width, _ = grid.tokens.shape
+    height, width = grid.tokens.shape[3:5]
+    return by_run(time_proj, grid).repeat_interleave(height * width, dim=1)
+
+
+def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
+    """Returns the same, (B, R, 6, D), of R runs of tokens: one of all, or the V * F frames."""
+    if not grid.num_history:
+        return time_proj
+    views, frames = grid.tokens.shape[1:3]
     parts = [
         time_proj[:, 1:].expand(-1, grid.num_history, -1, -1),
         time_proj[:, :1].expand(-1, frames - grid.num_history, -1, -1),
     ]
-    rows = torch.cat(parts, dim=1)[:, None, :, None]
-    return rows.expand(batch, views, -1, height * width, -1, -1).flatten(1, 3)
+    return torch.cat(parts, dim=1).repeat(1, views, 1, 1)
 
 
 def fit_context(context: Context, grid: TokenGrid) -> Context:

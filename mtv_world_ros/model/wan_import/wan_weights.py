@@ -257,7 +257,7 @@ def _taken(
     part: str,
     source: Path,
     tensors: Mapping[str, StoredTensor],
-    take: wan_keys.Take,
+    take: wan_keys.TakenTensor,
     shape: tuple[int, ...],
 ) -> StoredTensor:
     stored = tensors[take.source]

@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.ros.episodes.recorder_process import predicted_topics, Recording
+from mtv_world_ros.ros.episodes.recorder_process import predicted_topics, RecorderProcess
 from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded_start
 from mtv_world_ros.ros.messages.conversions import values_of
 from mtv_world_ros.ros.peers import Peers
@@ -56,7 +56,7 @@ class EpisodeRunner(Node):
         self._peers = Peers(self, self._spin_once)
         self._ended: dict[str, str] | None = None
         self._awaited = ''
-        self._recording = Recording(options.out, self._peers)
+        self._recording = RecorderProcess(options.out, self._peers)
         self._results: list[dict[str, Any]] = []
         policy_report = f'{options.policy_node}/report'
         self.create_subscription(DiagnosticArray, policy_report, self._on_report, 100)

@@ -23,7 +23,7 @@ def predicted_topics(world_model: str, views: Sequence[str]) -> list[str]:
     return topics + [f'{world_model}/{topic}' for topic in _TOPICS]
 
 
-class Recording:
+class RecorderProcess:
     """Starts and stops the recorder of episodes; however it is stopped, it closes its bag whole.
 
     Args:

@@ -14,7 +14,7 @@ from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.ros.bags.player import ENDS
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
-from mtv_world_ros.ros.policy.policy_thread import Actor, Answer
+from mtv_world_ros.ros.policy.policy_thread import Actor, PolicyAnswer
 from mtv_world_ros.ros.policy.predicted_frames import chunk_stamps, PredictedFrames
 
 #: ends of an episode that are no fault
@@ -197,7 +197,7 @@ class PolicyLoop:
         self._chunk = _Chunk(time.monotonic())
         self._ask('acting', lambda: policy.act(observation, instruction))
 
-    def _execute(self, answer: Answer) -> None:
+    def _execute(self, answer: PolicyAnswer) -> None:
         assert self._observation is not None
         if answer.trajectory is None:
             self.end('done')

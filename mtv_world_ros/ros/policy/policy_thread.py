@@ -17,7 +17,7 @@ _CLOSE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class PolicyAnswer:
     """What came of a question.
 
     Attributes:
@@ -45,7 +45,7 @@ class Actor:
         self._questions: SimpleQueue[tuple[int, Callable[[], JointTrajectory | None]] | None] = (
             SimpleQueue()
         )
-        self._answers: SimpleQueue[Answer] = SimpleQueue()
+        self._answers: SimpleQueue[PolicyAnswer] = SimpleQueue()
         # a daemon: what a policy does when the node ends is not known
         self._thread = Thread(target=self._run, name='policy', daemon=True)
         self._thread.start()
@@ -54,7 +54,7 @@ class Actor:
         """Asks after the questions before it."""
         self._questions.put((ticket, question))
 
-    def take(self) -> list[Answer]:
+    def take(self) -> list[PolicyAnswer]:
         """Returns the answers since the last call, in order."""
         return [self._answers.get() for _ in range(self._answers.qsize())]
 
@@ -74,6 +74,8 @@ class Actor:
             except Exception:  # a policy may be anybody's code
                 error = traceback.format_exc(limit=-3)
             seconds = time.monotonic() - begin
-            answer = Answer(ticket=ticket, trajectory=trajectory, error=error, seconds=seconds)
+            answer = PolicyAnswer(
+                ticket=ticket, trajectory=trajectory, error=error, seconds=seconds
+            )
             self._answers.put(answer)
             self._notify()

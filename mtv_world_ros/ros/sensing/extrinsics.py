@@ -24,7 +24,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header, NANO
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.qos_profiles import LATCHED
-from mtv_world_ros.ros.sensing.observations import Scene
+from mtv_world_ros.ros.sensing.observations import SensedScene
 
 Handler = Callable[[Any], None]
 
@@ -129,7 +129,7 @@ class Extrinsics:
         """For `/diagnostics`: where each view's pose comes from."""
         return {f'extrinsics.{view}': source for view, source in self._sources.items()}
 
-    def show(self, scene: Scene) -> None:
+    def show(self, scene: SensedScene) -> None:
         """Publishes the frames of a scene's views that TF lacks, so that viewers can place them.
 
         A camera whose frames TF has, but not where the whole camera is (drivers publish those

@@ -11,7 +11,7 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.extrinsics import Extrinsics
-from mtv_world_ros.ros.sensing.observations import Scene
+from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.ros.sensing.robot_description_topic import Handler, RobotDescription
 
 
@@ -64,7 +64,7 @@ class LiveRobot:
         described = {} if self._description is None else self._description.values()
         return {**described, **self._extrinsics.values()}
 
-    def show(self, scene: Scene) -> None:
+    def show(self, scene: SensedScene) -> None:
         """Publishes the frames of a scene's views that TF lacks."""
         self._extrinsics.show(scene)
 

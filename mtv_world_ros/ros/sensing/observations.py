@@ -45,7 +45,7 @@ _COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p', 'binning_x', 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class SensedScene:
     """An observation and where it came from.
 
     Attributes:
@@ -204,7 +204,7 @@ class ObservationBuffer:
             said.append(f'no fresh joint_states of {", ".join(names)}')
         return said
 
-    def observe(self, now_ns: int) -> Scene:
+    def observe(self, now_ns: int) -> SensedScene:
         """Makes an observation of the newest images that belong together.
 
         Raises:
@@ -229,7 +229,9 @@ class ObservationBuffer:
             positions=self._positions(stamp_ns, now_ns, limits),
             stamp_ns=stamp_ns,
         )
-        return Scene(observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns)
+        return SensedScene(
+            observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns
+        )
 
     def _check_frames(self, frames: Sequence[str]) -> None:
         """Refuses images that come from another camera than those before, as after a swap."""

@@ -74,7 +74,7 @@ class Fidelity:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scored:
+class ScoredChunk:
     """A chunk that was compared."""
 
     chunk: Chunk
@@ -105,7 +105,7 @@ class LiveFidelity:
         self,
         node: Node,
         pipeline: Pipeline,
-        on_scored: Callable[[Scored], None],
+        on_scored: Callable[[ScoredChunk], None],
         on_error: Callable[[Exception], None],
     ) -> None:
         self._pipeline, self._spec = pipeline, pipeline.spec
@@ -116,7 +116,7 @@ class LiveFidelity:
         self._expected: deque[Expected] = deque(maxlen=MAX_CHUNKS)
         self._frames = {view: deque(maxlen=MAX_FRAMES) for view in self._spec.views}
         self._seen: _SeenRollout | None = None
-        self._results: deque[Scored | Exception] = deque(maxlen=MAX_CHUNKS)
+        self._results: deque[ScoredChunk | Exception] = deque(maxlen=MAX_CHUNKS)
         self._kept: deque[float] = deque(maxlen=MAX_KEPT)
         self._num_missed, self._closing = 0, False
         self._publisher = create_publisher(node, Float32MultiArray, '~/fidelity', 10)
@@ -249,7 +249,7 @@ class LiveFidelity:
             copy=persistence_scores(found.start_masks.masks[:, :, 0], found.masks).objects,
             num_frames=len(indices),
         )
-        self._results.append(Scored(chunk=expected.chunk, fidelity=fidelity))
+        self._results.append(ScoredChunk(chunk=expected.chunk, fidelity=fidelity))
         self._done.trigger()
 
     def _real_episode(self, chunk: Chunk) -> ImaginedEpisode:

@@ -20,7 +20,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import create_publisher, status_name
-from mtv_world_ros.ros.world_model.live_fidelity import Scored
+from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
 from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
 
@@ -141,7 +141,7 @@ class Reporter:
         values['frames_published_total'] = counts['frames_published']
         self._publish_report('published', values)
 
-    def scored(self, scored: Scored) -> None:
+    def scored(self, scored: ScoredChunk) -> None:
         """Reports how a chunk compares with the real frames that came for it."""
         self._publish_report('fidelity', _fidelity_values(scored))
 
@@ -388,7 +388,7 @@ def _success_values(success: SuccessEstimate) -> dict[str, object]:
     }
 
 
-def _fidelity_values(scored: Scored) -> dict[str, object]:
+def _fidelity_values(scored: ScoredChunk) -> dict[str, object]:
     """Keys and values of a chunk whose real frames came."""
     prediction, found = scored.chunk.prediction, scored.fidelity
     values: dict[str, object] = {

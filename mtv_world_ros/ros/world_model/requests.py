@@ -16,7 +16,7 @@ from mtv_world_ros.ros.messages.conversions import to_trajectory
 from mtv_world_ros.ros.messages.rejection import Reason, refused_plan, rejected_as, Rejection
 from mtv_world_ros.ros.messages.stamps import to_ns
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
 from mtv_world_ros.ros.world_model.worker import from_observation, Request, TimeLimits
 
 #: measured joints may be beyond their limits by this, and by this share of their range
@@ -44,7 +44,7 @@ class RequestMaker:
         robot: RobotModel,
         buffer: ObservationBuffer,
         settings: Callable[[], Settings],
-        last_scene: Callable[[], Scene | None],
+        last_scene: Callable[[], SensedScene | None],
     ) -> None:
         self.robot, self._buffer = robot, buffer
         self._settings, self._last_scene = settings, last_scene
@@ -104,7 +104,7 @@ class RequestMaker:
         with rejected_as(Reason.JOINT_SPEEDS):
             check_plan(robot, whole, positions, tolerance=tolerance)
 
-    def _real_scene(self, now_ns: int) -> Scene:
+    def _real_scene(self, now_ns: int) -> SensedScene:
         if now_ns == 0:
             raise Rejection(
                 Reason.NO_CLOCK, "'use_sim_time' is set but nothing was received on /clock"

@@ -18,7 +18,7 @@ from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.messages.stamps import NANO
-from mtv_world_ros.ros.sensing.observations import Scene
+from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: a thread that is stuck in the model is not waited for longer than this at the end [s]
@@ -60,7 +60,7 @@ class Request:
     rollout: int
     trajectory: JointTrajectory
     stamp_ns: int
-    scene: Scene
+    scene: SensedScene
     imagine: bool
     instruction: str
     objects: tuple[str, ...]
@@ -78,7 +78,7 @@ class Chunk:
     """A predicted chunk of a request, the scene it started from, and when it was ready [s]."""
 
     request: Request
-    scene: Scene
+    scene: SensedScene
     prediction: Prediction
     ready_s: float
 
@@ -144,7 +144,7 @@ class RolloutWorker:
         self._abandoned = False
         self._closing = False
         self._episode: ImaginedEpisode | None = None
-        self._last: Scene | None = None
+        self._last: SensedScene | None = None
         self._results: deque[Result] = deque()
         #: when the thread last showed that it goes on [s]; None = it waits for work
         self._beat_s: float | None = None
@@ -189,7 +189,7 @@ class RolloutWorker:
         return current_thread() is not self._thread
 
     @property
-    def last_scene(self) -> Scene | None:
+    def last_scene(self) -> SensedScene | None:
         """The last predicted frames, from which imagine mode goes on; None = there are none."""
         with self._changed:
             return self._last
@@ -401,7 +401,7 @@ class RolloutWorker:
                 self._known.append(chunk)
                 self._put(chunk)
 
-    def _begin(self, request: Request) -> tuple[Scene, ImaginedEpisode]:
+    def _begin(self, request: Request) -> tuple[SensedScene, ImaginedEpisode]:
         """The scene to start from and its episode: the one that goes on, or a new one."""
         with self._changed:
             if request.imagine and self._episode is not None and self._last is not None:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.vision.colour_words import PALETTE
-from mtv_world_ros.vision.describers.scene_objects import check_objects, names_of, SceneObject
+from mtv_world_ros.vision.describers.scene_objects import check_objects, DescribedObject, names_of
 
 #: colour words that name an object although the colour segmenter cannot find it
 OTHER_COLOURS = frozenset({'black', 'white', 'grey', 'gray', 'brown', 'beige', 'silver', 'gold'})
@@ -24,7 +24,7 @@ _MAX_WORDS = 4
 class Describer(Protocol):
     """Names the objects of a scene."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns the objects; empty if there are none.
 
         Args:
@@ -40,7 +40,7 @@ class Describer(Protocol):
 class InstructionDescriber:
     """Names the objects that the instruction names by colour; looks at no image."""
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns what `objects_from_instruction` finds; no more than colours is known of it."""
         del first_frame
         names = objects_from_instruction(instruction)

@@ -13,7 +13,7 @@ from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.config import Count, expected, Schema
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
-from mtv_world_ros.vision.describers.vlm import Answer
+from mtv_world_ros.vision.describers.vlm import ChatAnswer
 
 
 class LocalVlmConfig(Schema):
@@ -65,7 +65,7 @@ class LocalVlm:
             digest.update(f'{file.name} {stat.st_size} {stat.st_mtime_ns}\n'.encode())
         return f'{self.config.model} ({digest.hexdigest()[:8]})'
 
-    def ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
+    def ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
         """Returns the most likely answer to the last turn; see `Chat`.
 
         Raises:
@@ -100,7 +100,7 @@ class LocalVlm:
             ) from error
         said = output[0, inputs['input_ids'].shape[1] :]
         text = self._processor.tokenizer.decode(said, skip_special_tokens=True)
-        return Answer(text, is_cut_off=len(said) >= limit)
+        return ChatAnswer(text, is_cut_off=len(said) >= limit)
 
 
 def _messages(frame: ByteArray, turns: Sequence[str]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from mtv_world_ros.config import read_yaml, Schema, validated
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
-from mtv_world_ros.vision.describers.scene_objects import check_objects, SceneObject
+from mtv_world_ros.vision.describers.scene_objects import check_objects, DescribedObject
 
 
 class ObjectList:
@@ -25,15 +25,15 @@ class ObjectList:
 
     def __init__(
         self,
-        by_instruction: Mapping[str, tuple[SceneObject, ...]],
-        others: tuple[SceneObject, ...] | None = None,
+        by_instruction: Mapping[str, tuple[DescribedObject, ...]],
+        others: tuple[DescribedObject, ...] | None = None,
         source: str = 'the object list',
     ) -> None:
         self.by_instruction = {_plain(key): value for key, value in by_instruction.items()}
         self.others = others
         self.source = source
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns the objects listed for the instruction.
 
         Raises:
@@ -52,14 +52,14 @@ class ObjectList:
         return found
 
 
-def _checked(items: Any, where: str = '') -> tuple[SceneObject, ...]:
+def _checked(items: Any, where: str = '') -> tuple[DescribedObject, ...]:
     try:
         return check_objects(items, complete=False)
     except DescriptionError as error:
         raise ValueError(f'{where}{error}') from error
 
 
-def _by_instruction(listed: Any) -> dict[str, tuple[SceneObject, ...]]:
+def _by_instruction(listed: Any) -> dict[str, tuple[DescribedObject, ...]]:
     if not isinstance(listed or {}, Mapping):
         raise ValueError("'instructions' has to map each instruction to its objects")
     return {

@@ -19,7 +19,7 @@ from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.config import expected, Positive, Schema
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, masked
-from mtv_world_ros.vision.describers.vlm import Answer, ANSWER_SCHEMA, excerpt
+from mtv_world_ros.vision.describers.vlm import ANSWER_SCHEMA, ChatAnswer, excerpt
 
 #: from the strictest to none; a server that refuses one is asked with the next
 _FORMATS: tuple[dict[str, Any] | None, ...] = (
@@ -80,7 +80,7 @@ class OpenAIChat:
         """The model and its server."""
         return f'{self.config.model} at {self.config.base_url}'
 
-    def ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
+    def ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
         """Returns the answer to the last turn; see `Chat`. No error quotes the key."""
         try:
             return self._ask(frame, turns)
@@ -90,7 +90,7 @@ class OpenAIChat:
                 raise
             raise DescriptionError(text, error.status) from None
 
-    def _ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
+    def _ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
         messages = _messages(frame, turns)
         for index in range(self._format, len(_FORMATS)):
             try:
@@ -147,7 +147,7 @@ class OpenAIChat:
             ) from error
         return bytes(body)
 
-    def _answer(self, body: bytes) -> Answer:
+    def _answer(self, body: bytes) -> ChatAnswer:
         """What a completion says; nothing is taken for granted about its form."""
         try:
             completion = parse_json(body, 'the answer')
@@ -166,7 +166,7 @@ class OpenAIChat:
                 "another model, or an object list (describer 'kind: list')",
                 'refused',
             )
-        return Answer(text, is_cut_off=reason == 'length')
+        return ChatAnswer(text, is_cut_off=reason == 'length')
 
     def _too_slow(self) -> DescriptionError:
         return DescriptionError(

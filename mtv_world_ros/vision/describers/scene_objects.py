@@ -19,7 +19,7 @@ Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SceneObject:
+class DescribedObject:
     """One object; what is None is not known.
 
     Attributes:
@@ -40,15 +40,15 @@ class SceneObject:
     box: Box | None = None
 
 
-KEYS = tuple(item.name for item in fields(SceneObject))
+KEYS = tuple(item.name for item in fields(DescribedObject))
 
 
-def names_of(objects: Iterable[SceneObject]) -> tuple[str, ...]:
+def names_of(objects: Iterable[DescribedObject]) -> tuple[str, ...]:
     """Returns the objects' names, in order."""
     return tuple(item.name for item in objects)
 
 
-def check_objects(items: Any, *, complete: bool) -> tuple[SceneObject, ...]:
+def check_objects(items: Any, *, complete: bool) -> tuple[DescribedObject, ...]:
     """Returns the objects that a list of plain values describes; an empty list is a valid answer.
 
     Args:
@@ -64,7 +64,7 @@ def check_objects(items: Any, *, complete: bool) -> tuple[SceneObject, ...]:
     problems: list[str] = []
     if len(items) > MAX_OBJECTS:
         problems.append(f'{len(items)} objects; at most {MAX_OBJECTS} are taken')
-    found: list[SceneObject] = []
+    found: list[DescribedObject] = []
     for index, given in enumerate(items):
         item: Any = {'name': given} if isinstance(given, str) and not complete else given
         where = f'objects[{index}]'
@@ -79,11 +79,11 @@ def check_objects(items: Any, *, complete: bool) -> tuple[SceneObject, ...]:
     return tuple(found)
 
 
-def _object(item: Mapping[str, Any], index: int) -> SceneObject:
+def _object(item: Mapping[str, Any], index: int) -> DescribedObject:
     values = {key: ' '.join(v.split()) if isinstance(v, str) else v for key, v in item.items()}
     box = values.get('box')
     values['box'] = tuple(map(float, box)) if box else None
-    return SceneObject(**{'id': f'object_{index + 1}', **values})
+    return DescribedObject(**{'id': f'object_{index + 1}', **values})
 
 
 def _problems(item: Any, complete: bool) -> list[str]:

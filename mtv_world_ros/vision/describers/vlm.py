@@ -16,9 +16,9 @@ from mtv_world_ros.files import write_whole
 from mtv_world_ros.vision.describers.scene_objects import (
     BOX_SCALE,
     check_objects,
+    DescribedObject,
     MAX_WORDS,
     ROLES,
-    SceneObject,
 )
 
 #: part of the cache's key: change it with every change of the texts or the schema below
@@ -86,7 +86,7 @@ def repair_request(problem: str) -> str:
     )
 
 
-def read_answer(text: str) -> tuple[SceneObject, ...]:
+def read_answer(text: str) -> tuple[DescribedObject, ...]:
     """Returns the objects of an answer; prose, a code fence or thoughts around the JSON are fine.
 
     Raises:
@@ -124,7 +124,7 @@ def excerpt(text: str, length: int = 160) -> str:
 _MAX_QUOTED = 4000
 
 
-class Answer(NamedTuple):
+class ChatAnswer(NamedTuple):
     """What a model said, and whether it was stopped by a token limit."""
 
     text: str
@@ -139,7 +139,7 @@ class Chat(Protocol):
         """Names the model; other weights or another server, another text."""
         ...
 
-    def ask(self, frame: ByteArray, turns: Sequence[str]) -> Answer:
+    def ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
         """Returns the answer to the last turn.
 
         Args:
@@ -164,7 +164,7 @@ class VlmDescriber:
         self.chat = chat
         self.cache = cache
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns the objects that the model sees; empty if it sees none.
 
         Raises:
@@ -180,7 +180,7 @@ class VlmDescriber:
             self.cache.put(key, kept, model)
         return kept
 
-    def _ask(self, frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def _ask(self, frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         asked = question(instruction)
         answer = self.chat.ask(frame, [asked])
         try:
@@ -199,7 +199,7 @@ class VlmDescriber:
             ) from error
 
 
-def _read(answer: Answer) -> tuple[SceneObject, ...]:
+def _read(answer: ChatAnswer) -> tuple[DescribedObject, ...]:
     try:
         return read_answer(answer.text)
     except DescriptionError as error:
@@ -226,7 +226,7 @@ class DescriptionCache:
         digest.update(frame.tobytes())
         return digest.hexdigest()
 
-    def get(self, key: str) -> tuple[SceneObject, ...] | None:
+    def get(self, key: str) -> tuple[DescribedObject, ...] | None:
         """Returns what was kept; None if there is nothing, or nothing that can be read."""
         try:
             kept = read_json(self._file(key))
@@ -234,7 +234,7 @@ class DescriptionCache:
         except (OSError, ValueError, KeyError, TypeError, DescriptionError):
             return None  # asked again, and written over
 
-    def put(self, key: str, objects: tuple[SceneObject, ...], model: str) -> None:
+    def put(self, key: str, objects: tuple[DescribedObject, ...], model: str) -> None:
         """Keeps a description; a reader sees the whole file or none.
 
         Raises:

@@ -15,8 +15,8 @@ from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.vision.colour_words import colour_of, PALETTE
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import (
+    ObjectTrack,
     part_of,
-    Track,
     track,
     TrackingConfig,
     with_part,
@@ -101,14 +101,14 @@ class ColourSegmenter:
         names: tuple[str, ...],
         firsts: BoolArray | None,
         out: BoolArray,
-    ) -> list[Track]:
+    ) -> list[ObjectTrack]:
         """Tracks of the named objects in (T, H, W, 3) frames of one view; `out` may take them."""
         images = self._look(frames, names)
-        tracks: list[Track] = []
+        tracks: list[ObjectTrack] = []
         for index, name in enumerate(names):
             word = colour_of(name)
             if word is None:
-                tracks.append(Track.missing(frames.shape[:3], 'out_of_palette'))
+                tracks.append(ObjectTrack.missing(frames.shape[:3], 'out_of_palette'))
                 continue
             rivals = [
                 i for i, other in enumerate(names) if colour_of(other) == word and i != index
@@ -118,7 +118,7 @@ class ColourSegmenter:
             pixels = self._pixels(images, word)
             found = track(pixels, first, _TRACKING, taken=others, out=out[index])
             if rivals and first is None and found.status == 'ok':
-                found = Track(masks=found.masks, status='ambiguous')
+                found = ObjectTrack(masks=found.masks, status='ambiguous')
             tracks.append(found)
         return [
             self._complete(tracks, index, name, firsts, images) for index, name in enumerate(names)
@@ -126,12 +126,12 @@ class ColourSegmenter:
 
     def _complete(
         self,
-        tracks: Sequence[Track],
+        tracks: Sequence[ObjectTrack],
         index: int,
         name: str,
         firsts: BoolArray | None,
         images: _Images,
-    ) -> Track:
+    ) -> ObjectTrack:
         """The track of an object with its part of another colour, where its noun has one."""
         word = part_of(name, colour_of(name))
         if word is None or not tracks[index].masks.any():
@@ -231,7 +231,7 @@ def _median(pixels: ByteArray) -> Floats:
     ])  # fmt: skip
 
 
-def _others(tracks: Sequence[Track], rivals: Sequence[int], index: int) -> BoolArray | None:
+def _others(tracks: Sequence[ObjectTrack], rivals: Sequence[int], index: int) -> BoolArray | None:
     """Pixels that objects of the same colour word, found before, already hold."""
     held = [tracks[i].masks for i in rivals if i < index]
     return np.any(held, axis=0) if held else None

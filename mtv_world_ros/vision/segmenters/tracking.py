@@ -52,7 +52,7 @@ class TrackingConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+class ObjectTrack:
     """One object in one view.
 
     Attributes:
@@ -64,9 +64,9 @@ class Track:
     status: str
 
     @staticmethod
-    def missing(shape: tuple[int, int, int], status: str) -> Track:
+    def missing(shape: tuple[int, int, int], status: str) -> ObjectTrack:
         """Returns empty masks with a reason."""
-        return Track(masks=np.zeros(shape, np.bool_), status=status)
+        return ObjectTrack(masks=np.zeros(shape, np.bool_), status=status)
 
 
 @dataclass(slots=True)
@@ -96,7 +96,7 @@ def track(
     config: TrackingConfig,
     taken: BoolArray | None = None,
     out: BoolArray | None = None,
-) -> Track:
+) -> ObjectTrack:
     """Follows one object through the pixels of its colour.
 
     Args:
@@ -116,7 +116,7 @@ def track(
         if not _find(_patch(frame), state, config, mask):
             state.gap += 1
     _doubt_whole(len(masks), state, config)
-    return Track(masks=masks, status=state.status)
+    return ObjectTrack(masks=masks, status=state.status)
 
 
 def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
@@ -303,12 +303,12 @@ def part_of(name: str, colour: str | None) -> str | None:
 
 
 def with_part(
-    found: Track,
+    found: ObjectTrack,
     pixels: BoolArray,
     others: Sequence[BoolArray],
     first: BoolArray | None,
     config: TrackingConfig,
-) -> Track:
+) -> ObjectTrack:
     """Adds the pieces of the part's colour that touch the main piece.
 
     Args:
@@ -335,4 +335,4 @@ def with_part(
     if status == 'ok':
         start = next((m for m in (first, *masks) if m is not None and m.any()), None)
         status = 'ok' if start is None else judge(masks, start, config)
-    return Track(masks=masks, status=status)
+    return ObjectTrack(masks=masks, status=status)

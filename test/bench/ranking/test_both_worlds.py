@@ -12,7 +12,7 @@ from mtv_world_ros.bench.ranking.ranking_summary import Summary
 from mtv_world_ros.bench.ranking.rollout_cards import curves, verdict, when_they_part, worst_first
 from mtv_world_ros.bench.ranking.rollout_jobs import Course, make_jobs, Result
 from mtv_world_ros.bench.ranking.rollout_runner import ComparisonRunner
-from mtv_world_ros.bench.ranking.run_jobs import Checkpoint, read_results, run_jobs
+from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
 from mtv_world_ros.data.stored_rollout import load_rollout
 from mtv_world_ros.rendering.video import decode_video
 
@@ -88,7 +88,7 @@ def ranked(runner, expert, tmp_path_factory):
             'mtv_world_ros.bench.ranking.run_jobs.make_runner',
             lambda make_pipelines, config: ComparisonRunner([runner]),
         )
-        checkpoint = Checkpoint(make_pipeline=lambda: runner.pipeline, out=out, settings={})
+        checkpoint = RankedCheckpoint(make_pipeline=lambda: runner.pipeline, out=out, settings={})
         run_jobs(jobs, [checkpoint], config=runner.config, show_progress=False)
     return out, {result.policy: result for result in read_results(out)}
 

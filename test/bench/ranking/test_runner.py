@@ -11,10 +11,10 @@ from mtv_world_ros.bench.ranking.rollout_runner import (
     RolloutRunner,
     WantedJob,
 )
-from mtv_world_ros.bench.ranking.run_jobs import Checkpoint, run_jobs
+from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint, run_jobs
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ConfigError, PolicyError, TrajectoryError
-from mtv_world_ros.vision.describers.scene_objects import SceneObject
+from mtv_world_ros.vision.describers.scene_objects import DescribedObject
 
 TASK = 'place_block_a2b_left'
 COLOURS = ('red', 'blue', 'green', 'purple')
@@ -111,7 +111,7 @@ def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, exp
     class Describer:
         def describe(self, first_frame, instruction):
             shown.append(first_frame)
-            return tuple(SceneObject(id=colour, name=f'{colour} block') for colour in COLOURS)
+            return tuple(DescribedObject(id=colour, name=f'{colour} block') for colour in COLOURS)
 
     (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
     asking = RolloutRunner(replace(runner.pipeline, describer=Describer()), runner.config)
@@ -153,7 +153,7 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
 
     def run(*names, overwrite=False):
         checkpoints = [
-            Checkpoint(
+            RankedCheckpoint(
                 make_pipeline=lambda: None, out=tmp_path / str(k), settings={'checkpoint': name}
             )
             for k, name in enumerate(names)
@@ -199,7 +199,7 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
         'mtv_world_ros.bench.ranking.run_jobs.make_runner', lambda make_pipeline, config: Failing()
     )
     jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
-    alone = Checkpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
+    alone = RankedCheckpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
     found, failed = run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False)
     assert [result.index for result in found[0]] == [1]
     assert failed == {jobs[0]: 'its server is gone'}

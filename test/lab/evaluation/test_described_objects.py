@@ -8,7 +8,7 @@ import pytest
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import DescriptionError
 from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.vision.describers.scene_objects import SceneObject
+from mtv_world_ros.vision.describers.scene_objects import DescribedObject
 
 
 class Reader:
@@ -17,11 +17,11 @@ class Reader:
     def __init__(self, *names: str, error: DescriptionError | None = None) -> None:
         self.names, self.error, self.shown = names, error, []
 
-    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[SceneObject, ...]:
+    def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         self.shown.append((first_frame, instruction))
         if self.error:
             raise self.error
-        return tuple(SceneObject(id=str(i), name=name) for i, name in enumerate(self.names, 1))
+        return tuple(DescribedObject(id=str(i), name=name) for i, name in enumerate(self.names, 1))
 
 
 def _names(out) -> set[str]:

@@ -18,7 +18,7 @@ from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.lab.importing.bags import convert_bag
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.sensing.observations import ObservationBuffer, Scene
+from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
 from mtv_world_ros.ros.world_model.requests import RequestMaker
 
 NUM = 25
@@ -125,7 +125,7 @@ def ask_node(case, robot):
         cameras=(), frames=np.zeros((0, 1, 1, 3), np.uint8),
         positions=np.array(list(HOME.values())), stamp_ns=START_NS,
     )  # fmt: skip
-    start = Scene(observation=seen, camera_infos=(), source_stamp_ns=START_NS)
+    start = SensedScene(observation=seen, camera_infos=(), source_stamp_ns=START_NS)
     buffer = ObservationBuffer(
         cameras=(), joint_names=robot.joint_names, width=96, height=72, limits=lambda: settings
     )

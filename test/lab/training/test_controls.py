@@ -17,7 +17,7 @@ from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.clips.fit_actions import fit_actions
-from mtv_world_ros.lab.training.objective import Draws, pooled_weights
+from mtv_world_ros.lab.training.objective import NoiseDraws, pooled_weights
 from mtv_world_ros.lab.training.trainer import _kept
 from mtv_world_ros.lab.training.training_config import (
     load_training_config,
@@ -185,7 +185,7 @@ def test_weights_bring_the_statistics_they_were_trained_with(
 
 
 def test_one_action_in_twenty_is_dropped_with_ee_mlp_alone(tiny: TrainingConfig) -> None:
-    draws = Draws(0, 0, range(4000))
+    draws = NoiseDraws(0, 0, range(4000))
     kept = _kept(draws, with_control(tiny, 'ee_mlp'), torch.device('cpu'))
     # three standard deviations of 4,000 draws
     assert 1 - kept.float().mean().item() == pytest.approx(0.05, abs=0.0104)

@@ -7,7 +7,7 @@ import torch
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.training.encoding import drop_conditions
-from mtv_world_ros.lab.training.objective import Draws
+from mtv_world_ros.lab.training.objective import NoiseDraws
 from mtv_world_ros.lab.training.training_config import AugmentConfig, ObjectiveConfig
 from mtv_world_ros.model.conditioning import Conditioning
 
@@ -32,7 +32,7 @@ def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
     augment = AugmentConfig(
         control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3, start_dropout=0.15
     )
-    out = drop_conditions(conditions(), augment, Draws(0, 0, range(COUNT)))
+    out = drop_conditions(conditions(), augment, NoiseDraws(0, 0, range(COUNT)))
     gone = {
         name: (getattr(out, name) == 0).flatten(1).all(1)
         for name in ('control', 'start_control', 'start', 'reference', 'image')
@@ -68,9 +68,9 @@ def test_the_start_image_is_in_one_place() -> None:
 
 
 def test_without_dropout_nothing_is_drawn() -> None:
-    draws = Draws(0, 0, range(COUNT))
+    draws = NoiseDraws(0, 0, range(COUNT))
     drop_conditions(conditions(), AugmentConfig(), draws)
-    assert torch.equal(draws.uniform(), Draws(0, 0, range(COUNT)).uniform())
+    assert torch.equal(draws.uniform(), NoiseDraws(0, 0, range(COUNT)).uniform())
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
-from mtv_world_ros.lab.training.training_run import HeldOut, Judged, train
+from mtv_world_ros.lab.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rendering.video import decode_video
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
@@ -23,9 +23,9 @@ def test_the_best_checkpoint_by_the_judge_is_kept(
 ) -> None:
     scores = {1: float('nan'), 2: 0.3, 3: 0.5, 4: 0.4}
 
-    def judge(checkpoint: Path, step: int) -> Judged:
+    def judge(checkpoint: Path, step: int) -> HeldOutScores:
         assert read_card(checkpoint).trained_on['steps'] == step
-        return Judged(score=scores[step], numbers={'j_moving': scores[step]})
+        return HeldOutScores(score=scores[step], numbers={'j_moving': scores[step]})
 
     train(
         TrainingRun(config=tiny, dataset=episode.parent, out=tmp_path),
@@ -91,4 +91,4 @@ def test_without_held_out_episodes_the_command_says_what_to_give(
 
 def test_a_negative_interval_is_refused() -> None:
     with pytest.raises(ConfigError, match='--sample-every is -1'):
-        HeldOut(lambda folder, step: Judged(score=0.0, numbers={}), -1)
+        HeldOut(lambda folder, step: HeldOutScores(score=0.0, numbers={}), -1)

@@ -10,8 +10,8 @@ import torch
 from mtv_world_ros.lab.training.objective import (
     add_noise,
     draw_sigmas,
-    Draws,
     latent_weights,
+    NoiseDraws,
     pixel_weights,
     sample_loss,
     sigma_weights,
@@ -25,7 +25,7 @@ CONFIG = ObjectiveConfig()
 def test_noise_levels_follow_wans_shift() -> None:
     """Without the share at full noise, the median of sigma' is s * .5 / (1 + (s - 1) * .5)."""
     config = ObjectiveConfig(full_noise_share=0.0, sigma_shift=5.0)
-    sigmas = draw_sigmas(Draws(0, 0, range(20_000)), config)
+    sigmas = draw_sigmas(NoiseDraws(0, 0, range(20_000)), config)
     assert sigmas.min() > 0
     assert sigmas.max() <= 1
     assert abs(sigmas.median().item() - 5 * 0.5 / 3) < 0.01

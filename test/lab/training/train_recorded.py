@@ -14,7 +14,7 @@ import torch
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.training.clips.batches import Batch
+from mtv_world_ros.lab.training.clips.batches import ClipBatch
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.lab.training.training_run import train
@@ -25,7 +25,7 @@ def record(out: Path) -> None:
     """Makes every trainer write down its first step."""
     computed = Trainer.gradients
 
-    def gradients(trainer: Trainer, batch: Batch) -> float:
+    def gradients(trainer: Trainer, batch: ClipBatch) -> float:
         loss = computed(trainer, batch)
         if trainer.step == 0:
             tensors = {f'gradient.{n}': p.grad for n, p in trainer.weights.master.items()}

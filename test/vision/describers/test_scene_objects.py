@@ -7,7 +7,7 @@ import json
 import pytest
 
 from mtv_world_ros.errors import DescriptionError
-from mtv_world_ros.vision.describers.scene_objects import check_objects, names_of, SceneObject
+from mtv_world_ros.vision.describers.scene_objects import check_objects, DescribedObject, names_of
 
 CUP = {
     'id': 'cup',
@@ -21,7 +21,7 @@ CUP = {
 
 def test_a_full_object_is_taken_as_it_is():
     (found,) = check_objects([CUP], complete=True)
-    assert found == SceneObject(**{**CUP, 'box': (0.0, 10.0, 1000.0, 20.0)})
+    assert found == DescribedObject(**{**CUP, 'box': (0.0, 10.0, 1000.0, 20.0)})
 
 
 def test_box_and_colour_may_be_unknown():

@@ -17,7 +17,7 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, DescriptionError
 from mtv_world_ros.vision.describers.openai_chat import OpenAIChat, OpenAIConfig, retry_after
-from mtv_world_ros.vision.describers.scene_objects import SceneObject
+from mtv_world_ros.vision.describers.scene_objects import DescribedObject
 from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber
 
 pytest.importorskip('openai')
@@ -66,7 +66,7 @@ def describer(server, cache=None, **options) -> VlmDescriber:
     return VlmDescriber(chat, None if cache is None else DescriptionCache(cache))
 
 
-def describe(server, **options) -> tuple[SceneObject, ...]:
+def describe(server, **options) -> tuple[DescribedObject, ...]:
     return describer(server, **options).describe(FRAME, INSTRUCTION)
 
 
@@ -84,7 +84,7 @@ def test_a_good_answer_becomes_objects():
     with ChatServer(GOOD) as server:
         found = describe(server)
     assert found == (
-        SceneObject(
+        DescribedObject(
             id='red_block',
             name='red block',
             colour='red',
@@ -92,7 +92,7 @@ def test_a_good_answer_becomes_objects():
             role='manipuland',
             box=(100.0, 200.5, 300.0, 400.0),
         ),
-        SceneObject(id='bowl', name='bowl', category='bowl', role='container'),
+        DescribedObject(id='bowl', name='bowl', category='bowl', role='container'),
     )
 
 

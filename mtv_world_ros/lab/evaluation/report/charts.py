@@ -65,7 +65,7 @@ class Dot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
+class ChartLine:
     """Values over time, with a band around them where it is known.
 
     Attributes:
@@ -140,15 +140,15 @@ def _draw_dot(axes: Axes, row: int, dot: Dot) -> None:
 
 
 def line_chart(
-    title: str, lines: Sequence[Line], seconds: Sequence[float], y_label: str
+    title: str, lines: Sequence[ChartLine], seconds: Sequence[float], y_label: str
 ) -> Markup:
     """Returns values in [0, 1] over time.
 
     Args:
         title: for those who cannot see it.
-        lines: what to draw; the last one on top.
+        lines: curves; the last one is drawn on top.
         seconds: time of each frame [s].
-        y_label: what the values are.
+        y_label: name and unit of the values.
     """
     height = 262
     with _axes(_WIDTH, height, left=34, right=8, top=22, bottom=40) as axes:

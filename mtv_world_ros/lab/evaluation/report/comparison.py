@@ -12,7 +12,7 @@ from mtv_world_ros.files import plain, write_json, write_whole
 from mtv_world_ros.lab.documents import Table
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, METHOD
 from mtv_world_ros.lab.evaluation.report import tables
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import Group, SEEN, Summary
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group, SEEN
 
 #: tasks beside each other in a table
 TASKS_PER_TABLE = 3
@@ -28,7 +28,7 @@ class Line(NamedTuple):
     """A row of the tables: a checkpoint on a set of episodes."""
 
     label: str
-    summary: Summary
+    summary: EvaluationSummary
     zero_shot: str | None
     held: bool = False
 
@@ -43,7 +43,7 @@ class Line(NamedTuple):
         return {'j_union': found['j_copy_union'], 'j_moving': found['j_copy_moving']}
 
 
-def lines(summaries: Sequence[Summary]) -> list[Line]:
+def lines(summaries: Sequence[EvaluationSummary]) -> list[Line]:
     """Returns a row per checkpoint, or per zero-shot set of each; the held first frame below.
 
     Where a data set has zero-shot episodes, the row with the plain label is that of the others.
@@ -61,12 +61,12 @@ def lines(summaries: Sequence[Summary]) -> list[Line]:
     return found
 
 
-def all_views(summaries: Sequence[Summary]) -> list[str]:
+def all_views(summaries: Sequence[EvaluationSummary]) -> list[str]:
     """Returns the names of all views, in the order in which they come first."""
     return list(dict.fromkeys(view for summary in summaries for view in summary.spec.views))
 
 
-def method_table(summaries: Sequence[Summary]) -> str:
+def method_table(summaries: Sequence[EvaluationSummary]) -> str:
     """Returns method by view: FID, FVD and J (the paper's table 1), and J of what moves."""
     views = all_views(summaries)
     columns = ('FID ↓', 'FVD ↓', 'J ↑', 'J moving ↑')
@@ -82,7 +82,7 @@ def method_table(summaries: Sequence[Summary]) -> str:
     return Table(head=head, rows=body).text()
 
 
-def task_tables(summaries: Sequence[Summary]) -> str:
+def task_tables(summaries: Sequence[EvaluationSummary]) -> str:
     """Returns method by task and view: J (the paper's table 3), a few tasks at a time."""
     views = all_views(summaries)
     tasks = sorted({task for summary in summaries for task in summary.tasks})
@@ -101,7 +101,7 @@ def task_tables(summaries: Sequence[Summary]) -> str:
     return '\n\n'.join(parts)
 
 
-def markdown(summaries: Sequence[Summary]) -> str:
+def markdown(summaries: Sequence[EvaluationSummary]) -> str:
     """Returns both tables with what they mean."""
     numbers = ', '.join(f'{s.label or s.name}: {len(s.results)} episodes' for s in summaries)
     failed = sum(len(summary.failed) for summary in summaries)
@@ -112,7 +112,7 @@ def markdown(summaries: Sequence[Summary]) -> str:
     )
 
 
-def as_csv(summaries: Sequence[Summary]) -> str:
+def as_csv(summaries: Sequence[EvaluationSummary]) -> str:
     """Returns every number with its interval: a line per method, set, task, view and number."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator='\n')
@@ -136,7 +136,7 @@ def _text(value: float) -> str:
     return '' if found is None else str(found)
 
 
-def write_comparison(summaries: Sequence[Summary], out: Path) -> str:
+def write_comparison(summaries: Sequence[EvaluationSummary], out: Path) -> str:
     """Writes `paper_tables.md` and `numbers.csv`; for several checkpoints `metrics.json` too.
 
     Returns:

@@ -16,7 +16,7 @@ from mtv_world_ros.lab.evaluation.metrics.scores import episode_means
 from mtv_world_ros.lab.evaluation.report.filters import Filter, filters
 from mtv_world_ros.lab.evaluation.report.headline import all_views, letter, mark
 from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, picks, ranked_by
-from mtv_world_ros.lab.evaluation.report.rollout_clips import Clip, make_clip
+from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip, RolloutClip
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 from mtv_world_ros.success.verdict import verdict
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -183,7 +183,7 @@ def _name(found: Evaluated, evaluations: Sequence[Evaluated]) -> str:
 
 def _clip(
     episode: str, found: Evaluated, is_picked: bool, budget: int
-) -> tuple[Clip | None, str] | None:
+) -> tuple[RolloutClip | None, str] | None:
     """An episode's video, or why there is none; None = the evaluation has no such episode."""
     if episode not in found.results:
         return None

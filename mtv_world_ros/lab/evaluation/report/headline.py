@@ -11,8 +11,9 @@ import numpy as np
 
 from mtv_world_ros.lab.documents import DASH, number, Table, with_interval
 from mtv_world_ros.lab.evaluation.metrics.horizon import curve
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import Following
 from mtv_world_ros.lab.evaluation.metrics.statistics import mean_interval, MIN_EPISODES
-from mtv_world_ros.lab.evaluation.report.charts import Dot, dot_chart, Line, line_chart
+from mtv_world_ros.lab.evaluation.report.charts import ChartLine, Dot, dot_chart, line_chart
 from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, ranked_by, scores
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
@@ -91,6 +92,11 @@ def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
     overall = [found.metrics['overall'] for found in evaluations]
     return {
         'words': words,
+        'follows': [
+            (mark(index, evaluations), Following(**found.metrics['follows_commands']).line)
+            for index, found in enumerate(evaluations)
+            if 'follows_commands' in found.metrics
+        ],
         'verdicts': [
             (mark(index, evaluations), _doubts(found), _few(found))
             for index, found in enumerate(evaluations)
@@ -246,7 +252,7 @@ def _seconds(evaluations: Sequence[Evaluated], count: int) -> list[float]:
     return [(k + 1) / evaluations[0].metrics['model']['fps'] for k in range(count)]
 
 
-def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line]:
+def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[ChartLine]:
     found = evaluations[index]
     rows = [result.rows for result in found.results.values()]
     clock = evaluations[0].metrics['model']['fps'] / found.metrics['model']['fps']
@@ -260,7 +266,7 @@ def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[Line
         with_band = len(evaluations) == 1 or not word
         band = _on_clock(drawn.band, clock) if with_band else ()
         lines.append(
-            Line(
+            ChartLine(
                 label=label,
                 values=values,
                 band=band,

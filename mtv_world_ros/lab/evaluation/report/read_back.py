@@ -24,7 +24,7 @@ class Evaluated:
     """What an evaluation left in its folder.
 
     Attributes:
-        folder: where.
+        folder: of the evaluation.
         metrics: metrics.json.
         results: scores by name of the episode.
     """
@@ -48,7 +48,7 @@ class Evaluated:
         """Returns the frames of a scored episode; None where they were not kept.
 
         Raises:
-            EpisodeError: they cannot be read.
+            EpisodeError: the frames cannot be read.
         """
         path = rollout_path(self.folder, episode)
         return load_rollout(path) if episode in self.results and path.is_file() else None
@@ -111,7 +111,7 @@ def _result(folder: Path, episode: str) -> EpisodeResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pick:
+class EpisodePick:
     """An episode worth looking at.
 
     Attributes:
@@ -150,7 +150,7 @@ def ranked_by(evaluations: Sequence[Evaluated]) -> tuple[str, str, dict[str, flo
     return words, key, means
 
 
-def picks(evaluations: Sequence[Evaluated]) -> list[Pick]:
+def picks(evaluations: Sequence[Evaluated]) -> list[EpisodePick]:
     """Returns the best, the median and the worst episode; see `ranked_by`."""
     means = ranked_by(evaluations)[2]
     ranked = sorted(means, key=lambda name: (-means[name], name))
@@ -158,6 +158,6 @@ def picks(evaluations: Sequence[Evaluated]) -> list[Pick]:
     if len(ranked) < 3:
         chosen = ({}, {0: 'The only one'}, {0: 'Best', 1: 'Worst'})[len(ranked)]
     return [
-        Pick(title=title, episode=ranked[place], score=means[ranked[place]])
+        EpisodePick(title=title, episode=ranked[place], score=means[ranked[place]])
         for place, title in chosen.items()
     ]

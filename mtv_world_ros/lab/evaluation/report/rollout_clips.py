@@ -30,7 +30,7 @@ _CRFS = (24, 30, 36, 42)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Clip:
+class RolloutClip:
     """Files of one rollout.
 
     Attributes:
@@ -56,11 +56,11 @@ def make_clip(
     max_bytes: int,
     tile_width: int = _VIDEO_TILE,
     with_sheet: bool = True,
-) -> Clip:
+) -> RolloutClip:
     """Returns a rollout's video and contact sheet.
 
     Args:
-        rollout: what to show.
+        rollout: frames and masks to show.
         max_bytes: the video's quality is lowered until it takes no more, down to a limit.
         tile_width: width up to which small frames are enlarged in the video [px].
         with_sheet: also make the contact sheet.
@@ -72,7 +72,7 @@ def make_clip(
         video = encode_video(frames, rollout.fps, crf=crf)
         if len(video) <= max_bytes:
             break
-    return Clip(
+    return RolloutClip(
         video=video,
         num_frames=len(frames),
         width=frames.shape[2],
@@ -100,7 +100,7 @@ def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
     found in them in the same colours, and the recorded ones in white.
 
     Args:
-        rollout: what to show.
+        rollout: frames and masks to show.
         tile_width: width up to which frames are enlarged, by whole factors [px].
     """
     factor = max(tile_width // rollout.real.shape[3], 1)

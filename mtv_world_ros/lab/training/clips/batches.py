@@ -36,7 +36,7 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Batch:
+class ClipBatch:
     """Clips with their trajectory videos.
 
     Attributes:
@@ -44,7 +44,7 @@ class Batch:
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
-        actions: what `ActionEncoding` gives, where they are not drawn.
+        actions: output of `ActionEncoding`, where actions are not drawn.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `past.py`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
@@ -65,7 +65,7 @@ class Batch:
     step: int = 0
     numbers: Sequence[int] = ()
 
-    def parts(self, count: int) -> Iterator[Batch]:
+    def parts(self, count: int) -> Iterator[ClipBatch]:
         """Yields its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
@@ -90,12 +90,12 @@ class BatchSource:
     """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
 
     Args:
-        recordings: where clips come from.
+        recordings: the clips are cut from them.
         config: views and times of clips, how they are drawn and disturbed, clips per step.
         robot: of the recordings.
         segmenter: finds the objects of the first frames.
         seed: of choice and disturbances.
-        actions: how positions become actions, where they are not drawn.
+        actions: encoding of positions as actions, where they are not drawn.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
     """
@@ -134,7 +134,7 @@ class BatchSource:
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None
-        self._ahead: tuple[int, Future[Batch]] | None = None
+        self._ahead: tuple[int, Future[ClipBatch]] | None = None
 
     @property
     def starts(self) -> list[tuple[Recording, np.ndarray]]:
@@ -146,7 +146,7 @@ class BatchSource:
         """Clips that can be cut."""
         return sum(len(starts) for _, starts in self._starts)
 
-    def batch(self, step: int) -> Batch:
+    def batch(self, step: int) -> ClipBatch:
         """Returns the batch of a step, and starts preparing the next one."""
         if self._ahead is not None and self._ahead[0] == step:
             result = self._ahead[1].result()
@@ -161,13 +161,13 @@ class BatchSource:
         if self._workers is not None:
             self._workers.close()
 
-    def _make(self, step: int) -> Batch:
+    def _make(self, step: int) -> ClipBatch:
         if self._workers is None:
             samples = [self._clip(step, number) for number in self._numbers]
         else:
             samples = self._workers.clips(step, self._numbers)
         encoded = [s.actions for s in samples if s.actions is not None]
-        return Batch(
+        return ClipBatch(
             step=step,
             numbers=self._numbers,
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),

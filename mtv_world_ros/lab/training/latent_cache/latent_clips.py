@@ -23,7 +23,7 @@ from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import content_digest
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.base import Base
-from mtv_world_ros.lab.training.clips.batches import Batch, BatchSource, pasts
+from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch, pasts
 from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.lab.training.clips.past import draw_past, history_before
 from mtv_world_ros.lab.training.distributed import Processes
@@ -127,7 +127,7 @@ def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[Cache
 
 def read_clip(
     clip: CachedClip, spec: WorldModelSpec, controls: ControlMaker, history: HistoryConfig
-) -> Batch:
+) -> ClipBatch:
     """Returns a clip as it was recorded, as a batch of one.
 
     Its anchor and history are drawn once, by its start.
@@ -144,7 +144,7 @@ def read_clip(
         rng = np.random.default_rng((_VERSION, clip.start))
         before = history_before(clip.recording, clip.start, spec, history, rng)
         past = draw_past(before, history, rng)
-    return Batch(
+    return ClipBatch(
         frames=frames,
         start_frame=start,
         trajectory=drawn,
@@ -171,7 +171,7 @@ class Build:
 def fill(
     cache: LatentCache,
     clips: Sequence[CachedClip],
-    read: Callable[[CachedClip], Batch],
+    read: Callable[[CachedClip], ClipBatch],
     encoders: Encoders,
     device: torch.device,
     dtype: torch.dtype,
@@ -183,8 +183,8 @@ def fill(
         clips: all clips of the training.
         read: gives a clip, undisturbed, as a batch of one.
         encoders: on the device.
-        device: where to encode.
-        dtype: that latents are kept in.
+        device: of the encoder.
+        dtype: of the stored latents.
 
     Raises:
         TrainingError: the disk is full, or will be before all clips are there.
@@ -214,7 +214,7 @@ def _check_space(root: Path, clip_bytes: int, count: int) -> None:
 
 @torch.no_grad()
 def _encode(
-    batch: Batch, encoders: Encoders, device: torch.device, dtype: torch.dtype
+    batch: ClipBatch, encoders: Encoders, device: torch.device, dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """The tensors of one clip, without the batch axis."""
     encoded = encode_batch(encoders, batch, ObjectiveConfig(), device)
@@ -229,7 +229,7 @@ def _encode(
     return held | {'shares': _shares(batch, encoded.clean.shape)[0]}
 
 
-def _shares(batch: Batch, shape: Sequence[int]) -> Tensor:
+def _shares(batch: ClipBatch, shape: Sequence[int]) -> Tensor:
     """(B, 3, V, F, h, w) uint8 shares of each latent that change, show an object, or lose one."""
     parts = []
     for name in WEIGHTS:
@@ -257,8 +257,8 @@ def cached(
         config: the preset.
         base: whose encoders are used.
         seed: of the clips' order.
-        dtype: that latents are kept in.
-        processes: that train together.
+        dtype: of the stored latents.
+        processes: the processes of the training.
 
     Raises:
         ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
@@ -344,9 +344,9 @@ class CachedSource:
         batch_size: clips of a step, over all processes.
         seed: of the order.
         numbers: the clips of a step that this process takes; None: all.
-        device: where batches go.
+        device: of the batches.
         controls: encodes actions that are not drawn.
-        spec: what the model takes and gives.
+        spec: sizes and rates of the model's inputs and outputs.
     """
 
     def __init__(

@@ -13,9 +13,9 @@ from mtv_world_ros.data.stored_rollout import load_rollout
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.evaluation.evaluate_episodes import DEFAULTS, evaluate
 from mtv_world_ros.lab.evaluation.report.charts import (
+    ChartLine,
     Dot,
     dot_chart,
-    Line,
     line_chart,
     Point,
     scatter_chart,
@@ -295,7 +295,7 @@ def test_dots_lie_on_their_axis():
 
 def test_line_lifts_the_pen_over_gaps():
     nan = float('nan')
-    line = Line(label='<J>', values=(0.0, 1.0, nan, 0.5), band=((0, 1),) * 4, colour='c0')
+    line = ChartLine(label='<J>', values=(0.0, 1.0, nan, 0.5), band=((0, 1),) * 4, colour='c0')
     chart = line_chart('t', [line], (1, 2, 3, 4), 'J')
     path = re.search(r'<title>&lt;J&gt;</title> <path d="([^"]*)"', chart)[1]
     assert [step[0] for step in re.findall(r'[ML] [\d. ]+', path)] == ['M', 'L', 'M']

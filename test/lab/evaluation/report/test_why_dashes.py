@@ -8,7 +8,7 @@ import pytest
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.lab.evaluation.metrics.scores import ScoreRow
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import Summary
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 
 NAN = float('nan')
@@ -32,7 +32,9 @@ def tables_of(*rows: ScoreRow) -> str:
     spec = WorldModelSpec(
         views=('low',), fps=5.0, num_frames=2, width=96, height=72, robot='crane'
     )
-    return Summary(name='x', spec=spec, settings={}, results=[result], failed={}).markdown()
+    return EvaluationSummary(
+        name='x', spec=spec, settings={}, results=[result], failed={}
+    ).markdown()
 
 
 @pytest.mark.parametrize(
