@@ -87,11 +87,11 @@ class Arms:
 
     Attributes:
         robot: the same, with inertias for all of its bodies.
-        notes: what was assumed of it, in words.
+        notes: assumptions about the robot, as text.
         drives: of its joints, with the numbers of free air.
 
     Raises:
-        RobotError: it cannot be a tree of bodies on a base that stands still.
+        RobotError: the robot is no tree of bodies on a fixed base.
     """
 
     def __init__(self, robot: RobotModel, response: ArmResponse | None) -> None:

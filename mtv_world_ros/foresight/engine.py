@@ -49,7 +49,7 @@ class BatchState:
 
     Attributes:
         physics: (K, N) of MuJoCo's full physics.
-        arms: as if they had touched nothing.
+        arms: state of the arms in free space, as if they had touched nothing.
         last: the course before; None = the arms rested.
         still: (K,) rows for which all was at rest.
         lost: why futures no longer count, by their number.
@@ -96,7 +96,7 @@ class Engine:
 
     Args:
         arms: of the robot.
-        threads: that compute.
+        threads: number of computing threads.
     """
 
     def __init__(self, arms: Arms, threads: int = 1) -> None:

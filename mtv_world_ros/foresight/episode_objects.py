@@ -68,7 +68,7 @@ class ObjectForesight:
 
         Args:
             plan: the chunk.
-            observation: that it begins with, at the model's size.
+            observation: first of the episode, at the model's size.
             names: O of them.
             start_masks: in its frames.
             majority: says which futures end as most do.
@@ -169,7 +169,7 @@ class ObjectForesight:
         """Objects of masks (V, O, H, W) in frames (V, H, W, 3) uint8 RGB at the model's size.
 
         Args:
-            source: the same frames as large as there are.
+            source: the same observation at the recorded size.
             names: O of them.
             frames: of all views.
             masks: in them.

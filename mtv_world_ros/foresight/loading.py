@@ -26,7 +26,7 @@ def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidFo
     Args:
         folder: that it wrote.
         robot: of the same joints.
-        threads: that compute futures.
+        threads: number of computing threads.
 
     Raises:
         CheckpointError: a file cannot be used.

@@ -40,7 +40,7 @@ class Part:
     """A convex part of a link.
 
     Attributes:
-        link: that carries it.
+        link: name of the link that carries the part.
         kind: `box`, `cylinder`, `sphere` or `hull`.
         size: half extents of a box, radius and half length of a cylinder, radius of a sphere [m].
         pose: (4, 4) in the link.
@@ -60,7 +60,7 @@ class RobotParts:
 
     Attributes:
         parts: P.
-        notes: what was assumed, in words.
+        notes: assumptions, as text.
     """
 
     parts: tuple[Part, ...]

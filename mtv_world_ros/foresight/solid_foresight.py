@@ -37,9 +37,9 @@ class SolidForesight:
 
     Args:
         robot: any whose base stands still.
-        response: how its arms follow their commands; None = not known yet.
+        response: of the arms to their commands; None = not known yet.
         settings: of contact.
-        threads: that compute.
+        threads: number of computing threads.
         camera_m: standard deviation of where the cameras see everything [m].
 
     Raises:

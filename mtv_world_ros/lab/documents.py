@@ -28,7 +28,7 @@ class Table:
     Attributes:
         head: headings.
         rows: cells, as many as headings.
-        caption: what it shows.
+        caption: title of the table.
         num_labels: columns on the left that hold text, not numbers.
     """
 

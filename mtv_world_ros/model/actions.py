@@ -171,7 +171,7 @@ class ActionEncoding:
             positions: (1 + T, J): row 0 the start, row k the command of frame k.
 
         Raises:
-            CheckpointError: it is another robot.
+            CheckpointError: the robot is another one.
         """
         self.scaling.check(action_names(self.control, robot))
         scaled = self.scaling.apply(action_features(self.control, robot, positions))

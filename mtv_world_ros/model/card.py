@@ -150,7 +150,7 @@ def check_same_model(card: CheckpointCard, adapter: Path) -> None:
         adapter: its folder; one without a card of its own is not checked.
 
     Raises:
-        CheckpointError: it was not.
+        CheckpointError: the adapter was trained for another model.
     """
     if not (adapter / CARD).is_file():
         return

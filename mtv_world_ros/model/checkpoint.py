@@ -35,7 +35,7 @@ class Checkpoint:
         transformer: the diffusion transformer.
         autoencoder: pixels to latents and back.
         scheduler: noise levels and the step rule.
-        card: what it takes, gives and was trained on.
+        card: inputs and outputs of the model, and its training data.
         actions: how positions become the transformer's actions; None where they are drawn.
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.

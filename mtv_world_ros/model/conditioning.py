@@ -25,7 +25,7 @@ class Conditioning:
         reference: (B, V, C, h, w) of the start image.
         actions: what `ActionEncoding` made of the commands, where they are not drawn.
         text: (B, 512, text_dim) umT5 tokens of the prompt, in models with text.
-        negative_text: the same of what guidance leads away from; None = no guidance.
+        negative_text: tokens of the text that guidance leads away from; None = no guidance.
         image: (B, V * 257, image_dim) CLIP tokens of the start image.
         anchor: (B, V, C, h, w) of the rollout's first frame, where reference tokens show that.
         history: (B, V, C, P, h, w) of what was seen before, in models that take it.
@@ -167,7 +167,7 @@ def condition_on_actions(
     Args:
         autoencoder: of the preset.
         start_frame: (B, V, H, W, 3) uint8 RGB.
-        actions: what `ActionEncoding` gives, of the whole batch.
+        actions: output of `ActionEncoding` for the whole batch.
         num_frames: T.
     """
     reference, start = _start(autoencoder, start_frame, autoencoder.num_latent_frames(num_frames))

@@ -111,7 +111,7 @@ class ImageEncoder:
         """Returns the one of a checkpoint folder.
 
         Raises:
-            CheckpointError: it is missing or cannot be loaded.
+            CheckpointError: the encoder is missing or cannot be loaded.
         """
         folder = checkpoint / _FOLDER
         try:

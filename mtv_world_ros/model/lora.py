@@ -76,7 +76,7 @@ def save_adapter(
         transformer: has the adapter.
         folder: to write.
         weights: in place of the transformer's, by name; such as averaged ones.
-        card: what it was trained for and on, as in a checkpoint.
+        card: base model and training data, as in a checkpoint.
     """
     from peft.utils import get_peft_model_state_dict
 
@@ -102,7 +102,7 @@ class Adapter:
     """An adapter in memory that is known to fit a transformer; without anything: none.
 
     Attributes:
-        path: where it was read; None = none.
+        path: of the adapter's file; None = no adapter.
         factors: of the layers that it changes, by name.
         whole: the weights beside it, by name.
     """
@@ -146,7 +146,7 @@ class Adapters:
             path: a folder of ours, of diffusers or of peft, or a LoRA file; None = none.
 
         Raises:
-            CheckpointError: it cannot be read, or is for another model.
+            CheckpointError: the adapter cannot be read, or is for another model.
             ConfigError: peft is not installed.
         """
         if path is None:
@@ -160,10 +160,10 @@ class Adapters:
         """Takes another adapter, or none; where that fails, the one before stays.
 
         Args:
-            adapter: what `read` gave, or what it takes.
+            adapter: the result of `read`, or a path for it.
 
         Raises:
-            CheckpointError: it cannot be read, or is for another model.
+            CheckpointError: the adapter cannot be read, or is for another model.
             ConfigError: peft is not installed.
         """
         wanted = adapter if isinstance(adapter, Adapter) else self.read(adapter)

@@ -74,7 +74,7 @@ def check_video(autoencoder: Autoencoder, transformer: Any, spec: WorldModelSpec
         spec: size and number of frames.
 
     Raises:
-        CheckpointError: it does not.
+        CheckpointError: a chunk does not divide into latents and tokens.
     """
     if not isinstance(autoencoder, WanAutoencoder):
         return

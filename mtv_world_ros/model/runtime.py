@@ -26,7 +26,7 @@ def check_device(name: str) -> None:
     """Checks that this machine has a device.
 
     Raises:
-        ConfigError: it has not, or torch does not know it.
+        ConfigError: the machine has no such device, or torch does not know it.
     """
     try:
         device = torch.device(name)

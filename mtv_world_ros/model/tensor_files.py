@@ -52,7 +52,7 @@ def open_tensors(path: Path, stem: str = '') -> dict[str, StoredTensor]:
 
     Args:
         path: a `.safetensors` file, an index, or a folder.
-        stem: what the names of the folder's files begin with.
+        stem: beginning of the names of the folder's files.
 
     Raises:
         CheckpointError: nothing there, a pickle, a shard is missing or damaged.
@@ -218,7 +218,7 @@ def import_transformers() -> Any:
     """Returns the package.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: the package is not installed.
     """
     try:
         import transformers

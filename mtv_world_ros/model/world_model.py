@@ -51,12 +51,12 @@ class DiffusionWorldModel:
         device: e.g. `cpu` or `cuda`.
         dtype: of the transformer's computations.
         robot: the trained one; needed where the checkpoint takes actions that are not drawn.
-        serving: what makes it faster or smaller.
+        serving: options that make the model faster or smaller.
 
     Raises:
-        CheckpointError: it is needed and missing.
+        CheckpointError: the robot is needed and missing.
         ConfigError: the serving options are not for this machine.
-        ModelMemoryError: it does not fit the device.
+        ModelMemoryError: the model does not fit the device.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class DiffusionWorldModel:
             path: see `Adapters.read`; None = none.
 
         Raises:
-            CheckpointError: it cannot be read or is for another model.
+            CheckpointError: the adapter cannot be read or is for another model.
             ConfigError: peft is not installed.
         """
         if path is not None:

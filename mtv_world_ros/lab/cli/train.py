@@ -361,12 +361,12 @@ def make_judge(
     Args:
         paths: of the episodes.
         out: gets a folder per step, with `metrics.json` and an MP4 per episode.
-        device: where to imagine.
+        device: of the model.
         dtype: of the model.
         base: checkpoint that adapters are used on.
-        source: how the episodes are read; None = they are this package's own.
-        segmenter: what finds the objects.
-        describer: what names them; None = the episodes, else their instructions.
+        source: topics and robot of the episodes; None = this package's own format.
+        segmenter: finds the objects' masks.
+        describer: names the objects; None = the episodes, else their instructions.
     """
     import torch
 

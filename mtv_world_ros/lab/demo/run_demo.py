@@ -221,7 +221,7 @@ class RecordedChunk:
     """A chunk as a subscriber saw it.
 
     Attributes:
-        report: what `~/report` said of it, as text by key.
+        report: rows of `~/report`, as text by key.
         stamps_ns: (T,) predicted times.
         predicted: (V, T, H, W, 3) uint8 RGB.
         trajectory: (V, T, H, W, 3) uint8 RGB.

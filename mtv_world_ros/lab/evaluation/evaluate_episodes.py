@@ -80,7 +80,7 @@ def evaluate(
         pipeline: imagines and segments.
         episode_paths: recorded episodes.
         out: folder for the results.
-        config: what is imagined and how it is scored.
+        config: stretches to imagine and scores to compute.
         name: identifies the checkpoint; only results of the same name are taken over, and none
             without a name.
         label: of its rows in tables that compare checkpoints.

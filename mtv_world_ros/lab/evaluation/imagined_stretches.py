@@ -126,7 +126,7 @@ def imagine_stretch(
     Args:
         pipeline: imagines.
         recording: the episode that the stretch was cut from.
-        stretch: what to imagine.
+        stretch: recorded frames to imagine.
         actions: the episode whose commands are executed: the same one, or another for a control.
         seed: of the noise.
         num_inference_steps: denoising steps.

@@ -95,7 +95,7 @@ def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, tuple[str, .
         The text, and how it was chosen, where there was a choice.
 
     Raises:
-        RobotError: it holds none.
+        RobotError: the bag holds no robot description.
     """
     topics = {mapping.topic(mapping.robot_description), '/robot_description'}
     texts = dict.fromkeys(
@@ -141,7 +141,7 @@ def import_bags(
     Args:
         bags: rosbag2 folders or files.
         out: folder of the episodes.
-        mapping: what the topics are, with views.
+        mapping: names and kinds of the topics, with views.
         robot_file: the robot's YAML.
         calibration: of the cameras; None = the bags' own.
         stage: names the objects and finds their masks.

@@ -34,7 +34,7 @@ class ImportSummary(Generic[Item]):
         made: converted now.
         kept: were there already.
         failed: why.
-        warnings: what was odd and how it was handled.
+        warnings: problems and how they were handled.
     """
 
     made: list[Item] = field(default_factory=list)

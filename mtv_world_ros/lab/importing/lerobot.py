@@ -64,12 +64,12 @@ class LeRobotDataset:
         root: the folder.
         version: of the format.
         fps: rows a second [Hz].
-        features: what the columns hold, by name.
+        features: types and shapes of the columns, by name.
         episodes: entries by number.
         tasks: texts by number.
 
     Raises:
-        EpisodeError: it is no such dataset, or of another version.
+        EpisodeError: the folder is no LeRobot dataset, or of another version.
         ConfigError: pyarrow is not installed.
     """
 

@@ -55,7 +55,7 @@ class _Rows:
         action: (T, J) commanded one period later [rad or m].
         frames: (V, T, H, W, 3) uint8 RGB.
         outcome: `success`, `failure` or `unknown`.
-        task: what the robot was told.
+        task: text for the robot.
         cameras: V cameras.
     """
 

@@ -72,7 +72,7 @@ class ActionStream(Stream):
         """Returns (T, J) positions of a feature's values (T, C), and what was odd.
 
         Args:
-            values: as in the dataset.
+            values: in the dataset's units.
             names: of the columns; empty where the dataset does not name them.
             measured: (T, J) positions of the same rows.
             robot: the robot.
@@ -162,7 +162,7 @@ def load_mapping(path: Path) -> DatasetMapping:
 
     Raises:
         ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
-        RobotError, CalibrationError: what it names cannot be used.
+        RobotError, CalibrationError: a file that the mapping names cannot be used.
     """
     values = read_yaml(path, 'mapping file', '--mapping')
     context: dict[str, Any] = {'folder': path.parent}
@@ -184,7 +184,7 @@ def guess_mapping(
 
     Raises:
         ConfigError: the calibration has none of the views.
-        CalibrationError: it cannot be used.
+        CalibrationError: the calibration cannot be used.
     """
     known = load_calibration(calibration)
     features = [n for n, f in dataset.features.items() if f.get('dtype') in ('video', 'image')]

@@ -27,7 +27,7 @@ class CameraEstimate:
         camera: with the estimated pose, at the size of the recorded images.
         std_mm: standard error of the camera's place [mm].
         std_deg: standard error of its direction and roll [degrees].
-        evidence: what it was estimated from and how well that fits, in words.
+        evidence: data of the estimate and its residuals, as text.
         residual_px: median distance of points from where they should be; NaN of silhouettes.
         match: correlation of drawn and seen motion, -1 .. 1; NaN of points.
     """

@@ -54,8 +54,8 @@ class Section:
 
     Attributes:
         name: of the view, or `recording`.
-        measures: what was measured, as text, by name.
-        findings: what is wrong, and what could not be checked and why.
+        measures: measured values as text, by name.
+        findings: faults, and checks that were not possible with the reason.
         notes: other things to know.
     """
 
@@ -78,7 +78,7 @@ class Inspection:
         episode: its path.
         robot: name of the robot it was checked against.
         views: a section for each view.
-        recording: what concerns all views.
+        recording: findings that concern all views.
     """
 
     episode: Path

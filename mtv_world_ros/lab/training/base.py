@@ -27,7 +27,7 @@ class Base:
     """A loaded checkpoint, ready to be trained.
 
     Attributes:
-        folder: where it lies.
+        folder: of the checkpoint.
         checkpoint: its parts; the transformer has a new adapter where the preset trains one.
         encoders: on the device.
         digest: identifies its transformer's weights.
@@ -59,13 +59,13 @@ def load_base(
     Args:
         config: the preset.
         folder: of the checkpoint.
-        device: where training computes.
+        device: of the training.
         dtype: of forward and backward, and of the encoders: the same as in serving.
         seed: of a new adapter.
 
     Raises:
         TrainingError: there is no folder, or its model is not the preset's.
-        CheckpointError: it cannot be loaded.
+        CheckpointError: the checkpoint cannot be loaded.
     """
     if folder is None:
         raise TrainingError(

@@ -23,7 +23,7 @@ class TrainingLog:
 
     Args:
         folder: gets `log.jsonl` and `tensorboard/`.
-        step: that the training starts from; later rows are dropped.
+        step: at which the training starts; later rows are dropped.
         total: steps of the training.
         active: False writes nothing, for all processes except the main one.
         ideal_seconds: of a step at the machine's peak arithmetic rate; None = unknown.

@@ -148,8 +148,8 @@ def sample_loss(
 
     Args:
         predicted: (B, V, C, T, h, w).
-        clean: the same shape.
-        weights: the same shape, positive.
+        clean: the clean latents, of the same shape.
+        weights: positive weights, of the same shape.
         delta: error from which on the Huber loss is linear; None = the squared error.
         by_sample: (B,) weights of samples; None = equal.
     """

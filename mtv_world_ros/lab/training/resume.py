@@ -53,7 +53,7 @@ def save_state(
     """Replaces the state in `folder/state` atomically.
 
     Raises:
-        DiskError: it could not be written; the old state stays.
+        DiskError: the state could not be written; the old one stays.
     """
     tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
     tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
@@ -70,7 +70,7 @@ def read_card(folder: Path) -> dict[str, Any] | None:
     """Returns the metadata of the saved state; None if there is none.
 
     Raises:
-        TrainingError: it is damaged.
+        TrainingError: the state is damaged.
     """
     recover_folder(folder / STATE)
     file = folder / STATE / _CARD
@@ -97,7 +97,7 @@ def check_architecture(folder: Path, config: TrainingConfig) -> None:
     """Checks that a preset has the architecture of the state in a folder, if there is one.
 
     Raises:
-        TrainingError: it has another one; names the first difference.
+        TrainingError: the architectures differ; names the first difference.
     """
     held, mine = read_card(folder), architecture(config)
     if held is None or 'lora.rank' not in held:  # of a version that did not keep it
@@ -142,7 +142,7 @@ def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Op
     """Loads the tensors of the saved state.
 
     Raises:
-        TrainingError: it is damaged, or of another model.
+        TrainingError: the state is damaged, or of another model.
     """
     card, file = read_card(folder), folder / STATE / _TENSORS
     assert card is not None

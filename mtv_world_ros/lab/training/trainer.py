@@ -102,7 +102,7 @@ class Trainer:
 
     Args:
         config: the preset.
-        folder: where state, logs and checkpoints go.
+        folder: of state, logs and checkpoints.
         seed: of weights, noise and batches.
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
@@ -315,7 +315,7 @@ class Trainer:
         """Continues from the saved state; returns whether there was one.
 
         Raises:
-            TrainingError: it is damaged, or of another model, seed, control or base.
+            TrainingError: the state is damaged, or of another model, seed, control or base.
         """
         card = read_card(self.folder)
         if card is None:
@@ -405,7 +405,7 @@ def batch_loss(
         batch: clips, or what a latent cache holds of them.
         config: the preset.
         draws: of its clips; noise levels, noise and what is dropped come from them.
-        device: where to compute.
+        device: of the computation.
     """
     objective, dtype = config.objective, transformer.dtype
     if isinstance(batch, ClipBatch):

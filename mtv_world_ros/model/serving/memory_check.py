@@ -37,7 +37,7 @@ def check_memory(
     """Checks that a model fits into what is free on the device now.
 
     Raises:
-        ModelMemoryError: it does not.
+        ModelMemoryError: the model does not fit.
     """
     transformer = checkpoint.transformer
     if dtype.itemsize * sum(p.numel() for p in transformer.parameters()) < _SMALL:

@@ -20,7 +20,7 @@ class ServingOptions(Schema):
         attention: diffusers' name of the attention's implementation; empty = torch's choice.
         offload: keep the transformer's blocks on the CPU, each on the device for its turn alone.
         tiny_decoder: file of TAEHV's `taew2_1` weights that decode in place of Wan's autoencoder.
-        tiny_encoder: they encode, too.
+        tiny_encoder: the tiny autoencoder encodes, too.
     """
 
     section = ''

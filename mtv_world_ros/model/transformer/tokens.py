@@ -70,7 +70,7 @@ def embed_reference(
     Args:
         transformer: its `ref_conv` (phi of the paper) is used.
         reference: (B, V, C, H, W) latents of the start image.
-        start_control: the same of the control frame 0.
+        start_control: latents of the control frame 0.
         anchor: the same of the rollout's first frame; None = the start image is the reference.
         temb: (B, D) embedding of the video's noise level.
     """
@@ -271,7 +271,7 @@ def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
 
     Args:
         time_proj: (B, 1, 6, D), or (B, 2, 6, D) of the video's and the history's noise level.
-        grid: which token is which.
+        grid: view, time, row and column of each token.
 
     Returns:
         (B, 6, D), or (B, S, 6, D). The reference shares the video's level, as in Wan.

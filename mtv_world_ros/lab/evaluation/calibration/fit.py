@@ -36,14 +36,14 @@ class Sample:
     Attributes:
         episode: its name.
         task: its name.
-        success: what really happened.
+        success: the true outcome.
         features: of the estimate by seed; empty where it abstained.
         before: probabilities by seed with the stated weights; NaN = abstained.
         reasons: of the first seed's estimate.
         kinds: faults of the policy that acted; empty = none, or not a scripted policy.
         observed: features of the estimate on the recorded frames; empty where it abstained, or
             they were not judged.
-        resumed: likewise, where all but the last chunk was seen.
+        resumed: features where all but the last chunk was seen.
     """
 
     episode: str
@@ -136,7 +136,7 @@ def calibrate(
 
     Args:
         samples: imagined episodes of known outcome.
-        segmenter: that found the masks.
+        segmenter: name of the segmenter of the masks.
         l2: strength of the penalty.
         made: command, date, machine.
 

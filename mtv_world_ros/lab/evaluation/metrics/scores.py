@@ -49,12 +49,12 @@ class ScoreRow:
         j_ceiling: of recorded frames that went through the autoencoder.
         j_self: of the recorded frames themselves, through the same path.
         j_frames: (T,) J per frame.
-        j_copy_frames: the same of the first frame held.
-        j_shuffled_frames: the same with the actions of another episode; empty = not imagined.
+        j_copy_frames: J per frame of the held first frame.
+        j_shuffled_frames: J per frame with the actions of another episode; empty = not imagined.
         moving_imagined: whether it moves in the predicted frames, by the same rule.
         f: mean boundary F over frames.
-        f_copy: the same of the first frame held.
-        f_self: the same of the recorded frames themselves.
+        f_copy: F of the held first frame.
+        f_self: F of the recorded frames themselves.
     """
 
     stretch: int
@@ -140,7 +140,7 @@ def true_masks(
         stretch: recorded frames.
         segmenter: finds the masks, as it will in the predicted frames.
         names: O objects to score.
-        objects: what the recorded identities stand for.
+        objects: names; the recorded identities number them from 1.
         use_ids: score against the recorded identities instead, where there are any. Which
             objects move is read from them in any case.
     """
@@ -192,9 +192,9 @@ def score_rows(
     """Returns a row per view and object, and one per view for the union of objects.
 
     Args:
-        stretch: that was imagined.
+        stretch: the imagined stretch.
         views: V names.
-        truth: what it is scored against.
+        truth: masks of the recorded frames.
         predicted: scores of the prediction.
         others: scores by name, of `OTHERS`; those that are missing were not measured.
         masks: in the predicted frames; they tell what is imagined to move.

@@ -47,7 +47,7 @@ class Estimate:
     Attributes:
         value: mean over the episodes that have it.
         interval: (low, high).
-        num_episodes: that have it.
+        num_episodes: number of episodes that have the value.
     """
 
     value: float

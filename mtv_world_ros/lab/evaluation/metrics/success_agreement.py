@@ -100,7 +100,7 @@ class Bin:
         said: mean probability.
         came_true: share.
         interval: of that share.
-        count: how many.
+        count: number of estimates.
     """
 
     middle: float

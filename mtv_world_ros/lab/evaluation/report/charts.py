@@ -146,9 +146,9 @@ def line_chart(
 
     Args:
         title: for those who cannot see it.
-        lines: what to draw; the last one on top.
+        lines: curves; the last one is drawn on top.
         seconds: time of each frame [s].
-        y_label: what the values are.
+        y_label: name and unit of the values.
     """
     height = 262
     with _axes(_WIDTH, height, left=34, right=8, top=22, bottom=40) as axes:

@@ -15,7 +15,7 @@ class Filter:
     Attributes:
         key: part of its id and of the classes; letters only.
         label: heading.
-        options: what can be chosen, beside `all`.
+        options: choices beside `all`.
         within: another filter, on whose choice it depends what this one compares.
     """
 

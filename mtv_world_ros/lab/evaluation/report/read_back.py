@@ -24,7 +24,7 @@ class Evaluated:
     """What an evaluation left in its folder.
 
     Attributes:
-        folder: where.
+        folder: of the evaluation.
         metrics: metrics.json.
         results: scores by name of the episode.
     """
@@ -48,7 +48,7 @@ class Evaluated:
         """Returns the frames of a scored episode; None where they were not kept.
 
         Raises:
-            EpisodeError: they cannot be read.
+            EpisodeError: the frames cannot be read.
         """
         path = rollout_path(self.folder, episode)
         return load_rollout(path) if episode in self.results and path.is_file() else None

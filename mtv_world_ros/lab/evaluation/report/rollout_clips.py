@@ -60,7 +60,7 @@ def make_clip(
     """Returns a rollout's video and contact sheet.
 
     Args:
-        rollout: what to show.
+        rollout: frames and masks to show.
         max_bytes: the video's quality is lowered until it takes no more, down to a limit.
         tile_width: width up to which small frames are enlarged in the video [px].
         with_sheet: also make the contact sheet.
@@ -100,7 +100,7 @@ def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
     found in them in the same colours, and the recorded ones in white.
 
     Args:
-        rollout: what to show.
+        rollout: frames and masks to show.
         tile_width: width up to which frames are enlarged, by whole factors [px].
     """
     factor = max(tile_width // rollout.real.shape[3], 1)

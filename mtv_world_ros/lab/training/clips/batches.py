@@ -44,7 +44,7 @@ class ClipBatch:
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
         trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
-        actions: what `ActionEncoding` gives, where they are not drawn.
+        actions: output of `ActionEncoding`, where actions are not drawn.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `past.py`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
@@ -90,12 +90,12 @@ class BatchSource:
     """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
 
     Args:
-        recordings: where clips come from.
+        recordings: the clips are cut from them.
         config: views and times of clips, how they are drawn and disturbed, clips per step.
         robot: of the recordings.
         segmenter: finds the objects of the first frames.
         seed: of choice and disturbances.
-        actions: how positions become actions, where they are not drawn.
+        actions: encoding of positions as actions, where they are not drawn.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
     """

@@ -27,7 +27,7 @@ class ControlMaker:
     Attributes:
         robot: of the episodes.
         segmenter: finds the objects of the start frame.
-        rendering: how trajectory videos look.
+        rendering: widths, colours and fading of trajectory videos.
         object_mask: whether they carry the objects' masks.
         actions: how actions are encoded where they are not drawn; None = they are drawn.
     """

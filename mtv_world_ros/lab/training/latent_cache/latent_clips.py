@@ -183,8 +183,8 @@ def fill(
         clips: all clips of the training.
         read: gives a clip, undisturbed, as a batch of one.
         encoders: on the device.
-        device: where to encode.
-        dtype: that latents are kept in.
+        device: of the encoder.
+        dtype: of the stored latents.
 
     Raises:
         TrainingError: the disk is full, or will be before all clips are there.
@@ -257,8 +257,8 @@ def cached(
         config: the preset.
         base: whose encoders are used.
         seed: of the clips' order.
-        dtype: that latents are kept in.
-        processes: that train together.
+        dtype: of the stored latents.
+        processes: the processes of the training.
 
     Raises:
         ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
@@ -344,9 +344,9 @@ class CachedSource:
         batch_size: clips of a step, over all processes.
         seed: of the order.
         numbers: the clips of a step that this process takes; None: all.
-        device: where batches go.
+        device: of the batches.
         controls: encodes actions that are not drawn.
-        spec: what the model takes and gives.
+        spec: sizes and rates of the model's inputs and outputs.
     """
 
     def __init__(

@@ -69,7 +69,7 @@ class LatentCache:
         """Returns the tensors of a clip by name.
 
         Raises:
-            TrainingError: they are not there.
+            TrainingError: the latents are missing.
         """
         if key not in self._shards:
             raise TrainingError(f"latent cache '{self.folder}' has no clip {key}")
@@ -82,7 +82,7 @@ class LatentCache:
         """Returns the labels of clips that are here with another content.
 
         Args:
-            labels: what clips are called, by their keys.
+            labels: names of the clips, by key.
         """
         held = {label: key for key, label in self._labels.items()}
         return sorted(

@@ -163,8 +163,8 @@ def fit_contact(
     Args:
         recordings: E.
         robot_file: of the robot.
-        response: how its arms follow.
-        first: where the search begins.
+        response: of the arms to their commands.
+        first: start of the search.
         workers: processes.
         report: is told how each round went.
 

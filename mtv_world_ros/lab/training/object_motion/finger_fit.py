@@ -72,7 +72,7 @@ def fit_fingers(
     Args:
         grippers: of some episodes.
         arms: of the robot, with how they follow.
-        settings: where the search begins.
+        settings: start of the search.
     """
     known = [one for one in grippers if len(one.positions) >= _SHORTEST]
     known = [one for one in known if np.isfinite(one.recorded).any()]

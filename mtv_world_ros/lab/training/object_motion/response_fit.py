@@ -55,7 +55,7 @@ def joint_recording(path: Path, robot: RobotModel) -> Recording:
     """Reads an episode's commands, and its joint states at the same times.
 
     Raises:
-        EpisodeError: it lacks either, or its joint states are too far apart.
+        EpisodeError: the episode lacks commands or joint states, or these are too far apart.
         TrajectoryError: either lacks joints of the robot.
     """
     episode = read_episode(path, with_cameras=False, with_masks=False)
@@ -116,8 +116,8 @@ def tool_errors(
 
     Args:
         robot: of the recordings.
-        recordings: what to compare with.
-        response: what says where they are; None = their commands.
+        recordings: commands and measured positions.
+        response: predicts the positions; None = the commands themselves.
     """
     errors = []
     for commands, positions in recordings:

@@ -33,7 +33,7 @@ def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
 
     Raises:
         ConfigError: there is no such file.
-        CheckpointError: it holds something else.
+        CheckpointError: the file holds other tensors.
     """
     _check_file(weights, 'fid_weights')
     import torch
@@ -63,7 +63,7 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
 
     Raises:
         ConfigError: there is no such file or folder.
-        CheckpointError: it holds something else.
+        CheckpointError: the file holds other tensors.
     """
     return _video_mae(weights, device) if weights.is_dir() else _i3d(weights, device)
 
