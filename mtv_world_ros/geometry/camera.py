@@ -119,8 +119,8 @@ def unproject(camera: CameraModel, pixels: FloatArray) -> FloatArray:
 
 
 def unknown_camera(view: str, width: int, height: int, mount_link: str) -> CameraModel:
-    """Returns a placeholder for a camera of which nothing is known: one of 65 degrees."""
-    focal = 0.785 * width
+    """Returns a placeholder for a camera of which nothing is known: one of 80 degrees."""
+    focal = 0.6 * width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return CameraModel(
         view=view, width=width, height=height, K=K, mount_link=mount_link, T_mount_camera=np.eye(4)

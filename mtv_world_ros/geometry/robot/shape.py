@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 import pinocchio as pin
+from scipy.spatial import ConvexHull, QhullError
 
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import CameraModel, FloatArray
@@ -21,11 +22,18 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.transforms import inverse
 
 #: corners of a round shape's rims, and directions in which a mesh's outermost points are kept
 _CORNERS, _DIRECTIONS = 16, 256
 #: radius of the rods that stand for links of which nothing is known [m]
 ROD_RADIUS_M = 0.03
+#: a mesh is cut into this many slices where they hold less than a share of its hull's volume
+_SLICES, _HOLLOW, _SLICE_DIRECTIONS = 5, 0.8, 96
+#: meshes shorter than this stay whole [units of the mesh, mostly m]
+_LEAST_SLICED = 0.12
+#: parts of shapes nearer to the camera's plane are cut off [m]
+_NEAR_M = 0.04
 #: links closer together than this get no rod between them [m]
 _SHORTEST_ROD_M = 0.01
 #: pixels are drawn with this many fractional bits
@@ -83,7 +91,7 @@ def load_shape(robot: RobotModel) -> RobotShape:
         link.attrib['name']: link
         for link in ElementTree.fromstring(read_text(path, 'urdf_bytes')).iter('link')
     }
-    found = {name: link_shapes(link, path) for name, link in links.items()}
+    found = {name: link_shapes(link, path, sliced=True) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
     missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
@@ -140,12 +148,14 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
     return LinkShape(link=link, points=_moved(T, _cylinder(ROD_RADIUS_M, length)))
 
 
-def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape], list[str]]:
+def link_shapes(
+    link: ElementTree.Element, urdf: Path, *, sliced: bool = False
+) -> tuple[list[LinkShape], list[str]]:
     """Returns a link's shapes, and why there are none; collisions stand in for visuals."""
     missing: list[str] = []
     for kind in ('visual', 'collision'):
         try:
-            shapes = list(shapes_of(link, kind, urdf))
+            shapes = list(shapes_of(link, kind, urdf, sliced=sliced))
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
@@ -154,8 +164,12 @@ def link_shapes(link: ElementTree.Element, urdf: Path) -> tuple[list[LinkShape],
     return [], missing
 
 
-def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[LinkShape]:
+def shapes_of(
+    link: ElementTree.Element, kind: str, urdf: Path, *, sliced: bool = False
+) -> Iterator[LinkShape]:
     """Yields the shapes of a link's elements of a kind, `visual` or `collision`.
+
+    With `sliced`, a mesh that is far from convex is given in slices.
 
     Raises:
         FileNotFoundError: a mesh is not there.
@@ -166,14 +180,69 @@ def shapes_of(link: ElementTree.Element, kind: str, urdf: Path) -> Iterator[Link
         if geometry is None or len(geometry) == 0:
             continue
         try:
-            points = _points(geometry[0], urdf)
+            pieces = _pieces(geometry[0], urdf, sliced)
         except KeyError as error:
             name = link.attrib['name']
             raise RobotError(
                 f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
             ) from error
         pose = shape_origin(element.find('origin'))
-        yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
+        for points in pieces:
+            yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
+
+
+def _pieces(shape: ElementTree.Element, urdf: Path, sliced: bool) -> list[FloatArray]:
+    """Convex parts (N, 3): one of a shape, or the slices of a mesh that is far from convex."""
+    if shape.tag != 'mesh':
+        return [_points(shape, urdf)]
+    scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
+    file = find_mesh(shape.attrib['filename'], urdf)
+    if file is None:
+        raise FileNotFoundError(f"'{shape.attrib['filename']}'")
+    mesh = _load_mesh(file)
+    vertices = np.asarray(mesh.vertices(), np.float64)
+    if not sliced:
+        return [outermost(vertices) * scale]
+    return [piece * scale for piece in _convex_pieces(vertices, _edges(mesh))]
+
+
+def _edges(mesh: Any) -> NDArray[np.int64]:
+    """(E, 2) vertices that edges of triangles join."""
+    faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in range(mesh.num_tris)])
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+
+
+def _convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
+    """The hull's points, or those of slices across the longest axis where these hold far less."""
+    whole = outermost(vertices)
+    middle = vertices - vertices.mean(axis=0)
+    axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
+    along = vertices @ axis
+    cuts = np.linspace(along.min(), along.max(), _SLICES + 1)
+    slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
+    try:
+        volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
+    except (QhullError, ValueError):  # flat
+        return [whole]
+    hollow = sum(volumes[1:]) < _HOLLOW * volumes[0]
+    return slices if hollow and np.ptp(along) > _LEAST_SLICED else [whole]
+
+
+def _slice(
+    vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
+) -> FloatArray:
+    """Outermost points between two planes, with where the planes cut edges."""
+    inside = vertices[(along >= low) & (along <= high)]
+    start, end = along[edges].T
+    found = [inside]
+    for cut in (low, high):
+        crossed = (start - cut) * (end - cut) < 0
+        share = ((cut - start[crossed]) / (end - start)[crossed])[:, None]
+        a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
+        found.append(a + share * (b - a))
+    points = np.concatenate(found)
+    return outermost(points, _SLICE_DIRECTIONS)
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
@@ -185,12 +254,6 @@ def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
         return _cylinder(float(values['radius']), float(values['length']))
     if shape.tag == 'sphere':
         return float(values['radius']) * _directions(64)
-    if shape.tag == 'mesh':
-        scale = np.array(values.get('scale', '1 1 1').split(), float)
-        file = find_mesh(values['filename'], urdf)
-        if file is None:
-            raise FileNotFoundError(f"'{values['filename']}'")
-        return _outermost(_load_mesh(file).vertices()) * scale
     raise RobotError(
         f"'{urdf}' has a shape '{shape.tag}'; known are box, capsule, cylinder, mesh, sphere"
     )
@@ -239,7 +302,7 @@ def write_convex_hull(mesh: Path, out: Path) -> None:
     import coal
 
     hull = coal.BVHModelOBBRSS()
-    points = _outermost(_load_mesh(mesh).vertices())
+    points = outermost(_load_mesh(mesh).vertices())
     hull.beginModel(0, len(points))
     for point in points:
         hull.addVertex(point)
@@ -267,8 +330,9 @@ def _load_mesh(path: Path) -> Any:
         raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
 
 
-def _outermost(points: FloatArray) -> FloatArray:
-    return points[np.unique((points @ _directions(_DIRECTIONS).T).argmax(axis=0))]
+def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
+    """The points (M, 3) of (N, 3) that are outermost in one of some directions."""
+    return points[np.unique((points @ _directions(directions).T).argmax(axis=0))]
 
 
 def shape_origin(element: ElementTree.Element | None) -> FloatArray:
@@ -297,17 +361,52 @@ def draw_silhouettes(
 def project_part(
     part: LinkShape, poses: FloatArray, camera: CameraModel, T_base_camera: FloatArray
 ) -> FloatArray:
-    """(T, N, 2) pixels of its points."""
-    points = np.einsum('tij,nj->tni', poses[:, :3, :3], part.points) + poses[:, None, :3, 3]
-    return project(camera, T_base_camera[:, None], points)[0]
+    """(T, N, 2) pixels of its points; what reaches behind the camera is cut off before it."""
+    T = inverse(T_base_camera) @ poses
+    points = np.einsum('tij,nj->tni', T[:, :3, :3], part.points) + T[:, None, :3, 3]
+    depth = points[..., 2]
+    for row in np.flatnonzero((depth < _NEAR_M).any(axis=1) & (depth > _NEAR_M).any(axis=1)):
+        points[row] = _before(points[row])
+    return project(camera, np.eye(4), points)[0]
+
+
+def project_points(parts: Sequence[FloatArray], camera: CameraModel) -> list[FloatArray]:
+    """Pixels (T, N, 2) of parts given by their points (T, N, 3) in the base frame, for `fill`.
+
+    The camera's pose is one in the base frame. What reaches behind it is cut off before it.
+    """
+    T = inverse(camera.T_mount_camera)
+    points = np.concatenate(parts, axis=1) @ T[:3, :3].T + T[:3, 3]
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    if (points[..., 2] < _NEAR_M).any():
+        for part in np.split(points, ends, axis=1):  # views of the same memory
+            near = part[..., 2] < _NEAR_M
+            for row in np.flatnonzero(near.any(axis=1) & ~near.all(axis=1)):
+                part[row] = _before(part[row])
+    return np.split(project(camera, np.eye(4), points)[0], ends, axis=1)
+
+
+def _before(points: FloatArray) -> FloatArray:
+    """Points (N, 3) with those behind moved to where lines to the middle of the rest pass."""
+    behind = points[:, 2] < _NEAR_M
+    middle = points[~behind].mean(axis=0)
+    apart = points[behind] - middle
+    share = (_NEAR_M - middle[2]) / apart[:, 2:]
+    moved = points.copy()
+    moved[behind] = middle + share * apart
+    return moved
 
 
 def fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
-    """(T, H, W) the convex hulls of the parts' pixels; parts that reach behind are left out."""
+    """(T, H, W) the convex hulls of the parts' pixels; parts behind the camera are left out."""
     images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
+    size = np.array([camera.width, camera.height])
     for part in parts:
-        for image, pixels in zip(images, part, strict=True):
-            if np.isfinite(pixels).all():
-                fixed = np.rint(pixels.clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS).astype(np.int32)
-                cv2.fillConvexPoly(image, cv2.convexHull(fixed), 1, shift=_SHIFT_BITS)
+        with np.errstate(invalid='ignore'):
+            low, high = part.min(axis=1), part.max(axis=1)
+            seen = ((high > -1) & (low < size)).all(axis=1)  # NaN is not seen
+        fixed = np.nan_to_num(part).clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS
+        fixed = np.rint(fixed).astype(np.int32)
+        for row in np.flatnonzero(seen):
+            cv2.fillConvexPoly(images[row], cv2.convexHull(fixed[row]), 1, shift=_SHIFT_BITS)
     return images

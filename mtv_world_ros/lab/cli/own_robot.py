@@ -124,12 +124,13 @@ def _draw_robot(robot: RobotModel, path: Path) -> None:
 def _add_doctor(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'doctor',
-        help='check calibration, joints and clocks of an episode or of running topics',
+        help='check calibration, joints, clocks and pictures of an episode, of all episodes of a '
+        'folder, or of running topics',
         epilog='Exit status: 0 where everything was checked and is ok, 1 where something is '
         'suspicious or broken, 3 where nothing wrong was found but not everything could be '
         'checked.',
     )
-    parser.add_argument('episode', type=Path, nargs='?')
+    parser.add_argument('episode', type=Path, nargs='?', help='an episode, or a folder of them')
     parser.add_argument('--live', action='store_true', help='check the running ROS topics')
     parser.add_argument(
         '--seconds', type=float, default=10.0, help='with --live: how long to record'
@@ -147,6 +148,9 @@ def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.live == (arguments.episode is not None):
         raise ConfigError('name an EPISODE, or give --live to check the running topics')
     if not arguments.live:
+        paths = _episodes_in(arguments.episode)
+        if paths:
+            return _check_folder(arguments, paths)
         return _check(arguments, arguments.episode, arguments.episode.name)
     from mtv_world_ros.lab.inspection.live import record_topics
 
@@ -162,13 +166,51 @@ def _doctor(arguments: argparse.Namespace) -> int:
         return _check(arguments, bag, 'live')
 
 
+def _episodes_in(path: Path) -> list[Path]:
+    """Episodes of a folder that is none itself."""
+    from mtv_world_ros.data.episode_reader import list_episodes
+
+    found = list_episodes(path) if path.is_dir() else []
+    return [] if path in found else found
+
+
+def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.lab.inspection.folder import (
+        folder_markdown,
+        folder_picture,
+        folder_text,
+        inspect_folder,
+    )
+    from mtv_world_ros.lab.inspection.inspect import load_inspector
+    from mtv_world_ros.rendering.images import write_png
+
+    file, source = robot_file(arguments, paths[0])
+    inspector = load_inspector(file)
+    found, pictures = inspect_folder(
+        tqdm(paths, unit='ep'),
+        inspector,
+        lambda path: read_for_checks(path, arguments.views, source, inspector.robot),
+    )
+    out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
+    picture = folder_picture(pictures)
+    if picture is not None:
+        write_png(out / 'episodes.png', picture)
+    write_whole(out / 'report.md', folder_markdown(found, 'episodes.png'))
+    print(folder_text(found))
+    print(f"{found.verdict}: see '{out / 'report.md'}'")
+    return _STATUS[found.verdict]
+
+
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     from mtv_world_ros.lab.inspection.inspect import load_inspector
     from mtv_world_ros.lab.inspection.inspection_report import to_text
 
-    file, source = _robot_file(arguments, path)
+    file, source = robot_file(arguments, path)
     inspector = load_inspector(file)
-    episode = _read(path, arguments.views, source, inspector.robot)
+    episode = read_for_checks(path, arguments.views, source, inspector.robot)
     inspection = inspector.inspect(episode)
     out = arguments.out or Path('out/doctor') / name
     _write_inspection(inspector, episode, inspection, out)
@@ -177,8 +219,8 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     return _STATUS[inspection.verdict]
 
 
-def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
-    """The robot's YAML (`--robot`, that of the mapping, that of the episode), and the source."""
+def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
+    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
     from mtv_world_ros.assembly import recorded_robot, robot_path
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_info
@@ -188,13 +230,14 @@ def _robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, Episod
     return robot_path(name) if name else recorded_robot(path, read_info(path).robot), source
 
 
-def _read(
+def read_for_checks(
     path: Path,
     views: Sequence[str] | None,
     source: EpisodeSource,
     robot: RobotModel,
     unknown_mount: str = '',
 ) -> Episode:
+    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
     from mtv_world_ros.data.episode_reader import read_episode
 
     return read_episode(
@@ -228,10 +271,31 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
         help='estimate where a camera is, fixed or on the arm, from a recording in which the arm '
         'moves',
         epilog='Intrinsics come from the recording; the pose there is the guess to start from. '
+        'Of several recordings, moved cameras are told apart, and the focal length is estimated '
+        'where it is not known. '
         'This is the calibration of a camera: that of the success estimate is `calibrate`.',
     )
-    parser.add_argument('episode', type=Path)
+    parser.add_argument(
+        'episodes', type=Path, nargs='+', metavar='EPISODE', help='recordings, or folders of them'
+    )
     parser.add_argument('--view', required=True)
+    parser.add_argument(
+        '--points',
+        type=Path,
+        metavar='FILE',
+        help='where the tool point is seen, to start from: '
+        '{VIEW: {EPISODE: [[seconds, x, y], ...]}} in YAML [s, px], four points or more',
+    )
+    parser.add_argument(
+        '--focal',
+        choices=('known', 'estimate'),
+        help='whether the focal length is right; default: estimate where nothing gives one',
+    )
+    parser.add_argument(
+        '--apply',
+        action='store_true',
+        help="write the poses into the recordings' calibration.yaml, where they have none",
+    )
     parser.add_argument(
         '--no-guess',
         dest='guess',
@@ -267,6 +331,15 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.lab.cli.shared_camera import calibrate_shared, is_shared
+
+    if is_shared(arguments):
+        return calibrate_shared(arguments)
+    arguments.episode = arguments.episodes[0]
+    return _calibrate_one(arguments)
+
+
+def _calibrate_one(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
@@ -281,9 +354,9 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
     known = load_calibration(out) if out.is_file() else {}
     if arguments.view in known and arguments.out is not None:
         raise ConfigError(f"'{out}' has view '{arguments.view}' already; name another --out")
-    file, source = _robot_file(arguments, arguments.episode)
+    file, source = robot_file(arguments, arguments.episode)
     robot = load_robot(file)
-    episode = _read(
+    episode = read_for_checks(
         arguments.episode,
         [arguments.view],
         source,

@@ -25,6 +25,7 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
 )
 from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import feature_path, FeatureTaker
 from mtv_world_ros.lab.evaluation.metrics.image_quality import ImageQuality
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import HELD, picture_scores, SHUFFLED
 from mtv_world_ros.lab.evaluation.metrics.scores import (
     find_masks,
     score_frames,
@@ -87,6 +88,7 @@ class _Found:
     rows: list[ScoreRow] = field(default_factory=list)
     shown: list[StoredRollout] = field(default_factory=list)
     quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
+    pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
     chunk_seconds: list[float] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
@@ -152,6 +154,7 @@ class EpisodeScorer:
             outcome=recording.outcome,
             rows=tuple(found.rows),
             quality=_mean_quality(found.quality),
+            pictures=_mean_quality(found.pictures),
             probability=success.probability if success else np.nan,
             reasons=success.reasons if success else (),
             features=dict(success.features) if success else {},
@@ -201,13 +204,14 @@ class EpisodeScorer:
             masks = find_masks(frames, truth, self.pipeline.segmenter)
         with found.timed('scoring'):
             predicted = object_scores(masks, truth.masks)
-        others = self._controls(recording, stretch, donor, truth, found)
+        others, shuffled = self._controls(recording, stretch, donor, truth, found)
         others |= self._ceilings(stretch, truth, found)
         views = self.pipeline.spec.views
         with found.timed('scoring'):
             found.rows += score_rows(stretch, views, truth, predicted, others, masks)
         with found.timed('features'):
             found.quality.append((stretch.num_frames, self._quality(frames, real)))
+            found.pictures.append((stretch.num_frames, self._pictures(stretch, frames, shuffled)))
         stored = stored_stretch(
             chunks,
             stretch,
@@ -252,10 +256,15 @@ class EpisodeScorer:
         donor: Recording | None,
         truth: Truth,
         found: _Found,
-    ) -> dict[str, ObjectScores]:
-        """Scores under other actions, where anything moves; what the robot cannot do is noted."""
+    ) -> tuple[dict[str, ObjectScores], ByteArray | None]:
+        """Scores under other actions, where anything moves; what the robot cannot do is noted.
+
+        Shuffled actions are imagined in any case: their frames are returned beside.
+        """
         scores: dict[str, ObjectScores] = {}
-        for name in self.config.actions if truth.moving.any() else ():
+        shuffled = None
+        moves = truth.moving.any()
+        for name in self.config.actions if moves else {SHUFFLED} & {*self.config.actions}:
             try:
                 actions = with_actions(name, recording, stretch, donor, self.pipeline.robot)
                 if name == 'true' or actions is None:
@@ -264,8 +273,29 @@ class EpisodeScorer:
             except MtvWorldError as error:
                 found.notes[f'{name} actions were not imagined: {error}'] = None
                 continue
-            scores[name] = self._scored(predicted_frames(chunks), truth, found)
-        return scores
+            frames = predicted_frames(chunks)
+            shuffled = frames if name == SHUFFLED else shuffled
+            if moves:
+                scores[name] = self._scored(frames, truth, found)
+        return scores, shuffled
+
+    def _pictures(
+        self, stretch: Stretch, frames: ByteArray, shuffled: ByteArray | None
+    ) -> dict[str, dict[str, float]]:
+        """Picture scores by view: imagined, first frame held, shuffled commands."""
+        held = np.repeat(stretch.frames[:, :1], frames.shape[1], axis=1)
+        compared = {'': frames, f'_{HELD}': held}
+        compared |= {} if shuffled is None else {f'_{SHUFFLED}': shuffled}
+        return {
+            view: {
+                f'{name}{suffix}': value
+                for suffix, shown in compared.items()
+                for name, value in picture_scores(
+                    shown[v], stretch.frames[v, 1:], stretch.frames[v, 0]
+                ).items()
+            }
+            for v, view in enumerate(self.pipeline.spec.views)
+        }
 
     def _ceilings(self, stretch: Stretch, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
         """Scores of the recorded frames: as they are, and through the autoencoder."""
@@ -293,12 +323,20 @@ class EpisodeScorer:
 def _mean_quality(
     stretches: Sequence[tuple[int, dict[str, dict[str, float]]]],
 ) -> dict[str, dict[str, float]]:
-    """Means over the stretches of an episode by view; frames weigh equally."""
-    total = sum(count for count, _ in stretches)
-    return {
-        view: {
-            name: sum(count * found[view][name] for count, found in stretches) / total
+    """Means over the stretches of an episode by view; frames weigh equally, NaN counts nothing."""
+    found: dict[str, dict[str, float]] = {}
+    for view in stretches[0][1]:
+        names = dict.fromkeys(name for _, numbers in stretches for name in numbers[view])
+        found[view] = {
+            name: _weighted(
+                [(count, numbers[view].get(name, np.nan)) for count, numbers in stretches]
+            )
             for name in names
         }
-        for view, names in stretches[0][1].items()
-    }
+    return found
+
+
+def _weighted(values: Sequence[tuple[int, float]]) -> float:
+    known = [(count, value) for count, value in values if np.isfinite(value)]
+    total = sum(count for count, _ in known)
+    return sum(count * value for count, value in known) / total if total else float('nan')

@@ -33,6 +33,7 @@ class EpisodeResult:
         notes: what was wrong with the recording, and what could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: by stage of the episode's evaluation [s].
+        pictures: `picture_scores` by view and name, of held frame and shuffled commands too.
         features: of that estimate, by name; empty where it abstained.
         observed: of the estimate at the end of the recorded frames, likewise; empty where they
             were not judged.
@@ -52,6 +53,7 @@ class EpisodeResult:
     seconds_per_chunk: float
     seconds: Mapping[str, float]
     has_ids: bool
+    pictures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     features: Mapping[str, float] = field(default_factory=dict)
     observed: Mapping[str, float] = field(default_factory=dict)
     resumed: Mapping[str, float] = field(default_factory=dict)
@@ -75,9 +77,13 @@ class EpisodeResult:
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
         for name in ('features', 'observed', 'resumed'):
-            given = values.get(name, {})
-            read[name] = {k: np.nan if v is None else v for k, v in given.items()}
+            read[name] = _with_nan(values.get(name, {}))
+        read['pictures'] = {k: _with_nan(v) for k, v in values.get('pictures', {}).items()}
         return EpisodeResult(**read)
+
+
+def _with_nan(values: Mapping[str, float | None]) -> dict[str, float]:
+    return {k: np.nan if v is None else v for k, v in values.items()}
 
 
 def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 from mtv_world_ros.lab.inspection.inspection_report import broken, Finding, suspicious
 
 Stamps = NDArray[np.int64]
@@ -210,6 +211,15 @@ class JointTrack:
         wanted = np.asarray(stamps_ns - self.stamps_ns[0], float)
         have = np.asarray(self.stamps_ns - self.stamps_ns[0], float)
         return np.stack([np.interp(wanted, have, c) for c in self.positions.T], axis=1)
+
+    def swapped(self, robot: RobotModel, tool: Tool) -> JointTrack:
+        """The track with open and closed of a gripper swapped."""
+        other = copy(self)
+        column = robot.joint_names.index(tool.gripper_joint)
+        other.positions = self.positions.copy()
+        both = tool.gripper_open + tool.gripper_closed
+        other.positions[:, column] = both - self.positions[:, column]
+        return other
 
     def covers(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the stamps lie within the recorded joint states."""

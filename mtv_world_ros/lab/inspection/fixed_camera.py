@@ -21,7 +21,13 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import fill, LinkShape, moving_links, project_part
+from mtv_world_ros.geometry.robot.shape import (
+    fill,
+    LinkShape,
+    moving_links,
+    outermost,
+    project_points,
+)
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.lab.inspection.camera_pose import (
     aligned,
@@ -43,6 +49,8 @@ _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
+#: directions in which a part's outermost points are drawn
+_NUM_CORNERS = 48
 #: parts that move less are left out: an arm that rests says nothing [m]
 _STILL_M = 0.02
 #: of the first search's sizes, the part that it looks at
@@ -57,7 +65,7 @@ _STEP = 5.0
 _LEAST_FIT = 0.45
 
 
-class _Reading(NamedTuple):
+class Reading(NamedTuple):
     """How colours that change are read.
 
     Attributes:
@@ -74,11 +82,11 @@ class _Reading(NamedTuple):
 
 #: grey levels do not tell a grey arm from a brown table; but an arm's shadow on a table is all
 #: brightness. The reading is kept in which drawn and seen changes fit better
-_READINGS = (_Reading(1.0, 4.0, 16.0), _Reading(0.3, 6.0, 20.0))
+READINGS = (Reading(1.0, 4.0, 16.0), Reading(0.3, 6.0, 20.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Changes:
+class Changes:
     """What changed between frames, at one size of the images.
 
     Attributes:
@@ -103,6 +111,8 @@ class FixedCamera:
         robot: gives the links' poses.
         shapes: of the links.
         joints: measured positions.
+        num_frames: that are compared, spread over the recording.
+        num_corners: directions in which a part's outermost points are drawn.
 
     Raises:
         CalibrationError: the arm does not move, or too few frames are within the joint states.
@@ -115,12 +125,15 @@ class FixedCamera:
         robot: RobotModel,
         shapes: Sequence[LinkShape],
         joints: JointTrack,
+        *,
+        num_frames: int = _NUM_FRAMES,
+        num_corners: int = _NUM_CORNERS,
     ) -> None:
         indices = covered_frames(track, joints)
-        chosen = indices[np.unique(np.linspace(0, len(indices) - 1, _NUM_FRAMES).astype(int))]
+        chosen = indices[np.unique(np.linspace(0, len(indices) - 1, num_frames).astype(int))]
         self._positions = joints.at(track.stamps_ns[chosen])
         self._frames = [np.asarray(track.frames[int(i)]) for i in chosen]
-        self._camera = camera
+        self.camera = camera
         poses = robot.forward_kinematics(self._positions)
         moving = moving_links(robot)
         self._parts = [
@@ -131,13 +144,16 @@ class FixedCamera:
         if not self._parts:
             raise _hardly_moves(camera.view)
         self._poses = {part.link: poses[part.link] for part in self._parts}
-        self._points = np.concatenate(
+        self._corners = [
+            _in_base(outermost(part.points, num_corners), poses[part.link]) for part in self._parts
+        ]
+        self.points = np.concatenate(
             [_sample(part.points) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
              for part in self._parts for T in [self._poses[part.link]]],
             axis=1,
         )  # fmt: skip
-        self.centre = self._points.reshape(-1, 3).mean(axis=0)
-        self._pairs = self._far_pairs()
+        self.centre = self.points.reshape(-1, 3).mean(axis=0)
+        self.pairs = self._far_pairs()
 
     def estimate(self, *, guess: bool = True, seed: int = 0) -> CameraEstimate:
         """Estimates the pose, in the robot's base link.
@@ -149,33 +165,33 @@ class FixedCamera:
         Raises:
             CalibrationError: no pose explains the pictures.
         """
-        T = self._camera.T_mount_camera
-        starts = [(T, reading) for reading in _READINGS] if guess else self._search(seed)
+        T = self.camera.T_mount_camera
+        starts = [(T, reading) for reading in READINGS] if guess else self._search(seed)
         found = []
         sizes = {
-            reading: (self._changes(*_WIDE, reading), self._changes(*_MIDDLE, reading))
+            reading: (self.changes(*_WIDE, reading), self.changes(*_MIDDLE, reading))
             for reading in dict.fromkeys(reading for _, reading in starts)
         }
         for start, reading in starts:
             wide, middle = sizes[reading]
             pose = self._aligned(self._aligned(start, wide), middle)
-            found.append((self._fit(pose, middle), pose, reading))
+            found.append((self.fit(pose, middle), pose, reading))
         _, T, reading = max(found, key=lambda one: one[0])
-        near, fine = self._changes(*_NEAR, reading), self._changes(*_FINE, reading)
+        near, fine = self.changes(*_NEAR, reading), self.changes(*_FINE, reading)
         for sign in (1.0, -1.0):
             T = self._refined(T, near, sign * self._alike_steps(T, near))
         T = self._aligned(T, fine)
-        fit = self._fit(T, fine)
+        fit = self.fit(T, fine)
         if fit < _LEAST_FIT:
             raise CalibrationError(
-                f"view '{self._camera.view}': no pose was found at which the drawn robot moves "
+                f"view '{self.camera.view}': no pose was found at which the drawn robot moves "
                 f'like the pictures (correlation {fit:.2f}); is it the right robot, K and clock, '
                 'and does the arm move through the view? A guess nearer to the truth may help'
             )
 
         std_mm, std_deg = self._standard_errors(T, fine)
         return CameraEstimate(
-            camera=with_pose(self._camera, T),
+            camera=with_pose(self.camera, T),
             std_mm=std_mm,
             std_deg=std_deg,
             evidence=f'correlation of drawn and seen motion {fit:.2f} over {len(fine.pairs)} '
@@ -187,7 +203,7 @@ class FixedCamera:
         """(P, 2) pairs of frames between which the robot moves most."""
         count = len(self._positions)
         rows, columns = np.triu_indices(count, 1)
-        apart = np.linalg.norm(self._points[rows] - self._points[columns], axis=-1).mean(axis=1)
+        apart = np.linalg.norm(self.points[rows] - self.points[columns], axis=-1).mean(axis=1)
         order = np.argsort(apart)[::-1]
         used = np.zeros(count, int)
         pairs = []
@@ -197,60 +213,63 @@ class FixedCamera:
                 used[list(pair)] += 1
                 pairs.append(pair)
         if len(pairs) < 8:
-            raise _hardly_moves(self._camera.view)
+            raise _hardly_moves(self.camera.view)
         return np.array(pairs)
 
-    def _changes(self, width: int, blur: float, reading: _Reading) -> _Changes:
-        small = shrunk(self._camera, width)
+    def changes(self, width: int, blur: float, reading: Reading) -> Changes:
+        """What changes between frames, in images of a width, blurred by some pixels."""
+        small = shrunk(self.camera, width)
         size = small.width, small.height
         colours = [
             cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
             for frame in self._frames
         ]
         seen = []
-        for i, j in self._pairs:
+        for i, j in self.pairs:
             apart = _colour_distance(colours[i], colours[j], reading.brightness)
             changed = np.interp(apart, (reading.may, reading.surely), (0.0, 1.0))
             changed = cv2.medianBlur(changed.astype(np.float32), 3)  # noise is single pixels
             seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
-        return _Changes(camera=small, pairs=self._pairs, seen=np.stack(seen), blur=blur)
+        return Changes(camera=small, pairs=self.pairs, seen=np.stack(seen), blur=blur)
 
-    def _fit(self, T: FloatArray, changes: _Changes) -> float:
+    def fit(self, T: FloatArray, changes: Changes) -> float:
         """Correlation of drawn and seen changes, -1 .. 1."""
         drawn = self._drawn(T, changes)
         return float(np.corrcoef(drawn.ravel(), changes.seen.ravel())[0, 1])
 
-    def _drawn(self, T: FloatArray, changes: _Changes) -> NDArray[np.float32]:
+    def _drawn(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
         """(P, H, W) where the pictures of each pair should differ, 0 .. 1."""
         before, after = self._silhouettes(T, changes, self._parts)
         differs = (before ^ after) + np.float32(_INSIDE) * (before & after)
         return np.stack([cv2.GaussianBlur(one, (0, 0), changes.blur) for one in differs])
 
     def _silhouettes(
-        self, T: FloatArray, changes: _Changes, parts: Sequence[LinkShape]
+        self, T: FloatArray, changes: Changes, parts: Sequence[LinkShape]
     ) -> NDArray[np.uint8]:
         """(2, P, H, W) 1 where parts are drawn in the frames of each pair."""
-        camera = with_pose(changes.camera, T)
         rows = np.unique(changes.pairs)
-        T_all = np.repeat(T[None], len(rows), axis=0)
-        drawn = fill(
-            [project_part(p, self._poses[p.link][rows], camera, T_all) for p in parts], camera
-        )
-        return drawn[np.searchsorted(rows, changes.pairs.T)]
+        wanted = {id(part) for part in parts}
+        corners = [
+            corners[rows]
+            for part, corners in zip(self._parts, self._corners, strict=True)
+            if id(part) in wanted
+        ]
+        pixels = project_points(corners, with_pose(changes.camera, T))
+        return fill(pixels, changes.camera)[np.searchsorted(rows, changes.pairs.T)]
 
-    def _aligned(self, T: FloatArray, changes: _Changes) -> FloatArray:
+    def _aligned(self, T: FloatArray, changes: Changes) -> FloatArray:
         """The pose nearby at which drawn and seen changes differ least.
 
         Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
         """
-        return aligned(T, lambda pose: self._errors(pose, changes).ravel(), self.centre,
+        return aligned(T, lambda pose: self.errors(pose, changes).ravel(), self.centre,
                        outlier=_OUTLIER)  # fmt: skip
 
-    def _errors(self, T: FloatArray, changes: _Changes) -> NDArray[np.float32]:
+    def errors(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
         """(P, H W) drawn minus seen changes."""
         return (self._drawn(T, changes) - changes.seen).reshape(len(changes.pairs), -1)
 
-    def _standard_errors(self, T: FloatArray, changes: _Changes) -> tuple[float, float]:
+    def _standard_errors(self, T: FloatArray, changes: Changes) -> tuple[float, float]:
         """Of the camera's place [mm] and direction [degrees].
 
         Errors of the shapes, shadows and the robot's own pattern are the same for a whole link
@@ -280,18 +299,18 @@ class FixedCamera:
         )
 
     def _linearized(
-        self, T: FloatArray, changes: _Changes
+        self, T: FloatArray, changes: Changes
     ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
         """Errors (N,), their weights (N,), and their change by each of `UNITS` (6, N)."""
-        errors = self._errors(T, changes).ravel()
+        errors = self.errors(T, changes).ravel()
         slopes = np.stack(
-            [(self._errors(moved(T, row, self.centre), changes)
-              - self._errors(moved(T, -row, self.centre), changes)).ravel() / 2
+            [(self.errors(moved(T, row, self.centre), changes)
+              - self.errors(moved(T, -row, self.centre), changes)).ravel() / 2
              for row in np.diag(UNITS)]
         )  # fmt: skip
         return errors, 1 / (1 + (errors / _OUTLIER) ** 2), slopes
 
-    def _alike_steps(self, T: FloatArray, changes: _Changes) -> FloatArray:
+    def _alike_steps(self, T: FloatArray, changes: Changes) -> FloatArray:
         """(6, 6) steps, in rows, that change the drawn pixels alike; the largest is of `_STEP`.
 
         A camera that circles the robot while it looks at it hardly changes them: there, least
@@ -302,7 +321,7 @@ class FixedCamera:
         steps = _STEP * vectors * np.sqrt(values[0] / values)
         return np.asarray(steps.T * UNITS, np.float64)
 
-    def _pixels_of_links(self, T: FloatArray, changes: _Changes) -> list[np.ndarray]:
+    def _pixels_of_links(self, T: FloatArray, changes: Changes) -> list[np.ndarray]:
         """Indices of the pixels at which each link is drawn, each pixel at one link."""
         owner = np.full(changes.seen.size, -1)
         links = list(dict.fromkeys(part.link for part in self._parts))
@@ -316,11 +335,11 @@ class FixedCamera:
         return [pixels for pixels in found if len(pixels)]
 
     def _refined(
-        self, T: FloatArray, changes: _Changes, steps: FloatArray, evaluations: int = 220
+        self, T: FloatArray, changes: Changes, steps: FloatArray, evaluations: int = 220
     ) -> FloatArray:
         """The pose nearby that fits best; `steps` (6, 6) are the first ones, in rows [rad, m]."""
         result = minimize(
-            lambda p: -self._fit(moved(T, p @ steps, self.centre), changes),
+            lambda p: -self.fit(moved(T, p @ steps, self.centre), changes),
             np.zeros(6),
             method='Nelder-Mead',
             options={
@@ -333,22 +352,22 @@ class FixedCamera:
         )
         return moved(T, np.asarray(result.x) @ steps, self.centre)
 
-    def _search(self, seed: int) -> list[tuple[FloatArray, _Reading]]:
+    def _search(self, seed: int) -> list[tuple[FloatArray, Reading]]:
         """The best of many upright cameras around the robot, and how each reads changes best."""
         generator = np.random.default_rng(seed)
-        changes = {reading: self._changes(*_COARSE, reading) for reading in _READINGS}
-        reach = float(np.linalg.norm(self._points.reshape(-1, 3) - self.centre, axis=1).max())
-        narrowest = min(self._camera.width / self._camera.K[0, 0],
-                        self._camera.height / self._camera.K[1, 1])  # fmt: skip
-        rough = [_rough(one) for one in changes.values()]
+        changes = {reading: self.changes(*_COARSE, reading) for reading in READINGS}
+        reach = float(np.linalg.norm(self.points.reshape(-1, 3) - self.centre, axis=1).max())
+        narrowest = min(self.camera.width / self.camera.K[0, 0],
+                        self.camera.height / self.camera.K[1, 1])  # fmt: skip
+        rough = [roughened(one) for one in changes.values()]
         tried = []
         for _ in range(_NUM_TRIED):
             away = reach / narrowest * generator.uniform(0.7, 3.5)
-            T = _looking(self.centre, away, reach, generator)
-            fits = self._rough_fits(T, changes[_READINGS[0]], rough)
-            tried.append((max(fits), len(tried), T, _READINGS[int(np.argmax(fits))]))
+            T = random_camera(self.centre, away, reach, generator)
+            fits = self.rough_fits(T, changes[READINGS[0]], rough)
+            tried.append((max(fits), len(tried), T, READINGS[int(np.argmax(fits))]))
         tried.sort(reverse=True)
-        best: list[tuple[FloatArray, _Reading]] = []
+        best: list[tuple[FloatArray, Reading]] = []
         for _, _, T, reading in tried:
             if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
                 best.append((T, reading))
@@ -359,15 +378,15 @@ class FixedCamera:
             (self._refined(T, changes[reading], steps, evaluations=70), reading)
             for T, reading in best
         ]
-        improved.sort(key=lambda one: -self._fit(one[0], changes[one[1]]))
+        improved.sort(key=lambda one: -self.fit(one[0], changes[one[1]]))
         return improved[:3]
 
-    def _rough_fits(
-        self, T: FloatArray, like: _Changes, rough: Sequence[NDArray[np.float32]]
+    def rough_fits(
+        self, T: FloatArray, like: Changes, rough: Sequence[NDArray[np.float32]]
     ) -> list[float]:
         """As `_fit`, with points in place of silhouettes, on each of `_rough`."""
         width, height = like.camera.width // _ROUGH, like.camera.height // _ROUGH
-        pixels, _ = project(with_pose(like.camera, T), T, self._points)
+        pixels, _ = project(with_pose(like.camera, T), T, self.points)
         cells = np.floor(np.nan_to_num(pixels, nan=-99.0) / _ROUGH).astype(int)
         inside = ((cells >= 0) & (cells < (width, height))).all(axis=-1)
         flat = np.where(inside, cells[..., 1] * width + cells[..., 0], width * height)
@@ -379,7 +398,7 @@ class FixedCamera:
         return [float((differs * seen).sum() / norm) for seen in rough]
 
 
-def _rough(changes: _Changes) -> NDArray[np.float32]:
+def roughened(changes: Changes) -> NDArray[np.float32]:
     """(P, cells) seen changes of a part of the size, without their means, of length 1."""
     pairs, height, width = changes.seen.shape
     height, width = height // _ROUGH, width // _ROUGH
@@ -390,7 +409,7 @@ def _rough(changes: _Changes) -> NDArray[np.float32]:
     return seen / (np.linalg.norm(seen) + 1e-9)
 
 
-def _looking(
+def random_camera(
     centre: FloatArray, away: float, reach: float, generator: np.random.Generator
 ) -> FloatArray:
     """A random upright camera around and above a point that looks near it."""
@@ -424,6 +443,11 @@ def _way(part: LinkShape, poses: FloatArray) -> float:
     """How far a part's points get from where they are at first, at most [m]."""
     points = _sample(part.points) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     return float(np.linalg.norm(points - points[0], axis=-1).max())
+
+
+def _in_base(points: FloatArray, poses: FloatArray) -> FloatArray:
+    """(F, N, 3) a link's points (N, 3) where its poses (F, 4, 4) put them."""
+    return points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
 
 
 def _sample(points: FloatArray, count: int = 12) -> FloatArray:

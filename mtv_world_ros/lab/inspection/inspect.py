@@ -47,6 +47,7 @@ from mtv_world_ros.lab.inspection.motion_residual import (
     ResidualSearch,
     WHOLE_SEARCH,
 )
+from mtv_world_ros.lab.inspection.pictures import check_frozen, check_lengths, mirrored
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,
@@ -74,6 +75,13 @@ _BETTER_PLACE = 0.05
 _BETTER_MATCH = 0.1
 #: delay of the images against the joint states from which on it matters [s]
 _MAX_LAG_S = 0.1
+#: gain in the correlation, as a share, from which a delay is shown by the data
+_LAG_GAIN = 0.03
+#: what else may be wrong, and by how much more drawn and seen motion then correlate
+_MIRRORED = 'the drawn robot moves like the mirrored image: the camera mirrors its images'
+_SWAPPED = "fingers move like those of '{}' with open and closed swapped"
+_ALTERNATIVE_GAIN = 0.02
+_ALONE = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())
 
 
 class Inspector:
@@ -138,6 +146,8 @@ class Inspector:
                 ),
                 measured,
                 check_rate('frames', track.stamps_ns),
+                check_frozen(track, joints),
+                check_lengths(track.stamps_ns, joints),
                 check_skew(view, episode.images),
                 check_joint_states(track.stamps_ns, joints),
             ],
@@ -150,7 +160,39 @@ class Inspector:
         residual = self._residual(episode, view, joints)
         if isinstance(residual, Finding):
             return ({}, [residual]), ()
-        return self._judge(residual, episode.cameras[view])
+        measured, notes = self._judge(residual, episode.cameras[view], episode.images[view])
+        findings = [*measured[1], *self._alternatives(episode, view, joints, residual)]
+        return (measured[0], findings), notes
+
+    def stands_still(self, episode: Episode, view: str) -> bool:
+        """Whether a view's camera is neither on the arm nor moved by itself."""
+        on_arm = episode.cameras[view].mount_link in moving_links(self.robot)
+        return not on_arm and view not in episode.camera_tracks
+
+    def _alternatives(
+        self, episode: Episode, view: str, joints: JointTrack, residual: MotionResidual
+    ) -> list[Finding]:
+        """Mirrored frames or a gripper that opens the other way, where they fit much better."""
+        if residual.reason or not self.shape.is_known:
+            return []
+        track, camera = episode.images[view], episode.cameras[view]
+        others: dict[str, tuple[Track, CameraModel, JointTrack]] = {
+            _MIRRORED: (*mirrored(track, camera), joints)
+        }
+        for tool in self.robot.tools:
+            if tool.gripper_joint:
+                swapped = joints.swapped(self.robot, tool)
+                others[_SWAPPED.format(tool.gripper_joint)] = track, camera, swapped
+        found = []
+        for text, (frames, seen_by, states) in others.items():
+            match = measure_residual(
+                frames, seen_by, self.robot, self.shape.parts, states, _ALONE
+            ).match_here
+            if match > residual.match_here + _ALTERNATIVE_GAIN:
+                found.append(
+                    broken(f'{text} (match {match:.2f}, as it is {residual.match_here:.2f})')
+                )
+        return found
 
     def _residual(
         self, episode: Episode, view: str, joints: JointTrack
@@ -168,7 +210,7 @@ class Inspector:
             return broken(f'its images cannot be read: {error}')
 
     def _judge(
-        self, residual: MotionResidual, camera: CameraModel
+        self, residual: MotionResidual, camera: CameraModel, track: Track
     ) -> tuple[Checked, tuple[str, ...]]:
         if residual.reason:
             text = f'calibration not checked against the images: {residual.reason}'
@@ -186,7 +228,9 @@ class Inspector:
                 f'only gross errors were looked for: the robot is drawn with {self.shape.source}'
             )
             findings.append(not_checked(text))
-        if abs(residual.lag_s) >= _MAX_LAG_S - 1e-9:
+        period_s = float(np.median(np.diff(track.stamps_ns))) * 1e-9
+        shown = residual.lag_gain > _LAG_GAIN and abs(residual.lag_s) > 0.99 * period_s
+        if abs(residual.lag_s) >= _MAX_LAG_S - 1e-9 and shown:
             findings.append(
                 suspicious(
                     f'the images fit the joint states best {residual.lag_s:+.1f} s later: their '

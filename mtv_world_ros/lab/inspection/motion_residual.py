@@ -71,6 +71,7 @@ class MotionResidual:
         match_here: the same where the robot is drawn.
         contrast: by how many standard deviations that stands out from other shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
+        lag_gain: how much better they fit there than without a delay, as a share.
         best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
         reason: why it could not be measured; empty where it was.
@@ -81,6 +82,7 @@ class MotionResidual:
     match_here: float = float('nan')
     contrast: float = float('nan')
     lag_s: float = float('nan')
+    lag_gain: float = 0.0
     best_change: tuple[str, float] = ('', float('nan'))
     num_pairs: int = 0
     reason: str = ''
@@ -137,12 +139,15 @@ def measure_residual(
     changes = {name: match(changed) for name, changed in _changes(coarse, search).items()}
     gain = float(now.max()) - match(coarse)
     best = max(changes, key=changes.__getitem__, default='')
+    lags = {lag_s: match(coarse, lag_s) for lag_s in search.lags_s}
+    lag_s = max(lags, key=lags.__getitem__)
     return MotionResidual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
         match_here=float(now[len(now) // 2, len(now) // 2]),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
-        lag_s=max(search.lags_s, key=lambda lag_s: match(coarse, lag_s)),
+        lag_s=lag_s,
+        lag_gain=lags[lag_s] / max(lags.get(0.0, lags[lag_s]), 1e-6) - 1,
         best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
     )

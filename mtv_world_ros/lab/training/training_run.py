@@ -37,7 +37,7 @@ from mtv_world_ros.errors import (
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot.file import save_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.lab.training.base import load_base, needs_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.clips.fit_actions import kept_actions
@@ -110,6 +110,7 @@ def load_recordings(
             with disk_errors_named(cache):
                 recording = cached_recording(path, spec, robot, cache, source)
             check_clips(recording, spec)
+            check_recording(recording, robot)
             if describer is not None:
                 named = described_objects(path, describer, spec.views[0], source)
                 recording = replace(recording, described=named)
@@ -123,6 +124,37 @@ def load_recordings(
         reasons = '; '.join(counted(skipped) or ['none given'])
         raise TrainingError(f'no usable episode: {_other_robot(paths, robot)}{reasons}')
     return recordings, skipped
+
+
+#: joints outside their limits by more are of another unit, zero or robot [rad or m]
+_LIMIT_TOLERANCE = 0.05
+#: joints that move more between two frames change the picture, by more than this [grey levels]
+_MOVES, _SAME_PICTURE = 0.02, 0.02
+#: share of the frames in which joints move that may stay as they were
+_MOST_FROZEN = 0.5
+
+
+def check_recording(recording: Recording, robot: RobotModel) -> None:
+    """Refuses what would teach nonsense: joints in another unit, pictures that are frozen.
+
+    Raises:
+        TrajectoryError: measured joints are far outside their limits.
+        EpisodeError: a view hardly changes while the joints move.
+    """
+    check_positions(robot, recording.positions, tolerance=_LIMIT_TOLERANCE)
+    moves = np.abs(np.diff(recording.positions, axis=0)).max(axis=1) > _MOVES
+    if moves.sum() < 3:
+        return
+    for view, frames in zip((camera.view for camera in recording.cameras), recording.frames,
+                            strict=True):  # fmt: skip
+        pairs = zip(frames[:-1][moves], frames[1:][moves], strict=True)
+        changes = np.array([np.abs(b.astype(np.int16) - a).mean() for a, b in pairs])
+        share = float((changes < _SAME_PICTURE).mean())
+        if share > _MOST_FROZEN:
+            raise EpisodeError(
+                f"view '{view}': {share:.0%} of the frames in which joints move are the same as "
+                'the one before: frozen, or no view of this robot (see mtv-world doctor)'
+            )
 
 
 def _other_robot(paths: Sequence[Path], robot: RobotModel) -> str:

@@ -13,6 +13,14 @@ from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.lab.documents import DASH, Table
 from mtv_world_ros.lab.evaluation.metrics.horizon import by_chunk, Curve, curve
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
+    Following,
+    following,
+    HELD,
+    MEASURES,
+    picture_estimates,
+    SHUFFLED,
+)
 from mtv_world_ros.lab.evaluation.metrics.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, METHOD, summarise
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import agreement, Judgement
@@ -137,6 +145,8 @@ class EvaluationSummary:
             'model': asdict(self.spec),
             'num_episodes_with_true_masks': self.num_true,
             'moving_rule': MOVING_RULE.format(source=source),
+            'follows_commands': asdict(self.following),
+            'pictures': self._pictures(),
             'interval': f'{METHOD}; of FID and FVD jackknife over groups of episodes',
             **self._numbers(ALL),
             'tasks': {task: self._group(Group(task=task)) for task in self.tasks},
@@ -163,6 +173,7 @@ class EvaluationSummary:
         by_task = [(f'{task} · {view}', self.estimates(view, Group(task=task)))
                    for task in self.tasks for view in views]  # fmt: skip
         parts = [
+            self.following.line,
             f'# {self.name or "Evaluation"}\n\n{len(self.results)} episodes: {counts}.',
             self._truth(),
             BRACKETS,
@@ -173,11 +184,41 @@ class EvaluationSummary:
             tables.controls_table(by_view),
             self._chunks_table(),
             tables.quality_table(by_view),
+            self._pictures_table(),
             tables.status_table({view: self._statuses(view) for view in views}),
             '\n'.join(f'- not scored: {path}: {why}' for path, why in self.failed.items()),
             '\n'.join(f'- {r.episode}: {note}' for r in self.results for note in r.notes),
         ]
         return '\n\n'.join(part for part in parts if part) + '\n'
+
+    @property
+    def following(self) -> Following:
+        """Whether the model follows the commands, by pictures alone."""
+        return following(picture_estimates([result.pictures for result in self.results]))
+
+    def _pictures(self) -> dict[str, Any]:
+        """Picture scores by view, with intervals."""
+        episodes = [result.pictures for result in self.results]
+        views = {view: picture_estimates(episodes, view) for view in self.spec.views}
+        return {
+            view: {name: asdict(estimate) for name, estimate in found.items()}
+            for view, found in {**views, 'overall': picture_estimates(episodes)}.items()
+        }
+
+    def _pictures_table(self) -> str:
+        """Picture scores beside the held frame and shuffled commands; empty without any."""
+        episodes = [result.pictures for result in self.results if result.pictures]
+        if not episodes:
+            return ''
+        kinds = {'': 'imagined', f'_{HELD}': 'first frame held', f'_{SHUFFLED}': 'other commands'}
+        rows = [
+            [f'{view or "all views"} · {words}',
+             *(tables.cell(found.get(f'{name}{suffix}')) for name in MEASURES)]
+            for view in (*self.spec.views, None)
+            for found in [picture_estimates(episodes, view)]
+            for suffix, words in kinds.items()
+        ]  # fmt: skip
+        return Table(head=['pictures', *MEASURES.values()], rows=rows).text()
 
     def _why_dashes(self) -> str:
         """Why numbers of objects are not there, a line each; empty where all are."""

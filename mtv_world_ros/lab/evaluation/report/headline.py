@@ -11,6 +11,7 @@ import numpy as np
 
 from mtv_world_ros.lab.documents import DASH, number, Table, with_interval
 from mtv_world_ros.lab.evaluation.metrics.horizon import curve
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import Following
 from mtv_world_ros.lab.evaluation.metrics.statistics import mean_interval, MIN_EPISODES
 from mtv_world_ros.lab.evaluation.report.charts import ChartLine, Dot, dot_chart, line_chart
 from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, ranked_by, scores
@@ -91,6 +92,11 @@ def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
     overall = [found.metrics['overall'] for found in evaluations]
     return {
         'words': words,
+        'follows': [
+            (mark(index, evaluations), Following(**found.metrics['follows_commands']).line)
+            for index, found in enumerate(evaluations)
+            if 'follows_commands' in found.metrics
+        ],
         'verdicts': [
             (mark(index, evaluations), _doubts(found), _few(found))
             for index, found in enumerate(evaluations)

@@ -1,0 +1,167 @@
+"""`mtv-world calibrate-camera` of several recordings: moved cameras, focal length, points."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.data.episode import Episode
+    from mtv_world_ros.data_types import CameraModel
+    from mtv_world_ros.geometry.robot.model import RobotModel
+    from mtv_world_ros.geometry.robot.shape import LinkShape
+    from mtv_world_ros.lab.inspection.shared_camera import SharedEstimate
+
+
+def is_shared(arguments: argparse.Namespace) -> bool:
+    """Whether several recordings are asked about, or what one recording's search has not."""
+    asked = arguments.points or arguments.focal == 'estimate' or arguments.apply
+    return bool(asked) or len(recordings(arguments.episodes)) > 1
+
+
+def recordings(paths: Sequence[Path]) -> list[Path]:
+    """Returns recordings, and those in folders.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    from mtv_world_ros.data.episode_reader import list_episodes
+
+    found: list[Path] = []
+    for path in paths:
+        inside = (
+            [] if (path / 'metadata.yaml').is_file() or path.is_file() else list_episodes(path)
+        )
+        found += inside or [path]
+    if not found:
+        raise ConfigError('name at least one recording')
+    return found
+
+
+def calibrate_shared(arguments: argparse.Namespace) -> int:
+    """Runs the command on all recordings."""
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.geometry.robot.shape import load_shape
+    from mtv_world_ros.lab.inspection.shared_camera import estimate_shared, load_points
+
+    if arguments.mount_link or arguments.between:
+        raise ConfigError('--mount-link and --between are for one recording')
+    points = load_points(arguments.points, arguments.view) if arguments.points else None
+    episodes, file = _read_all(arguments)
+    robot = load_robot(file)
+    shape = load_shape(robot)
+    if not shape.is_known:
+        raise ConfigError(
+            f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
+            'the meshes of its URDF'
+        )
+    view = arguments.view
+    unknown = {episode.info.path: episode.unknown.get(view, '') for episode in episodes}
+    has_guess = arguments.guess and not any(unknown.values()) and points is None
+    if arguments.guess and any(unknown.values()) and points is None:
+        print('the pose is not known: searched from all sides; --points gives a start')
+    known = arguments.focal == 'known' or (
+        arguments.focal is None and not any('intrinsics' in what for what in unknown.values())
+    )
+    estimate = estimate_shared(
+        episodes,
+        view,
+        robot,
+        shape.parts,
+        guess=has_guess,
+        points=points,
+        focal_known=known,
+        seed=arguments.seed,
+    )
+    print(describe(estimate, episodes, focal_known=known))
+    _write(arguments, estimate, episodes, robot, shape.parts)
+    return 0
+
+
+def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
+    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.cli.own_robot import read_for_checks, robot_file
+
+    paths = recordings(arguments.episodes)
+    file, source = robot_file(arguments, paths[0])
+    robot = load_robot(file)
+    episodes = [
+        read_for_checks(path, [arguments.view], source, robot, robot.base_link) for path in paths
+    ]
+    return episodes, file
+
+
+def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_known: bool) -> str:
+    """Returns the table: a line a recording, with its place, the doctor's measures and doubts."""
+    view, width = estimate.cameras[0].view, estimate.cameras[0].width
+    how = 'as given' if focal_known or estimate.kept_guess else 'estimated'
+    count = len(set(estimate.places.place.tolist()))
+    focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how})'
+    lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
+    if estimate.kept_guess:
+        lines.append("the guess fits better by the doctor's measure and is kept")
+    for number, episode in enumerate(episodes):
+        x, y, z = estimate.cameras[number].T_mount_camera[:3, 3]
+        measure = estimate.measures[number]
+        parts = [f'place {estimate.places.place[number]}', f'at ({x:.3f}, {y:.3f}, {z:.3f}) m']
+        parts.append(f'fit {estimate.fits[number]:.2f}, match {measure.match_here:.2f}')
+        if estimate.guess_measures:
+            parts.append(f'guess {estimate.guess_measures[number].match_here:.2f}')
+        doubt = estimate.doubts(number)
+        parts += [f'doubted: {doubt}'] if doubt else []
+        lines.append(f'{episode.info.path.name}: {"; ".join(parts)}')
+    return '\n'.join(lines)
+
+
+def _write(
+    arguments: argparse.Namespace,
+    estimate: SharedEstimate,
+    episodes: Sequence[Episode],
+    robot: RobotModel,
+    parts: Sequence[LinkShape],
+) -> None:
+    """Writes a calibration file and a picture a place, and with `--apply` into the episodes."""
+    from dataclasses import replace
+
+    from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
+    from mtv_world_ros.lab.inspection.clocks import JointTrack
+    from mtv_world_ros.lab.inspection.inspect import overlay_picture
+    from mtv_world_ros.rendering.images import write_png
+
+    view = arguments.view
+    out = arguments.out or Path('out/camera') / f'{view}.yaml'
+    numbers = estimate.places.place.tolist()
+    several = len(set(numbers)) > 1
+    for place in dict.fromkeys(numbers):
+        file = out.with_stem(f'{out.stem}_{place}') if several else out
+        known = load_calibration(file) if file.is_file() else {}
+        if view in known and arguments.out is not None:
+            raise ConfigError(f"'{file}' has view '{view}' already; name another --out")
+        first = numbers.index(place)
+        save_calibration(file, {**known, view: estimate.cameras[first]})
+        states = episodes[first].joint_states
+        assert states is not None
+        shown = replace(episodes[first], cameras={view: estimate.cameras[first]})
+        picture = overlay_picture(shown, view, robot, parts, JointTrack(states, robot))
+        write_png(file.with_suffix('.png'), picture)
+        print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')
+    if arguments.apply:
+        for episode, camera in zip(episodes, estimate.cameras, strict=True):
+            _apply(episode, camera)
+
+
+def _apply(episode: Episode, camera: CameraModel) -> None:
+    """Adds a view to the calibration of an episode that has none of it."""
+    from mtv_world_ros.data.episode import CALIBRATION_FILE
+    from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
+
+    file = episode.info.path / CALIBRATION_FILE
+    known = load_calibration(file) if file.is_file() else {}
+    if camera.view in known:
+        print(f"'{file}' has view '{camera.view}' already and is left as it is")
+        return
+    save_calibration(file, {**known, camera.view: camera})

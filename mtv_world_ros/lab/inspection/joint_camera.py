@@ -1,0 +1,425 @@
+"""Estimates one fixed camera from several recordings: its places, and its focal length.
+
+Recordings in which it stands at the same place share a pose, all share the focal length. What is
+compared is what `FixedCamera` compares: where drawn silhouettes say that pictures change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.lab.inspection.camera_pose import moved, UNITS
+from mtv_world_ros.lab.inspection.fixed_camera import (
+    Changes,
+    FixedCamera,
+    random_camera,
+    Reading,
+    READINGS,
+    roughened,
+)
+from mtv_world_ros.lab.inspection.places import CameraPlaces, turn_between
+
+#: widths of the images and blurs [px], from coarse to fine
+_COARSE, _FIRST, _STAGES = (64, 1.5), (64, 3.0), ((80, 3.0), (120, 2.0), (160, 1.2))
+#: recordings whose background is shifted by less look alike to the search [share of the width]
+_NEAR = 0.06
+#: difference of drawn and seen change from which on a pixel counts less
+_OUTLIER = 0.3
+#: cameras tried without a guess, how many of the best are improved, and then looked at closely
+_NUM_TRIED, _NUM_KEPT, _NUM_REFINED = 2400, 6, 2
+#: recordings that the search without a guess looks at
+_NUM_SEARCHED = 4
+#: cameras that points are fitted from
+_NUM_POINT_STARTS = 24
+#: standard deviation of where a place is, against where the background says [`UNITS`]
+_OWN_STD = np.array([3.0] * 3 + [2.0] * 3)
+#: standard deviation of where somebody sees a tool point [share of the image width]
+_POINT_STD = 0.006
+#: weight of these against the mean squared errors of a recording's pixels
+_STIFFNESS = 0.003
+#: a zoom's unit, and its standard deviation where the focal length is known or a mere guess
+_ZOOM_UNIT, _ZOOM_KNOWN, _ZOOM_GUESSED = 0.02, 0.003, 0.35
+
+
+def zoomed(camera: CameraModel, factor: float) -> CameraModel:
+    """Returns the camera with another focal length."""
+    K = camera.K.copy()
+    K[:2, :2] *= factor
+    return replace(camera, K=K)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenPoint:
+    """A tool point that somebody saw in a frame.
+
+    Attributes:
+        recording: number of the recording.
+        position: (3,) of the tool point, by the joint states, in the base link [m].
+        pixel: (2,) where it was seen [px].
+    """
+
+    recording: int
+    position: FloatArray
+    pixel: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointState:
+    """Poses and focal length of a camera in several recordings.
+
+    Attributes:
+        poses: (4, 4) T_base_camera [m] by place.
+        zoom: focal length against that of the camera given.
+        own_steps: (6,) by place, in `UNITS`: how far its pose has gone its own way.
+    """
+
+    poses: Mapping[int, FloatArray]
+    zoom: float = 1.0
+    own_steps: Mapping[int, FloatArray] = field(default_factory=dict)
+
+    def own(self, place: int) -> FloatArray:
+        """The own steps of a place, (6,)."""
+        return self.own_steps.get(place, np.zeros(6))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Step:
+    """Normal equations of a place: six of its pose, and the zoom."""
+
+    normal: FloatArray
+    gradient: FloatArray
+
+
+class JointCamera:
+    """Estimates poses by place, and one focal length.
+
+    Args:
+        recordings: one of each recording.
+        places: number of the place of each.
+        intrinsics_known: whether the focal length is that of a calibration.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[FixedCamera],
+        places: Sequence[int],
+        *,
+        intrinsics_known: bool,
+    ) -> None:
+        self._recordings, self._places = list(recordings), list(places)
+        self._zoom_std = _ZOOM_KNOWN if intrinsics_known else _ZOOM_GUESSED
+        self._centre = np.mean([one.centre for one in recordings], axis=0)
+        self._points: Sequence[SeenPoint] = ()
+        self._seen: dict[tuple[int, int, float, Reading], Changes] = {}
+
+    def estimate(
+        self,
+        places: CameraPlaces,
+        guess: JointState | None = None,
+        points: Sequence[SeenPoint] = (),
+        seed: int = 0,
+    ) -> JointState:
+        """Estimates all poses and the zoom.
+
+        Args:
+            places: of the recordings.
+            guess: to start from; None = from points, or from cameras all around.
+            points: seen tool points, of any of the recordings.
+            seed: of the search.
+        """
+        self._points = points
+        if guess is not None:
+            starts = [guess]
+        elif points:
+            starts = [self.from_points(places, points, seed)]
+        else:
+            near = [n for n in places.near(_NEAR) if n < len(self._recordings)][:_NUM_SEARCHED]
+            found = [
+                self.refined(self._spread(near[0], T, zoom, places), (_FIRST,), 10, near)
+                for T, zoom in self.search(near, seed)
+            ]
+            found.sort(key=lambda state: -float(self.fits(state, _FIRST, near).mean()))
+            starts = found[:_NUM_REFINED]
+            starts = [self._respread(near[0], state, places) for state in starts]
+        ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
+        best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
+        if guess is None:
+            best = self._respread(places.near(_NEAR)[0], best, places)
+        return self.refined(best, _STAGES[1:], 9)
+
+    def from_points(
+        self, places: CameraPlaces, points: Sequence[SeenPoint], seed: int = 0
+    ) -> JointState:
+        """The state at which tool points are seen where somebody saw them."""
+        camera = self._recordings[0].camera
+        focal = float(camera.K[0, 0])
+        first = points[0].recording
+        turns = np.stack([self._turn(first, p.recording, places, focal) for p in points])
+        X = np.stack([point.position for point in points])
+        seen = np.stack([point.pixel for point in points])
+        generator = np.random.default_rng(seed)
+        std = min(self._zoom_std, 0.3)
+
+        def errors(p: FloatArray) -> FloatArray:
+            local = (X - p[3:6]) @ cv2.Rodrigues(p[:3])[0]
+            local = np.einsum('nij,nj->ni', turns, local)
+            depth = np.maximum(local[:, 2:], 0.05)
+            pixels = local[:, :2] / depth * camera.K[[0, 1], [0, 1]] * np.exp(p[6])
+            apart = (pixels + camera.K[:2, 2] - seen) / (0.012 * camera.width)
+            return np.concatenate([apart.ravel(), p[6:] / std])
+
+        best = None
+        reach = float(np.linalg.norm(X - X.mean(axis=0), axis=1).max()) + 0.2
+        for _ in range(_NUM_POINT_STARTS):
+            T = random_camera(X.mean(axis=0), generator.uniform(0.3, 2.5), reach, generator)
+            start = np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3], [0.0]])
+            found = least_squares(errors, start, loss='soft_l1', max_nfev=60)
+            if best is None or found.cost < best.cost:
+                best = found
+        assert best is not None
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(best.x[:3])[0], best.x[3:6]
+        return self._spread(first, T, float(np.exp(best.x[6])), places)
+
+    def _turn(self, a: int, b: int, places: CameraPlaces, focal: float) -> FloatArray:
+        """(3, 3) that takes rays of recording a to those of b; by a third one where none match."""
+        if places.place[a] == places.place[b]:
+            return np.eye(3)
+        width = self._recordings[0].camera.width
+        for path in ((a, b), *((a, c, b) for c in np.argsort(places.apart[a]))):
+            steps = list(zip(path, path[1:], strict=False))
+            if all(tuple(sorted(step)) in places.matches for step in steps):
+                R = np.eye(3)
+                for x, y in steps:
+                    pairs = places.matches[min(x, y), max(x, y)]
+                    R = turn_between(pairs if x < y else pairs[:, ::-1], focal / width) @ R
+                return R
+        return np.eye(3)
+
+    def _spread(self, number: int, T: FloatArray, zoom: float, places: CameraPlaces) -> JointState:
+        """The state with a recording's pose, the others turned as their backgrounds say."""
+        focal = float(self._recordings[0].camera.K[0, 0]) * zoom
+        poses = {}
+        for other, place in enumerate(self._places):
+            if place not in poses:
+                turned = T.copy()
+                turned[:3, :3] = T[:3, :3] @ self._turn(number, other, places, focal).T
+                poses[place] = turned
+        return JointState(poses=poses, zoom=zoom)
+
+    def _respread(self, number: int, state: JointState, places: CameraPlaces) -> JointState:
+        T = state.poses[self._places[number]]
+        spread = self._spread(number, T, state.zoom, places)
+        return replace(spread, poses={**spread.poses, self._places[number]: T})
+
+    def _changes(self, number: int, stage: tuple[int, float], reading: Reading) -> Changes:
+        key = (number, *stage, reading)
+        if key not in self._seen:
+            self._seen[key] = self._recordings[number].changes(*stage, reading)
+        return self._seen[key]
+
+    def search(self, members: Sequence[int], seed: int = 0) -> list[tuple[FloatArray, float]]:
+        """Poses and zooms from cameras all around that fit some recordings best, best first.
+
+        Args:
+            members: numbers of recordings in which the camera stands at about the same place.
+            seed: of the cameras tried.
+        """
+        generator = np.random.default_rng(seed)
+        members = members[:_NUM_SEARCHED]
+        chosen = [self._recordings[n] for n in members]
+        changes = [{r: self._changes(n, _COARSE, r) for r in READINGS} for n in members]
+        rough = [[roughened(found) for found in each.values()] for each in changes]
+        points = np.concatenate([one.points.reshape(-1, 3) for one in chosen])
+        reach = float(np.linalg.norm(points - self._centre, axis=1).max())
+        camera = changes[0][READINGS[0]].camera
+        tried = []
+        for _ in range(_NUM_TRIED):
+            zoom = 1.0 if self._zoom_std < 0.1 else float(np.exp(generator.normal(0, 0.3)))
+            narrowest = min(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]) / zoom
+            away = reach / narrowest * generator.uniform(0.5, 3.5)
+            T = random_camera(self._centre, away, reach, generator)
+            fits = [
+                max(one.rough_fits(T, _zoomed(each[READINGS[0]], zoom), cells))
+                for one, each, cells in zip(chosen, changes, rough, strict=True)
+            ]
+            tried.append((float(np.mean(fits)), len(tried), T, zoom))
+        tried.sort(reverse=True)
+        best: list[tuple[FloatArray, float]] = []
+        for _, _, T, zoom in tried:
+            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
+                best.append((T, zoom))
+            if len(best) == _NUM_KEPT:
+                break
+        return best
+
+    def fits(
+        self,
+        state: JointState,
+        stage: tuple[int, float] = _STAGES[1],
+        members: Sequence[int] | None = None,
+    ) -> FloatArray:
+        """(R,) correlation of drawn and seen changes of recordings; None = of all."""
+        found = []
+        for number in range(len(self._recordings)) if members is None else members:
+            one, T = self._recordings[number], state.poses[self._places[number]]
+            read = [_zoomed(self._changes(number, stage, r), state.zoom) for r in READINGS]
+            found.append(max(one.fit(T, changes) for changes in read))
+        return np.array(found)
+
+    def refined(
+        self,
+        state: JointState,
+        stages: Sequence[tuple[int, float]] = _STAGES,
+        iterations: int = 8,
+        members: Sequence[int] | None = None,
+    ) -> JointState:
+        """The state nearby at which drawn and seen changes differ least."""
+        numbers = range(len(self._recordings)) if members is None else members
+        for stage in stages:
+            changes = {n: self._read(n, state, stage) for n in numbers}
+            state = self._aligned(state, changes, iterations)
+        return state
+
+    def _read(self, number: int, state: JointState, stage: tuple[int, float]) -> Changes:
+        """The changes of a recording, read in the way that fits better."""
+        one, T = self._recordings[number], state.poses[self._places[number]]
+        read = [self._changes(number, stage, reading) for reading in READINGS]
+        return max(read, key=lambda found: one.fit(T, _zoomed(found, state.zoom)))
+
+    def _aligned(
+        self, state: JointState, changes: Mapping[int, Changes], iterations: int
+    ) -> JointState:
+        damping, cost = 1e-3, self._cost(state, changes)
+        for _ in range(iterations):
+            steps = self._steps(state, changes)
+            tried = self._moved(state, steps, damping)
+            there = self._cost(tried, changes)
+            if there < cost:
+                gain = (cost - there) / cost
+                state, cost, damping = tried, there, damping / 4
+                if gain < 1e-4:
+                    break
+            else:
+                damping *= 12
+                if damping > 1e4:
+                    break
+        return state
+
+    def _errors(
+        self, number: int, T: FloatArray, zoom: float, changes: Mapping[int, Changes]
+    ) -> NDArray[np.floating]:
+        one = self._recordings[number]
+        return one.errors(T, _zoomed(changes[number], zoom)).ravel()
+
+    def _cost(self, state: JointState, changes: Mapping[int, Changes]) -> float:
+        pulls = [(state.own(place) / _OWN_STD) ** 2 for place in state.poses]
+        prior = (np.log(state.zoom) / self._zoom_std) ** 2 + float(np.sum(pulls))
+        for point in self._points:
+            apart = self._point_error(
+                point, state.poses[self._places[point.recording]], state.zoom
+            )
+            prior += 2 * float(np.log1p((apart**2).sum() / 2))
+        total = _STIFFNESS / _OUTLIER**2 * prior
+        for number in changes:
+            T = state.poses[self._places[number]]
+            errors = self._errors(number, T, state.zoom, changes)
+            total += float(np.log1p((errors / _OUTLIER) ** 2).mean())
+        return total
+
+    def _point_error(self, point: SeenPoint, T: FloatArray, zoom: float) -> FloatArray:
+        """(2,) how far a point is drawn from where it was seen [standard deviations]."""
+        camera = self._recordings[0].camera
+        local = T[:3, :3].T @ (point.position - T[:3, 3])
+        pixel = zoom * camera.K[[0, 1], [0, 1]] * local[:2] / max(float(local[2]), 0.05)
+        return (pixel + camera.K[:2, 2] - point.pixel) / (_POINT_STD * camera.width)
+
+    def _add_points(self, state: JointState, found: dict[int, _Step]) -> None:
+        """Adds the seen points to the normal equations of their places."""
+        for point in self._points:
+            place = self._places[point.recording]
+            if place not in found:
+                continue
+            T, zoom = state.poses[place], state.zoom
+            now = self._point_error(point, T, zoom)
+            slopes = [
+                (self._point_error(point, moved(T, row, self._centre), zoom)
+                 - self._point_error(point, moved(T, -row, self._centre), zoom)) / 2
+                for row in np.diag(UNITS)
+            ]  # fmt: skip
+            wide = self._point_error(point, T, zoom * np.exp(_ZOOM_UNIT))
+            narrow = self._point_error(point, T, zoom * np.exp(-_ZOOM_UNIT))
+            table = np.stack([*slopes, (wide - narrow) / 2])
+            weight = _STIFFNESS / (1 + float((now**2).sum()) / 2)
+            step = found[place]
+            found[place] = _Step(
+                normal=step.normal + weight * (table @ table.T),
+                gradient=step.gradient + weight * (table @ now),
+            )
+
+    def _steps(self, state: JointState, changes: Mapping[int, Changes]) -> dict[int, _Step]:
+        """Normal equations by place."""
+        found: dict[int, _Step] = {}
+        for number in changes:
+            place = self._places[number]
+            T, zoom = state.poses[place], state.zoom
+            now = self._errors(number, T, zoom, changes)
+            slopes = [
+                (self._errors(number, moved(T, row, self._centre), zoom, changes)
+                 - self._errors(number, moved(T, -row, self._centre), zoom, changes)) / 2
+                for row in np.diag(UNITS)
+            ]  # fmt: skip
+            wide, narrow = zoom * np.exp(_ZOOM_UNIT), zoom * np.exp(-_ZOOM_UNIT)
+            slopes.append((self._errors(number, T, wide, changes)
+                           - self._errors(number, T, narrow, changes)) / 2)  # fmt: skip
+            table = np.stack(slopes)
+            weighted = table / (1 + (now / _OUTLIER) ** 2) / now.size
+            step = _Step(
+                normal=np.asarray(weighted @ table.T, np.float64),
+                gradient=np.asarray(weighted @ now, np.float64),
+            )
+            before = found.get(place)
+            found[place] = step if before is None else _Step(
+                normal=before.normal + step.normal, gradient=before.gradient + step.gradient
+            )  # fmt: skip
+        self._add_points(state, found)
+        return found
+
+    def _moved(self, state: JointState, steps: Mapping[int, _Step], damping: float) -> JointState:
+        """The state after a damped step of what all share (pose, zoom) and of each place's own.
+
+        A place's own six numbers are eliminated first (Schur complement).
+        """
+        shared, slope = np.zeros((7, 7)), np.zeros(7)
+        shared[6, 6] = _STIFFNESS * (_ZOOM_UNIT / self._zoom_std) ** 2
+        slope[6] = shared[6, 6] * np.log(state.zoom) / _ZOOM_UNIT
+        solved = {}
+        for place, step in steps.items():
+            normal = step.normal + damping * np.diag(np.diag(step.normal))
+            own = normal[:6, :6] + np.diag(_STIFFNESS / _OWN_STD**2)
+            pull = step.gradient[:6] + _STIFFNESS / _OWN_STD**2 * state.own(place)
+            gain = np.linalg.solve(own, np.column_stack([normal[:6], pull]))
+            shared += normal - normal[:, :6] @ gain[:, :7]
+            slope += step.gradient - normal[:, :6] @ gain[:, 7]
+            solved[place] = gain
+        step_of_all = -np.linalg.solve(shared + 1e-12 * np.eye(7), slope)
+        step_of_all *= min(1.0, 4.0 / max(float(np.abs(step_of_all).max()), 1e-9))
+        poses, own_steps = dict(state.poses), dict(state.own_steps)
+        for place, gain in solved.items():
+            own_step = (-gain[:, :7] @ step_of_all - gain[:, 7]).clip(-4, 4)
+            change = step_of_all[:6] + own_step
+            poses[place] = moved(poses[place], change * UNITS, self._centre)
+            own_steps[place] = state.own(place) + own_step
+        zoom = state.zoom * float(np.exp(step_of_all[6] * _ZOOM_UNIT))
+        return JointState(poses=poses, zoom=zoom, own_steps=own_steps)
+
+
+def _zoomed(changes: Changes, factor: float) -> Changes:
+    return replace(changes, camera=zoomed(changes.camera, factor))

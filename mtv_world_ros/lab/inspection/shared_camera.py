@@ -1,0 +1,229 @@
+"""One view of several recordings: its poses and focal length, judged beside a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.config import read_yaml
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError, ConfigError
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import LinkShape, moving_links
+from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
+from mtv_world_ros.lab.inspection.joint_camera import JointCamera, JointState, SeenPoint, zoomed
+from mtv_world_ros.lab.inspection.motion_residual import (
+    measure_residual,
+    MotionResidual,
+    ResidualSearch,
+)
+from mtv_world_ros.lab.inspection.places import background, CameraPlaces, find_places
+
+#: frames of a recording that are compared, and directions in which shapes are drawn
+_NUM_FRAMES, _NUM_CORNERS = 10, 20
+#: the doctor's measure alone: nothing else is tried
+_MEASURE = ResidualSearch(max_pairs=24, lags_s=(0.0,), rolls_deg=(), zooms=())
+#: distance of drawn and seen robot from which on a pose is doubted [share of the width]
+_DOUBTED = 0.02
+#: correlation of drawn and seen motion (the doctor's) from which on a pose is not doubted
+_LEAST_MATCH = 0.25
+#: correlation of drawn and seen changes below which a pose is doubted: on ten real recordings a
+#: view with the right focal length had .71 to .83, one with a wrong one .57 to .70
+_LEAST_FIT = 0.705
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedEstimate:
+    """What was found of one view in several recordings.
+
+    Attributes:
+        cameras: of each recording, (R,).
+        places: which recordings share one.
+        measures: the doctor's measure of each recording.
+        guess_measures: the same of the guess; empty where there was none.
+        kept_guess: whether the guess fits better and is what `cameras` has.
+        focal_px: estimated, or the one given.
+        fits: (R,) correlation of drawn and seen changes of each recording.
+    """
+
+    cameras: tuple[CameraModel, ...]
+    places: CameraPlaces
+    measures: tuple[MotionResidual, ...]
+    guess_measures: tuple[MotionResidual, ...]
+    kept_guess: bool
+    focal_px: float
+    fits: FloatArray
+
+    def doubts(self, number: int) -> str:
+        """Why the pose of a recording may be wrong; empty where nothing says so."""
+        measure = self.measures[number]
+        if measure.reason:
+            return f'not checked: {measure.reason}'
+        if self.fits[number] < _LEAST_FIT:
+            return (
+                f'drawn and seen changes correlate by {self.fits[number]:.2f}, below '
+                f'{_LEAST_FIT:g}: pose or focal length may be wrong'
+            )
+        apart = float(np.hypot(*measure.shift_px)) / self.cameras[number].width
+        if measure.match_here < _LEAST_MATCH:
+            return f'drawn and seen motion correlate by {measure.match_here:.2f} only'
+        if apart > _DOUBTED and measure.match > 1.05 * measure.match_here:
+            return f'the robot moves {apart:.1%} of the width beside where it is drawn'
+        return ''
+
+
+def estimate_shared(
+    episodes: Sequence[Episode],
+    view: str,
+    robot: RobotModel,
+    shapes: Sequence[LinkShape],
+    *,
+    guess: bool,
+    points: Mapping[str, Sequence[Any]] | None = None,
+    focal_known: bool = True,
+    seed: int = 0,
+) -> SharedEstimate:
+    """Estimates one fixed camera from several recordings.
+
+    Args:
+        episodes: with cameras of the view, whose intrinsics and, with `guess`, pose are starts.
+        view: the view.
+        robot: of the recordings.
+        shapes: of its links.
+        guess: start from the poses of the recordings.
+        points: seen tool points by the name of the episode: (time [s], x, y [px]).
+        focal_known: whether the focal length is right as it is.
+        seed: of the search.
+
+    Raises:
+        CalibrationError: a camera is on the arm, or the arm stands still.
+        ConfigError: a point is of no episode or of no frame.
+    """
+    tracks = [_joints(episode, robot) for episode in episodes]
+    cameras = [_on_base(episode.cameras[view], robot) for episode in episodes]
+    focal = float(np.median([camera.K[0, 0] for camera in cameras]))
+    cameras = [zoomed(camera, focal / camera.K[0, 0]) for camera in cameras]
+    recordings = [
+        FixedCamera(
+            episode.images[view], camera, robot, shapes, joints,
+            num_frames=_NUM_FRAMES, num_corners=_NUM_CORNERS,
+        )
+        for episode, camera, joints in zip(episodes, cameras, tracks, strict=True)
+    ]  # fmt: skip
+    places = find_places([background(episode.images[view]) for episode in episodes])
+    numbers = [int(n) for n in places.place]
+    joint = JointCamera(recordings, numbers, intrinsics_known=focal_known)
+    given = JointState(
+        poses={p: c.T_mount_camera for p, c in reversed(list(zip(numbers, cameras, strict=True)))}
+    )
+    seen = _seen_points(points or {}, episodes, tracks, robot)
+    state = joint.estimate(places, given if guess else None, seen, seed)
+
+    def measured(found: Sequence[CameraModel]) -> tuple[MotionResidual, ...]:
+        rows = zip(episodes, found, tracks, strict=True)
+        return tuple(
+            measure_residual(episode.images[view], camera, robot, shapes, joints, _MEASURE)
+            for episode, camera, joints in rows
+        )
+
+    ends = [
+        replace(zoomed(camera, state.zoom), T_mount_camera=state.poses[place])
+        for camera, place in zip(cameras, numbers, strict=True)
+    ]
+    measures, before = measured(ends), measured(cameras) if guess else ()
+    kept = bool(before) and _mean_match(before) > _mean_match(measures)
+    return SharedEstimate(
+        cameras=tuple(cameras if kept else ends),
+        places=places,
+        measures=before if kept else measures,
+        guess_measures=before,
+        kept_guess=kept,
+        focal_px=focal if kept else focal * state.zoom,
+        fits=joint.fits(given if kept else state),
+    )
+
+
+def _mean_match(measures: Sequence[MotionResidual]) -> float:
+    found = [measure.match_here for measure in measures if not measure.reason]
+    return float(np.mean(found)) if found else -1.0
+
+
+def _joints(episode: Episode, robot: RobotModel) -> JointTrack:
+    if episode.joint_states is None:
+        raise CalibrationError(f"'{episode.info.path}' has no joint_states")
+    return JointTrack(episode.joint_states, robot)
+
+
+def _on_base(camera: CameraModel, robot: RobotModel) -> CameraModel:
+    if camera.mount_link in moving_links(robot):
+        raise CalibrationError(
+            f"view '{camera.view}' is on the arm ('{camera.mount_link}'): several recordings "
+            'are compared for a camera that stands still; give one recording, and --mount-link'
+        )
+    rest = robot.link_poses(camera.mount_link, np.zeros((1, len(robot.joint_names))))[0]
+    return replace(camera, mount_link=robot.base_link, T_mount_camera=rest @ camera.T_mount_camera)
+
+
+def _seen_points(
+    points: Mapping[str, Sequence[Any]],
+    episodes: Sequence[Episode],
+    tracks: Sequence[JointTrack],
+    robot: RobotModel,
+) -> list[SeenPoint]:
+    names = [episode.info.path.name for episode in episodes]
+    found = []
+    for name, rows in points.items():
+        if name not in names:
+            continue
+        number = names.index(name)
+        for seconds, x, y in rows:
+            stamp = tracks[number].stamps_ns[:1] + round(seconds * 1e9)
+            if not tracks[number].covers(stamp).all():
+                raise ConfigError(
+                    f"points: '{name}' has no joint states at {seconds:g} s; times are from the "
+                    'first joint state on'
+                )
+            position = robot.tool_poses(tracks[number].at(stamp))[0, 0, :3, 3]
+            found.append(
+                SeenPoint(recording=number, position=position, pixel=np.array([x, y], float))
+            )
+    return found
+
+
+def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
+    """Reads seen tool points: `{<view>: {<episode>: [[seconds, x, y], ...]}}` [s, px].
+
+    Raises:
+        ConfigError: the file is no such table, or has fewer than four points of the view.
+    """
+    values = read_yaml(path, 'points file', '--points')
+    rows = values.get(view) if isinstance(values, dict) else None
+    try:
+        found = {
+            str(name): [_row(row) for row in given] for name, given in dict(rows or {}).items()
+        }
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"'{path}', view '{view}': {error}; a row is [seconds, x, y]") from error
+    count = sum(map(len, found.values()))
+    if count < _LEAST_POINTS:
+        raise ConfigError(
+            f"'{path}' has {count} points of view '{view}'; {_LEAST_POINTS} or more are needed, "
+            'far apart: where the tool point is, seconds from the first joint state on'
+        )
+    return found
+
+
+_LEAST_POINTS = 4
+
+
+def _row(row: Any) -> FloatArray:
+    numbers = np.asarray(row, float)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise ValueError(f'{row!r} is not three numbers')
+    return numbers

@@ -1,0 +1,143 @@
+"""`mtv-world doctor FOLDER`: each kind of bad recording is named, with its episode."""
+
+from dataclasses import replace
+
+from crane import FPS, load, make_cameras, make_positions, render, START_NS
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.geometry.robot.shape import load_shape
+from mtv_world_ros.lab.inspection.folder import folder_text, inspect_folder
+from mtv_world_ros.lab.inspection.inspect import Inspector
+from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
+from mtv_world_ros.lab.training.training_run import check_recording
+
+SECONDS = 3.0
+QUICK = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())
+
+
+def write(path, robot, camera, positions, frames, *, states=None, every=1, spare=0):
+    """An episode of one view whose parts may contradict each other.
+
+    `states` are recorded in place of the positions, of the frames every n-th, and joint states
+    go on for some rows after the last frame.
+    """
+    states = positions if states is None else states
+    with EpisodeWriter(
+        path, task='', instruction='move', robot=robot.name, cameras=[camera]
+    ) as writer:
+        stamps = [START_NS + round(k * 1e9 / FPS) for k in range(len(positions) + spare)]
+        times = np.arange(1, len(positions)) / FPS
+        plan = JointTrajectory(joint_names=robot.joint_names, times=times, positions=states[1:])
+        writer.write_trajectory(stamps[0], plan)
+        for k, stamp in enumerate(stamps):
+            row = states[min(k, len(states) - 1)]
+            writer.write_joint_states(stamp, robot.joint_names, row)
+            if k < len(positions) and k % every == 0:
+                writer.write_camera_info(camera.view, stamp, camera)
+                writer.write_image(camera.view, stamp, np.ascontiguousarray(frames[k]))
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Robot and a folder: two good episodes, and one of each kind of bad ones."""
+    place = tmp_path_factory.mktemp('folder')
+    robot = load(place)
+    camera = make_cameras()['door']
+    data = place / 'data'
+    for number in (0, 1):
+        positions = make_positions(SECONDS, seed=number)
+        write(data / f'good{number}', robot, camera, positions, render(robot, camera, positions))
+    positions = make_positions(SECONDS, seed=2)
+    frames = render(robot, camera, positions)
+
+    def bad(name, shown=frames, **more):
+        write(data / name, robot, camera, positions, shown, **more)
+
+    bad('degrees', states=np.degrees(positions))
+    bad('frozen', np.repeat(frames[:1], len(frames), axis=0))
+    bad('longer', spare=round(4 * FPS))
+    bad('mirrored', frames[:, :, ::-1])
+    bad('slow', every=FPS)
+    turn = np.eye(4)
+    turn[:3, :3] = [[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]]
+    moved = replace(camera, T_mount_camera=camera.T_mount_camera @ turn)
+    write(data / 'moved', robot, moved, positions, render(robot, moved, positions))
+    return robot, data
+
+
+@pytest.fixture(scope='module')
+def inspected(folder):
+    """What is found in the folder, and as text."""
+    robot, data = folder
+    inspector = Inspector(robot, load_shape(robot), QUICK)
+    found, pictures = inspect_folder(list_episodes(data), inspector, read_episode)
+    assert set(pictures) == set(found.episodes)
+    return found, folder_text(found)
+
+
+@pytest.mark.parametrize(
+    ('name', 'verdict', 'said'),
+    [
+        ('degrees', 'broken', 'outside its limits'),
+        ('frozen', 'broken', 'the same as the one before'),
+        ('longer', 'suspicious', 'after the last frame'),
+        ('mirrored', 'broken', 'mirror'),
+        ('slow', 'suspicious', '1 frames a second'),
+    ],
+)
+def test_what_is_wrong_is_named_in_its_own_row(inspected, name, verdict, said):
+    found, text = inspected
+    row = next(line for line in text.splitlines() if line.startswith(f'{name} '))
+    assert said in row and verdict in row, row
+
+
+def test_good_episodes_are_not_blamed(inspected):
+    found, text = inspected
+    for name in ('good0', 'good1'):
+        assert found.episodes[name].verdict == 'ok', text
+
+
+def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
+    found, text = inspected
+    assert found.place('door', 'good0') == found.place('door', 'good1')
+    assert found.place('door', 'moved') != found.place('door', 'good0')
+    line = next(line for line in text.splitlines() if 'the camera stands at' in line)
+    assert 'moved' in line and line.startswith('suspicious')
+    assert found.verdict == 'broken'
+
+
+def test_the_command_writes_a_table_and_a_picture(folder, tmp_path, capsys):
+    robot, data = folder
+    few = tmp_path / 'few'
+    few.mkdir()
+    for name in ('good0', 'frozen'):
+        (few / name).symlink_to(data / name)
+    command = ['doctor', str(few), '--robot', str(robot.file), '--out', str(tmp_path / 'report')]
+    assert main(command) == 1
+    printed = capsys.readouterr().out
+    assert 'good0' in printed and 'frozen' in printed and 'broken: see' in printed
+    assert (tmp_path / 'report' / 'episodes.png').is_file()
+    assert '| frozen | broken |' in (tmp_path / 'report' / 'report.md').read_text()
+
+
+def test_training_leaves_out_what_would_teach_nonsense(folder):
+    robot, data = folder
+    spec = WorldModelSpec(
+        views=('door',), width=64, height=48, num_frames=4, fps=5.0, robot='crane'
+    )
+    reasons = {}
+    for name in ('good0', 'degrees', 'frozen'):
+        recording = load_recording(data / name, spec, robot)
+        try:
+            check_recording(recording, robot)
+        except MtvWorldError as error:
+            reasons[name] = str(error)
+    assert set(reasons) == {'degrees', 'frozen'}
+    assert 'its limits are' in reasons['degrees'] and "view 'door'" in reasons['frozen']

@@ -1,0 +1,117 @@
+"""`mtv-world calibrate-camera` of several recordings against the cameras they were drawn with."""
+
+from dataclasses import replace
+
+from crane import load, make_cameras, make_positions, tool_pixels, write_episode
+import numpy as np
+import pytest
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.errors import CalibrationError
+from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.lab.inspection.camera_pose import moved
+from mtv_world_ros.lab.inspection.places import background, find_places, turn_between
+
+SECONDS = 5.0
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory):
+    """Robot, true cameras and recordings: the camera is turned before the last of three.
+
+    They are recorded with a pose that is off, and a focal length that is 15 % too long.
+    """
+    folder = tmp_path_factory.mktemp('shared')
+    robot = load(folder)
+    door = make_cameras()['door']
+    turn = moved(np.eye(4), np.array([0.01, 0.04, 0.0, 0.0, 0.0, 0.0]), np.zeros(3))
+    true = [door, door, replace(door, T_mount_camera=door.T_mount_camera @ turn)]
+    K = door.K.copy()
+    K[:2, :2] *= 1.15
+    off = moved(np.eye(4), np.array([0.03, -0.02, 0.04, 0.03, 0.02, -0.04]), np.zeros(3))
+    paths = []
+    for number, camera in enumerate(true):
+        guess = replace(camera, K=K, T_mount_camera=camera.T_mount_camera @ off)
+        paths.append(
+            write_episode(
+                folder / 'data' / f'e{number}', robot, {'door': camera},
+                make_positions(SECONDS, seed=number), recorded_as={'door': guess},
+            )
+        )  # fmt: skip
+    return robot, true, paths
+
+
+def error_px(robot, true, found, seed):
+    """Median distance of the tool point from where it is seen [px of 320]."""
+    positions = make_positions(SECONDS, seed=seed)
+    apart = tool_pixels(robot, true, positions) - tool_pixels(robot, found, positions)
+    return float(np.nanmedian(np.linalg.norm(apart, axis=-1)))
+
+
+def test_a_turned_camera_is_another_place_and_its_turn_is_measured(recorded):
+    _, true, paths = recorded
+    images = [read_episode(path, with_cameras=False).images['door'] for path in paths]
+    places = find_places([background(track) for track in images])
+    assert places.place.tolist() == [0, 0, 1]
+    R = turn_between(places.matches[0, 2], true[0].K[0, 0] / true[0].width)
+    wanted = true[2].T_mount_camera[:3, :3].T @ true[0].T_mount_camera[:3, :3]
+    assert np.degrees(np.arccos(min(1.0, (np.trace(R @ wanted.T) - 1) / 2))) < 0.5
+
+
+def test_poses_by_place_and_the_focal_length_are_found_from_a_guess(recorded, tmp_path, capsys):
+    robot, true, paths = recorded
+    command = ['calibrate-camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
+    out = tmp_path / 'door.yaml'
+    assert main([*command, '--focal', 'estimate', '--out', str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert '2 places in 3 recordings' in printed and 'guess' in printed
+    for place, number in ((0, 0), (1, 2)):
+        found = load_calibration(tmp_path / f'door_{place}.yaml')['door']
+        assert abs(found.K[0, 0] / true[number].K[0, 0] - 1) < 0.07, printed  # .15 before
+        guess = read_episode(paths[number]).cameras['door']
+        before = error_px(robot, true[number], guess, number)
+        assert error_px(robot, true[number], found, number) < min(3.0, before), (before, printed)
+        assert (tmp_path / f'door_{place}.png').is_file()
+
+
+def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, capsys):
+    robot, true, paths = recorded
+    data = paths[0].parent
+    for path in paths:
+        (path / 'calibration.yaml').rename(path / 'guess.yaml')
+    try:
+        with pytest.raises(CalibrationError, match='calibrate-camera'):
+            read_episode(paths[0])
+        rows = {}
+        for number, path in enumerate(paths):
+            positions = make_positions(SECONDS, seed=number)
+            seen = tool_pixels(robot, true[number], positions)
+            rows[path.name] = [[k / 10, *seen[k].tolist()] for k in (5, 20, 35)]
+        file = tmp_path / 'points.yaml'
+        file.write_text(yaml.safe_dump({'door': rows}))
+        command = ['calibrate-camera', str(data), '--view', 'door', '--robot', str(robot.file)]
+        more = ['--points', str(file), '--focal', 'estimate', '--apply']
+        assert main([*command, *more, '--out', str(tmp_path / 'seen.yaml')]) == 0
+        for number, path in enumerate(paths):
+            found = read_episode(path).cameras['door']
+            assert error_px(robot, true[number], found, number) < 3
+            assert abs(found.K[0, 0] / true[number].K[0, 0] - 1) < 0.07
+    finally:
+        for path in paths:
+            (path / 'guess.yaml').replace(path / 'calibration.yaml')
+
+
+def test_points_that_are_none_are_named(recorded, tmp_path, capsys):
+    robot, _, paths = recorded
+    file = tmp_path / 'points.yaml'
+    command = ['calibrate-camera', str(paths[0]), '--view', 'door', '--robot', str(robot.file)]
+    for text, said in (
+        ('door: {e0: [[0, 1, 2]]}', "1 points of view 'door'; 4 or more"),
+        ('door: {e0: [[0, 1]]}', 'not three numbers'),
+        ('door: {e0: [[99, 1, 2], [1, 1, 2], [2, 1, 2], [3, 1, 2]]}', 'no joint states at 99 s'),
+    ):
+        file.write_text(text)
+        assert main([*command, '--points', str(file)]) == 1
+        assert said in capsys.readouterr().err
