@@ -127,8 +127,8 @@ def test_numbers_of_which_nothing_tells_say_so(recording, robot, response, setti
 def test_recordings_that_say_nothing_are_refused(robot, response, recording, tmp_path):
     recordings, skipped = read_recordings([DEMO, tmp_path], robot, VIEWS)
     assert len(recordings) == 1 and list(skipped) == [str(tmp_path)]
-    still = replace(recording, ways=np.zeros_like(recording.ways))
-    for nothing in ([], [still]):
+    unseen = replace(recording, ways=np.full_like(recording.ways, np.nan))
+    for nothing in ([], [unseen]):
         with pytest.raises(TrainingError, match='no episode says where an object went'):
             fit_contact(nothing, Arms(robot, response))
 
