@@ -496,8 +496,8 @@ class ImaginedEpisode:
     def _majority(self, state: RolloutState) -> Majority:
         """Says which futures end as most do, so that pictures and the estimate say the same."""
 
-        def as_most(motions: ForeseenMotions) -> BoolArray | None:
+        def majority(motions: ForeseenMotions) -> BoolArray | None:
             ends = self.pipeline.estimator.foresee(motions, self.instruction, state.memory)
-            return None if ends is None else ends.as_most
+            return None if ends is None else ends.is_majority
 
-        return as_most
+        return majority
