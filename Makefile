@@ -34,7 +34,7 @@ style: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright
 
-test: style  ## the linters and all tests (about 10 minutes)
+test: style  ## the linters and all tests (about 8 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 types tests
 
 tests: $(STAMP)

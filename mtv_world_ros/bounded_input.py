@@ -227,7 +227,7 @@ def _array(data: bytes) -> np.ndarray:
 
 
 def check_finite(tensor: Any, name: str, file: Path) -> None:
-    """Checks that a tensor of torch holds finite numbers: what others give would be believed.
+    """Checks that a tensor of torch holds finite numbers: a model with others gives wrong results.
 
     Raises:
         CheckpointError: a number is not finite.

@@ -431,7 +431,8 @@ class ImaginedEpisode:
         foreseen = objects.motions(plan, state.is_begun)
         success, memory = self._judge(state, positions, start_masks, masks, foreseen)
         unseen = () if any(shown) else (_UNSEEN,)
-        success = replace(success, reasons=(*success.reasons, *objects.reasons, *unseen))
+        success = doubted(success, (*objects.reasons, *unseen))
+        success = doubted(success, refusal=objects.refusal)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -496,8 +497,8 @@ class ImaginedEpisode:
     def _majority(self, state: RolloutState) -> Majority:
         """Says which futures end as most do, so that pictures and the estimate say the same."""
 
-        def as_most(motions: ForeseenMotions) -> BoolArray | None:
+        def majority(motions: ForeseenMotions) -> BoolArray | None:
             ends = self.pipeline.estimator.foresee(motions, self.instruction, state.memory)
-            return None if ends is None else ends.as_most
+            return None if ends is None else ends.is_majority
 
-        return as_most
+        return majority

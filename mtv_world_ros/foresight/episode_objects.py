@@ -126,6 +126,11 @@ class ObjectForesight:
         """What speaks against what is foreseen, in words."""
         return () if self.found is None else self.found.tracked.reasons
 
+    @property
+    def refusal(self) -> str:
+        """Why what is foreseen allows no verdict; empty = it does."""
+        return '' if self.found is None else self.found.tracked.refusal
+
     def _shown_before(self, shown: int) -> int:
         return shown if self.found is None else self.found.shown
 

@@ -41,8 +41,8 @@ class ForeseenEnds:
         return float(np.average(self.done, weights=self.weights))
 
     @property
-    def as_most(self) -> BoolArray:
-        """(K,) which of them end as most do."""
+    def is_majority(self) -> BoolArray:
+        """(K,) whether a motion has the outcome of the majority, by weight."""
         return self.done == (self.share >= 0.5)
 
 

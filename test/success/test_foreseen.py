@@ -68,7 +68,7 @@ def test_motions_count_by_weight():
     motions = replace(held(GOAL, RED, BLUE), weights=np.array([3.0, 1.0, 1.0]))
     ends = motions.ends(task, bound, np.full((2, 3), np.nan))
     assert ends.share == pytest.approx(0.6)
-    np.testing.assert_array_equal(ends.as_most, [True, False, False])
+    np.testing.assert_array_equal(ends.is_majority, [True, False, False])
     assert foreseen_feature(ends) == pytest.approx(0.2)
 
 
