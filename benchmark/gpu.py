@@ -41,7 +41,6 @@ _TESTS = (
     'test/model/serving/test_serving.py',
     'test/lab/training/test_trainer.py',
     'test/lab/training/test_wan_training.py',
-    'test/lab/training/object_motion/test_train_motion.py',
     'test/vision/segmenters/test_prompted.py',
 )
 _COMPARED = (

@@ -440,7 +440,8 @@ class ImaginedEpisode:
         foreseen = objects.motions(plan, state.is_begun)
         success, memory = self._judge(state, positions, start_masks, masks, foreseen)
         unseen = () if any(shown) else (_UNSEEN,)
-        success = replace(success, reasons=(*success.reasons, *objects.reasons, *unseen))
+        success = doubted(success, (*objects.reasons, *unseen))
+        success = doubted(success, refusal=objects.refusal)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
