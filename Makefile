@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test tests style types fuzz kills soak lint format docs clean distclean
+.PHONY: help install demo test tests style types fuzz kills soak attacks lint format docs clean distclean
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -34,7 +34,7 @@ style: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright
 
-test: style  ## the linters and all tests (about 10 minutes)
+test: style  ## the linters and all tests (about 8 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 types tests
 
 tests: $(STAMP)
@@ -49,6 +49,13 @@ kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour);
 
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python test/robustness/soak.py
+
+attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers (two hours)
+	@mkdir -p out
+	$(BIN)/python test/robustness/rate.py
+	$(BIN)/python test/robustness/cycles.py --bundled
+	$(BIN)/python test/robustness/odd_worlds.py
+	$(BIN)/python test/robustness/policy_servers.py --json out/servers.json
 
 format: $(STAMP)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .

@@ -1,9 +1,11 @@
 """What became of damaged input, kills and rollouts with faults: a page of what the harness wrote.
 
-    make fuzz kills soak
+    make fuzz kills soak attacks
     python benchmark/robustness.py out/fuzz.json out/kills/kills.json --soak out/soak --out DIR
+        --rate out/rate --cycles out/cycles --worlds out/odd_worlds --servers out/servers.json
 
-Rows of one kind in several files are added up. Beside the page stands the plot of the soak.
+Rows of one kind in several files are added up. Beside the page stand the plots of soak and cycles.
+`--before` and the like take the same of an earlier commit, for a table beside.
 """
 
 from __future__ import annotations
@@ -67,12 +69,98 @@ def soak_text(folder: Path) -> str:
     )
 
 
+def plans_table(folders: list[Path]) -> str:
+    """What became of plans at a rate, a row a run."""
+    keys = ('commit', 'plans', 'without_end', 'several_ends', 'late', 'median_s', 'worst_s',
+            'tracebacks', 'memory_growth_mb_per_1000')  # fmt: skip
+    rows = [json.loads((folder / 'rate.json').read_text()) for folder in folders]
+    return table(
+        ('commit', 'plans', 'no end', 'several ends', 'late', 'median [s]', 'worst [s]',
+         'tracebacks', 'memory [MB for 1,000]'),
+        [[_cell(row[key]) for key in keys] for row in rows],
+    )  # fmt: skip
+
+
+def cycles_table(folders: list[Path]) -> str:
+    """What grew over lifecycle cycles, a row a run."""
+    rows = []
+    for folder in folders:
+        found = json.loads((folder / 'cycles.json').read_text())
+        ends = [found[end] for end in ('first', 'last')]
+        spans = [f'{ends[0][key]:.0f} → {ends[1][key]:.0f}'
+                 for key in ('memory_mb', 'descriptors', 'threads')]  # fmt: skip
+        grown = found['growth_a_cycle']['memory_mb']
+        most, failed = found['most_processes'], len(found['problems'])
+        rows.append([found['commit'], found['cycles'], *spans, f'{grown:.2f}', most, failed])
+    head = ('commit', 'cycles', 'memory [MB]', 'descriptors', 'threads',
+            'growth, warm [MB a cycle]', 'most processes', 'problems')  # fmt: skip
+    return table(head, [[str(cell) for cell in row] for row in rows])
+
+
+def worlds_table(folder: Path) -> str:
+    """What became of plans in odd worlds."""
+    keys = ('world', 'plans', 'without_end', 'several_ends', 'unknown_ends', 'tracebacks',
+            'worst_s', 'ends')  # fmt: skip
+    rows = json.loads((folder / 'odd_worlds.json').read_text())
+    return table(
+        ('world', 'plans', 'no end', 'several', 'of others', 'tracebacks', 'worst [s]', 'ends'),
+        [[_cell(row[key]) for key in keys] for row in rows],
+    )
+
+
+def servers_table(file: Path) -> str:
+    """What became of questions to policy servers that misbehave."""
+    keys = ('server', 'tried', 'answered', 'refused', 'recovered', 'worst_s', 'failures')
+    rows = json.loads(file.read_text())
+    return table(
+        ('server', 'tried', 'answered', 'refused', 'answered next', 'worst [s]', 'failed'),
+        [[_cell(row[key]) for key in keys] for row in rows],
+    )
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return ', '.join(f'{key} {count}' for key, count in value.items())
+    if isinstance(value, list):
+        return str(len(value))
+    return f'{value:.2f}' if isinstance(value, float) else str(value)
+
+
+def attacks_text(options: argparse.Namespace) -> list[str]:
+    """The tables of what was run beside the fuzz."""
+    body = []
+    if options.before:
+        cells = [line(kind, row) for kind, row in add_up(options.before).items()]
+        body += ['## The same attacks before', table(HEAD, cells), commits_text(options.before)]
+    if options.rate:
+        body += ['## Plans at 10 Hz, with bursts and a node that is stopped now and then',
+                 plans_table(options.rate)]  # fmt: skip
+    if options.cycles:
+        body += ['## Lifecycle cycles with the bundled model', cycles_table(options.cycles)]
+        if options.out:
+            name = f'robustness_cycles_{options.machine}.png'
+            shutil.copy(options.cycles[-1] / 'cycles.png', options.out / name)
+            body.append(f'![Memory, processes and descriptors over cycles]({name})')
+    if options.worlds:
+        body += ['## Odd worlds', worlds_table(options.worlds)]
+    if options.servers:
+        body += ['## Policy servers that misbehave', servers_table(options.servers)]
+    return body
+
+
 def main() -> None:
     """Makes the page."""
 
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('rows', type=Path, nargs='+', help='what --json and kills wrote')
         parser.add_argument('--soak', type=Path, nargs='+', default=[], help='folders of soaks')
+
+        several: dict[str, Any] = {'type': Path, 'nargs': '+', 'default': []}
+        parser.add_argument('--before', **several, help='rows of an earlier commit')
+        parser.add_argument('--rate', **several, help='folders of rate.py, the earliest first')
+        parser.add_argument('--cycles', **several, help='folders of cycles.py, likewise')
+        parser.add_argument('--worlds', type=Path, help='folder of odd_worlds.py')
+        parser.add_argument('--servers', type=Path, help='what policy_servers.py wrote')
 
     options = parse_arguments(__doc__, 1, more)
     rows = add_up(options.rows)
@@ -93,6 +181,7 @@ def main() -> None:
             name = f'robustness_soak{index or ""}_{options.machine}.png'
             shutil.copy(folder / 'soak.png', options.out / name)
             body.append(f'![Memory, threads, descriptors and latency over rollouts]({name})')
+    body += attacks_text(options)
     publish(
         'robustness', 'Damaged input, kills and rollouts with faults',
         'python benchmark/robustness.py', '\n\n'.join(body), options, 'rclpy over Fast DDS',

@@ -222,6 +222,12 @@ def score_with_ray(
         ray.init(address=address or None, log_to_driver=False, include_dashboard=False)
     except (ConnectionError, ValueError) as error:
         raise ConfigError(f"Ray cannot be reached at '{address}': {error}; set --ray") from error
+    except ray.exceptions.AuthenticationError as error:
+        raise ConfigError(
+            f"the Ray cluster at '{address or 'this machine'}' asks for its token, and there is "
+            'none, or another one, here: copy ~/.ray/auth_token of the head node to this user, '
+            'or set RAY_AUTH_TOKEN (docs/ray.md)'
+        ) from error
     try:
         actor = ray.remote(num_cpus=1)(_RayWorker)
         pool = ray.util.ActorPool([actor.remote(make_scorer) for _ in range(workers)])

@@ -91,7 +91,9 @@ def test_without_the_bench_a_scripted_policy_says_what_to_install(monkeypatch):
 
 
 def test_policies_and_rollouts_of_the_package_are_registered():
-    assert load(registered(POLICIES)['scripted']).fault_kinds('expert-miss-0.5') == ('miss',)
+    assert load(registered(POLICIES)['scripted']).fault_kinds('expert-miss-0.5') == (
+        'grasp_missed',
+    )
     assert {load(entry).FILE for entry in registered(ROLLOUTS).values()} >= {
         'ranking.json',
         'metrics.json',

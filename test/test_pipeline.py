@@ -348,7 +348,7 @@ def test_the_last_chunk_alone_is_imagined_from_what_was_seen(
 class ThreeWays:
     """Objects that go along x in the first second; how far, in each of three motions [m]."""
 
-    step_s, commands_a_step, reasons = 0.1, 1, ()
+    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
     sizes = np.full((3, 2, 3), 0.04)
 
     reasons = ()
@@ -404,7 +404,7 @@ def test_a_plan_is_foreseen_chunk_by_chunk(
 class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
-    step_s, commands_a_step, reasons = 0.1, 1, ()
+    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
     sizes = np.full((1, 2, 3), 0.04)
 
     def __init__(
@@ -551,7 +551,7 @@ def test_positions_outside_the_limits_are_refused(
 class SlidingObjects:
     """Moves every object 1 cm along x in each step of 0.1 s; remembers how often it was asked."""
 
-    step_s, commands_a_step, reasons = 0.1, 1, ()
+    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
 
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps

@@ -189,6 +189,14 @@ class TrackedSolids:
         return sizes
 
     @property
+    def refusal(self) -> str:
+        """Why there is no verdict, as most futures are implausible; empty = there may be one."""
+        count = self.foresight.settings.num_motions
+        if self.state is None or not _too_many(self.state, count):
+            return ''
+        return f'{len(self.state.lost)} of {count} foreseen futures are implausible'
+
+    @property
     def reasons(self) -> tuple[str, ...]:
         """Why nothing is foreseen, or what speaks against it, in words."""
         doubts = tuple(dict.fromkeys(self.doubts.values()))
@@ -230,7 +238,7 @@ class TrackedSolids:
         if self.turned is not None:
             turns = turns @ self.turned
         points[:, :, list(doubts)] = np.nan
-        if len(state.lost) > (1 - _ENOUGH) * num:
+        if _too_many(state, num):
             points[:] = np.nan
         reference = self.centres if self.reference is None else self.reference
         openings = self.foresight.robot.gripper_openings
@@ -269,6 +277,11 @@ class TrackedSolids:
         solids = [solid for solid in self.solids if solid is not None]
         drives = self.foresight.engine.arms.drives
         return draw_futures(self.foresight.settings, solids, drives, self.foresight.camera_m)
+
+
+def _too_many(state: BatchState, count: int) -> bool:
+    """Whether too few of the futures are left to tell anything."""
+    return len(state.lost) > (1 - _ENOUGH) * count
 
 
 def _upright(solid: Solid) -> FloatArray:

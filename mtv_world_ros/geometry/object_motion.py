@@ -116,6 +116,11 @@ class TrackedObjects(Protocol):
         """What speaks against what is foreseen, in words."""
         ...
 
+    @property
+    def refusal(self) -> str:
+        """Why what is foreseen allows no verdict; empty = it does."""
+        ...
+
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:

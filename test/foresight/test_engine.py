@@ -146,6 +146,8 @@ def test_where_too_few_futures_are_left_nothing_is_said(lift):
     motions, _ = lost.advance(picking(0.2))
     assert all(np.isnan(motion.points).all() for motion in motions)
     assert lost.reasons == ('3 of 4 foreseen futures do not count: diverged',)
+    # most of them: then there is no verdict at all
+    assert lost.refusal == '3 of 4 foreseen futures are implausible'
     few = replace(one, state=replace(one.state, lost={2: 'diverged'}))
     motions, _ = few.advance(picking(0.2))
     assert [motion.weight for motion in motions] == [1, 1, 0, 1]

@@ -194,10 +194,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=20, help='questions to each kind of server')
     parser.add_argument('--margin', type=float, default=MARGIN_S, help='[s]')
+    parser.add_argument('--json', type=Path, help='keep the rows here')
     arguments = parser.parse_args()
     rows = run(arguments.cases, arguments.margin)
     for row in rows:
         sys.stdout.write(json.dumps(row) + '\n')
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(rows, indent=1))
     return int(any(row['failures'] or row['recovered'] < row['tried'] for row in rows))
 
 

@@ -68,7 +68,7 @@ def test_motions_count_by_weight():
     motions = replace(held(GOAL, RED, BLUE), weights=np.array([3.0, 1.0, 1.0]))
     ends = motions.ends(task, bound, np.full((2, 3), np.nan))
     assert ends.share == pytest.approx(0.6)
-    np.testing.assert_array_equal(ends.as_most, [True, False, False])
+    np.testing.assert_array_equal(ends.is_majority, [True, False, False])
     assert foreseen_feature(ends) == pytest.approx(0.2)
 
 
@@ -113,7 +113,7 @@ def test_motions_that_foresee_no_fingers_are_told_by_others(shares, told):
         names=(),
         cuts=np.zeros((2, 0, 4, 4, 4), np.uint8),
         poses=np.zeros((2, 0, 4, 4)),
-        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3))),
+        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3)), step_s=0.1),
         motions=tuple(map(motion, shares)),
         positions=positions,
     )

@@ -278,13 +278,20 @@ def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
     """
     if not grid.num_history:
         return time_proj[:, 0]
-    batch, views, frames, height, width, _ = grid.tokens.shape
+    height, width = grid.tokens.shape[3:5]
+    return by_run(time_proj, grid).repeat_interleave(height * width, dim=1)
+
+
+def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
+    """Returns the same, (B, R, 6, D), of R runs of tokens: one of all, or the V * F frames."""
+    if not grid.num_history:
+        return time_proj
+    views, frames = grid.tokens.shape[1:3]
     parts = [
         time_proj[:, 1:].expand(-1, grid.num_history, -1, -1),
         time_proj[:, :1].expand(-1, frames - grid.num_history, -1, -1),
     ]
-    rows = torch.cat(parts, dim=1)[:, None, :, None]
-    return rows.expand(batch, views, -1, height * width, -1, -1).flatten(1, 3)
+    return torch.cat(parts, dim=1).repeat(1, views, 1, 1)
 
 
 def fit_context(context: Context, grid: TokenGrid) -> Context:

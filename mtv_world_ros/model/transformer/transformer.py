@@ -16,10 +16,12 @@ from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.transformer.action_context import build_control
+from mtv_world_ros.model.transformer.block import hold_levels_by_run
 from mtv_world_ros.model.transformer.cross_attention import check_tokens, fit_cross_attention
 from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, ReferenceStem
 from mtv_world_ros.model.transformer.tokens import (
     arrange,
+    by_run,
     by_token,
     check_start_image,
     embed_history,
@@ -64,6 +66,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             that shows the objects themselves (`rendering.object_motion`).
     """
 
+    _repeated_blocks = ['WanTransformerBlock', 'RunwiseBlock']
+    _no_split_modules = _repeated_blocks
     # number formats are chosen by whoever loads the model, in one place for all modules
     _keep_in_fp32_modules = None
 
@@ -138,6 +142,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             )
         else:
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
+            hold_levels_by_run(self.blocks)
         self.with_text = context != 'none'
         # last, so that a seed gives what all controls share the same weights
         self.action_control = build_control(
@@ -237,7 +242,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         sequence = self._run_blocks(
             sequence.flatten(1, 4),
             context,
-            by_token(time_proj, grid),
+            (by_token if self.stem == 'conv' else by_run)(time_proj, grid),
             self.rope(grid.tokens, grid.times),
         )
         shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)

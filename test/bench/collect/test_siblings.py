@@ -68,7 +68,7 @@ def test_siblings_share_a_scene_and_their_outcomes_differ(tmp_path, opengl):
     said = [info.metadata for info in infos]
     assert said[0]['policy'] == 'expert' and said[0]['kind'] == ''
     sizes = [float(metadata['size']) for metadata in said[1:]]
-    assert said[1]['kind'] == said[2]['kind'] == 'high' and 0 < sizes[0] < sizes[1] < 0.08
+    assert said[1]['kind'] == said[2]['kind'] == 'grasp_height' and 0 < sizes[0] < sizes[1] < 0.08
     assert said[2]['policy'] == f'expert-high-{sizes[1]:g}'
     assert [metadata['sibling'] for metadata in said] == ['0', '1', '2']
     assert all(0 <= float(metadata['diverges_s']) < 6 for metadata in said)

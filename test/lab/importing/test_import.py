@@ -16,6 +16,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.lab.importing.convert import import_dataset
+from mtv_world_ros.lab.importing.lerobot import frames_at
 
 START_NS = 1_000_000_000
 KINDS = ('v2.0', 'v2.1', 'v3.0', 'v3.0, unnamed index', 'images')
@@ -299,3 +300,18 @@ def test_a_camera_that_is_said_to_be_no_depth_map_is_one(datasets, make_mapping,
     described['features']['observation.images.front']['info'] = {'video.is_depth_map': False}
     file.write_text(json.dumps(described))
     assert import_dataset(root, make_mapping(), tmp_path / 'out').made
+
+
+def test_reports_9_and_10_times_of_hardware_find_their_frames_or_are_named(write_video, tmp_path):
+    """Of docs/importing.md; by the frame number times would be those of other frames."""
+    levels = list(range(20, 200, 15))
+    write_video(tmp_path / 'v.mp4', levels)
+    period = 0.1
+    times = period * (np.arange(len(levels)) + np.resize([0.2, -0.2, 0.1], len(levels)))
+    found = [frame.mean() for frame in frames_at(tmp_path / 'v.mp4', times, period / 4)]
+    np.testing.assert_allclose(found, levels, atol=4)
+    with pytest.raises(EpisodeError, match='has no frame at'):
+        list(frames_at(tmp_path / 'v.mp4', times[:5] + period * 0.4, period / 4))
+    with pytest.raises(EpisodeError, match='3 frames are missing'):
+        more = np.append(times, times[-1] + period * np.arange(1, 4))
+        list(frames_at(tmp_path / 'v.mp4', more, period / 4))

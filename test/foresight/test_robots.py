@@ -1,0 +1,115 @@
+"""Any robot is a scene, or is named with what it lacks."""
+
+from __future__ import annotations
+
+from itertools import product
+import struct
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.errors import RobotError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.engine import Engine
+from mtv_world_ros.foresight.futures import draw_futures
+from mtv_world_ros.foresight.robot_parts import load_parts
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.solids import Solid
+
+SETTINGS = ContactSettings(
+    finger_stiffness=400.0,
+    finger_damping=10.0,
+    finger_mass_kg=0.05,
+    grip_friction=1.0,
+    table_friction=0.5,
+    density=500.0,
+    tray_kg=0.4,
+    num_motions=1,
+)
+MESH = """<robot name="mesh"><link name="base"/>
+  <link name="arm"><collision><geometry><mesh filename="{file}" scale="2 2 2"/></geometry>
+  </collision></link>
+  <joint name="turn" type="revolute"><origin xyz="0 0 0.12"/>
+    <parent link="base"/><child link="arm"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+TOOL = 'tools:\n  - {arm: arm, link: arm}\n'
+
+
+def write_cube(file, half: float) -> None:
+    """A cube that is not closed: its top is missing."""
+    corners = np.array(list(product((-half, half), repeat=3)))
+    faces = [(0, 1, 3), (0, 3, 2), (0, 4, 5), (0, 5, 1), (0, 2, 6), (0, 6, 4), (7, 5, 4)]
+    rows = [struct.pack('<12fH', 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces]
+    file.write_bytes(bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+
+
+def mesh_robot(folder, file='cube.stl'):
+    (folder / 'mesh.urdf').write_text(MESH.format(file=file))
+    (folder / 'mesh.yaml').write_text(f'name: mesh\nurdf: mesh.urdf\n{TOOL}')
+    return load_robot(folder / 'mesh.yaml')
+
+
+def test_a_mesh_that_is_not_closed_counts_as_its_hull_filled_with_water(tmp_path):
+    write_cube(tmp_path / 'cube.stl', 0.05)
+    arms = Arms(mesh_robot(tmp_path), None)
+    assert '1 of 1 bodies state no inertia' in arms.notes[0]
+    inertia = arms.robot.pinocchio_model.inertias[1]
+    assert inertia.mass == pytest.approx(0.2**3 * 1000, rel=1e-6)  # scaled by 2
+    np.testing.assert_allclose(np.diag(inertia.inertia), 8 * 0.2**2 / 6, rtol=1e-6)
+    # a corner sweeps over what stands beside it
+    block = Solid(centre=np.array([0.12, -0.02, 0.02]), size=np.array([0.02, 0.02, 0.04]))
+    engine = Engine(arms)
+    batch = engine.begin(draw_futures(SETTINGS, (block,), engine.arms.drives))
+    turn = np.linspace(0, 0.8, 51)[:, None]
+    points = batch.advance(turn, 5)[0].points[0, :, 0]
+    assert np.linalg.norm(points[-1] - points[0]) > 0.01
+
+
+def test_a_mesh_that_is_missing_is_named(tmp_path):
+    with pytest.raises(RobotError, match="mesh 'nowhere.stl' is missing"):
+        load_parts(mesh_robot(tmp_path, 'nowhere.stl'))
+
+
+@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+def test_bundled_robots_stay_where_they_are_told_to_be(name):
+    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    engine = Engine(Arms(robot, None))
+    away = Solid(centre=np.array([1.5, 1.5, 0.02]), size=np.full(3, 0.04))
+    batch = engine.begin(draw_futures(SETTINGS, (away,), engine.arms.drives))
+    middle = np.where(np.isfinite(robot.lower + robot.upper), robot.lower + robot.upper, 0) / 2
+    motion, state = batch.advance(np.repeat(middle[None], 26, 0), 5)
+    assert not state.lost
+    np.testing.assert_allclose(motion.joints[0, -1], middle, atol=1e-3)
+
+
+@pytest.mark.parametrize(('swing', 'apart_m'), [(False, (0.0, 0.001)), (True, (0.0015, 0.04))])
+def test_fingers_that_follow_one_joint_are_kept_together_unless_they_swing(lift, swing, apart_m):
+    """A heavy block off the middle stops one finger first."""
+    engine = Engine(Arms(lift, None))
+    settings = SETTINGS.model_copy(update={'fingers_swing': swing, 'density': 20000.0})
+    block = Solid(centre=np.array([0.0, 0.01, 0.02]), size=np.array([0.02, 0.03, 0.04]))
+    batch = engine.begin(draw_futures(settings, (block,), engine.arms.drives))
+    times = np.arange(0, 0.8, 0.02)
+    commands = np.stack([np.full(len(times), 0.02), np.where(times < 0.05, 0.04, 0.0)], -1)
+    _, state = batch.advance(commands, 1)
+    qpos = state.physics[0, 1 : 1 + batch.model.nq]
+    fingers = qpos[batch._scene.arm_qpos][engine.arms.drives.fingers]
+    assert apart_m[0] <= abs(fingers[0] - fingers[1]) < apart_m[1]
+
+
+def test_a_gripper_whose_joint_moves_nothing_is_named(tmp_path):
+    robot = share_path('config', 'robots', 'franka.urdf').read_text()
+    bare = robot
+    for link in ('panda_leftfinger', 'panda_rightfinger'):
+        first = bare.index(f'<link name="{link}">')
+        bare = f'{bare[:first]}<link name="{link}"/>{bare[bare.index("</link>", first) + 7 :]}'
+    (tmp_path / 'franka.urdf').write_text(bare)
+    text = share_path('config', 'robots', 'franka.yaml').read_text()
+    (tmp_path / 'franka.yaml').write_text(text)
+    with pytest.raises(
+        RobotError, match="'panda' .* no part that its joint 'panda_finger_joint1'"
+    ):
+        Arms(load_robot(tmp_path / 'franka.yaml'), None)
