@@ -39,7 +39,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
-from mtv_world_ros.success.doubts import doubted
+from mtv_world_ros.success.doubts import doubted, widened
 from mtv_world_ros.success.estimator import Judged, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
@@ -247,6 +247,8 @@ class ImaginedEpisode:
         should_stop: asked between denoising steps and between chunks.
         num_chunks: imagined so far.
         camera_check: what the first pictures say about the cameras, which are corrected by it.
+        doubt: why the fitted physics is not to be believed, which widens the estimate; empty =
+            nothing speaks against it.
     """
 
     pipeline: Pipeline
@@ -259,6 +261,7 @@ class ImaginedEpisode:
     should_stop: Callable[[], bool]
     num_chunks: int = field(default=0, init=False)
     camera_check: CameraCheck = CameraCheck()
+    doubt: str = ''
     _rollouts: tuple[RolloutState, ...]
     _described: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -343,6 +346,12 @@ class ImaginedEpisode:
         objects = state.objects.branch(last)
         self._rollouts = (replace(state, observation=last, num_imagined=0, objects=objects),)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success)
+
+    def seen_points(self, num_frames: int) -> FloatArray:
+        """Returns (1 + T, O, 3) where masks showed the objects in the last frames [m]."""
+        memory = self._rollouts[0].memory
+        assert memory is not None
+        return memory.points[:, -1 - num_frames :].swapaxes(0, 1)
 
     def branch(self, observation: Observation) -> ImaginedEpisode:
         """Returns an episode that begins at a later real observation and remembers this one.
@@ -455,6 +464,7 @@ class ImaginedEpisode:
             horizon=pipeline.horizon,
             segmenter=pipeline.segmenter.name,
             num_inference_steps=num_steps,
+            foreseen=None if foreseen is None else foreseen.at_frames(plan),
             in_view=np.array(shown),
             seconds=MappingProxyType(clock.seconds),
         )
@@ -492,7 +502,8 @@ class ImaginedEpisode:
             footage, self.instruction, state.memory, foreseen, is_real=is_real
         )
         check = self.camera_check
-        return judged._replace(estimate=doubted(judged.estimate, check.notes, check.refusal))
+        estimate = doubted(judged.estimate, check.notes, check.refusal)
+        return judged._replace(estimate=widened(estimate, self.doubt) if self.doubt else estimate)
 
     def _majority(self, state: RolloutState) -> Majority:
         """Says which futures end as most do, so that pictures and the estimate say the same."""

@@ -58,6 +58,8 @@ class Prediction:
         horizon: measured J by horizon; None = not measured.
         segmenter: name of what found the masks.
         num_inference_steps: denoising steps.
+        foreseen: (K, 1 + T, O, 3) centres of the objects in each future at the chunk's start and
+            at its frames [m]; None = nothing was foreseen.
         in_view: (V,) share of the states in which the view shows a tool.
         seconds: time spent by stage [s].
     """
@@ -77,6 +79,7 @@ class Prediction:
     horizon: HorizonCurve | None = None
     segmenter: str = ''
     num_inference_steps: int = 0
+    foreseen: FloatArray | None = None
     in_view: FloatArray
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -128,3 +129,15 @@ def test_evaluates_the_bundled_model(tmp_path: Path) -> None:
         assert 0 < value < 1
         assert scores['fid'] is None
     assert np.isfinite(metrics['num_episodes'])
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    pytest.importorskip('argcomplete', reason='argcomplete is not installed')
+    for line, wanted in (('mtv-world imag', 'imagine'), ('mtv-world imagine --pol', '--policy')):
+        words = {'_ARGCOMPLETE': '1', 'COMP_LINE': line, 'COMP_POINT': str(len(line))}
+        words |= {'_ARGCOMPLETE_IFS': ' ', '_ARGCOMPLETE_STDOUT_FILENAME': '/dev/stdout'}
+        done = subprocess.run(
+            [sys.executable, '-m', 'mtv_world_ros.cli'],
+            env={**os.environ, **words}, capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+        assert wanted in done.stdout.split(), done

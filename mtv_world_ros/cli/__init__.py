@@ -1,10 +1,13 @@
+# PYTHON_ARGCOMPLETE_OK
 """The command `mtv-world`."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 import errno
+from importlib import import_module
 import os
 import shlex
 import signal
@@ -85,6 +88,8 @@ class _Version(argparse.Action):
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace:
     parser = make_parser()
+    with suppress(ImportError):  # completion in the shell, where this is installed
+        import_module('argcomplete').autocomplete(parser)
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     if words and not words[0].startswith('-') and words[0] not in commands.choices:
         known = list(commands.choices)

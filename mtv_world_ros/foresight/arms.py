@@ -87,6 +87,7 @@ class Arms:
 
     Attributes:
         robot: the same, with inertias for all of its bodies.
+        response: as given.
         notes: assumptions about the robot, as text.
         drives: of its joints, with the numbers of free air.
 
@@ -97,6 +98,7 @@ class Arms:
     def __init__(self, robot: RobotModel, response: ArmResponse | None) -> None:
         found = load_parts(robot)
         self.robot, assumed = with_inertias(robot, found.parts)
+        self.response = response
         self._model = self.robot.pinocchio_model
         self._frames = {f.name: f for f in self._model.frames if f.type == pin.FrameType.BODY}
         base = self._frames[robot.base_link]

@@ -50,6 +50,9 @@ class ContactSettings(Schema):
     rim_m: Thickness = Field(default=0.01, description='thickness of the rim of plates and bowls')
     wall_m: Thickness = Field(default=0.005, description='of the walls of cups and of boxes')
     table_m: Metres = Field(default=0.0, description='its height in the base frame [m]')
+    delay_s: float = Field(
+        default=0.0, ge=0, le=1, description='by which commands take effect later [s]'
+    )
     spread: ContactSpread = Field(
         default=ContactSpread(), description='how exactly all this is known'
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks, Observation
+from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
@@ -83,6 +84,8 @@ class ObjectForesight:
         found = self.found
         if found is None or found.names != names:
             found = self._find(observation, names, start_masks)
+            if should_stop():
+                raise RolloutPreempted('stopped while objects were looked for')
         shown = found.shown
         positions = plan.fine_positions(found.tracked.step_s, found.tracked.commands_a_step)
         found = found.after(positions, should_stop)

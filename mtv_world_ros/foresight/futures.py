@@ -83,7 +83,7 @@ def _drawn(
         update={'density': settings.density * heavier, 'tray_kg': settings.tray_kg * heavier}
     )
     zeros = share * spread.zero_rad * rng.normal(size=len(drives.names))
-    delay_s = share * spread.delay_s * abs(float(rng.normal()))
+    delay_s = settings.delay_s + share * spread.delay_s * abs(float(rng.normal()))
     moved = share * camera_m * rng.normal(size=2)
     return Future(
         settings=changed,

@@ -42,6 +42,8 @@ _WHOLE = 0.9
 #: what fits so well from where it was has stayed there [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
+#: what fits so well fits best, whatever turn one begins with [px]
+_EXACT_PX = 0.35
 #: parts of a mask that are smaller than this share of its largest one are not the object's
 _PART = 0.2
 #: relative step of finite differences
@@ -137,6 +139,8 @@ def fit_solid(
             if best is None or found.cost < best[0] * (_BETTER if is_round else 1.0):
                 error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
                 best = found.cost, _solid(found.x, turn is None, error)
+            if turn is not None and best[1].error_px < _EXACT_PX:
+                break  # no other turn fits better
     assert best is not None
     solid = replace(best[1], is_open=is_open)
     return replace(solid, fills=_fills(solid, masks, cameras, poses))

@@ -8,7 +8,7 @@ K motions, N steps, O objects, A arms.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from math import nan
@@ -17,6 +17,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import CannotTell
+from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.success.situation import TruePoses
@@ -57,6 +58,7 @@ class ForeseenMotions:
         sizes: (K, O, 3) extents [m].
         openings: (K, A, N) of the grippers, 0 closed to 1 open.
         weights: (K,) how much each counts.
+        step_s: between the rows [s].
         is_begun: whether they begin with the rollout, and not later.
     """
 
@@ -66,7 +68,18 @@ class ForeseenMotions:
     sizes: FloatArray
     openings: FloatArray
     weights: FloatArray
+    step_s: float = 0.1
     is_begun: bool = True
+
+    def at_frames(self, plan: ChunkPlan) -> FloatArray:
+        """Returns centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
+
+        Args:
+            plan: the chunk, at whose end these motions end.
+        """
+        each = round(plan.frame_s / self.step_s)
+        rows = self.points.shape[1] - 1 - each * np.arange(plan.num_frames, -1, -1)
+        return self.points[:, np.maximum(rows, 0)]
 
     def ends(
         self, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
@@ -101,13 +114,13 @@ class ForeseenMotions:
         openings = self.openings[number]
         openings = np.concatenate([openings[:, :1], openings], axis=1)
         sizes = {
-            role: tuple(map(float, task.sizes_m.get(role) or self.sizes[number, item]))
+            role: _size(self.sizes[number, item], task.sizes_m.get(role))
             for role, item in items.items()
         }
         poses = TruePoses(
             positions={role: points[:, item] for role, item in items.items()},
             rotations={role: turns[:, item] for role, item in items.items()},
-            sizes=sizes,  # type: ignore[arg-type]
+            sizes=sizes,
             openings=openings,
         )
         return ever_and_final(task.holds(poses, openings))[1]
@@ -133,8 +146,16 @@ def foreseen_of(
         sizes=objects.tracked.sizes,
         openings=np.stack([rows[kept].T for rows in openings]),
         weights=np.array([motion.weight for motion in objects.motions]),
+        step_s=objects.tracked.step_s,
         is_begun=is_begun,
     )
+
+
+def _size(measured: FloatArray, usual: Sequence[float] | None) -> tuple[float, float, float]:
+    """Extents of an object as masks show them, or else as usual [m]."""
+    known = measured if usual is None or np.isfinite(measured).all() else usual
+    x, y, z = map(float, known)
+    return (x, y, z)
 
 
 def foreseen_feature(ends: ForeseenEnds | None) -> float:

@@ -48,7 +48,10 @@ PLAYER = ROOT / 'mtv_world_ros' / 'ros' / 'bags' / 'player.py'
 #: folders of the repository that lines may name files of
 FOLDERS = ('benchmark', 'config', 'docs', 'examples', 'launch', 'requirements', 'resource', 'test')
 #: options of other programs that the texts mention
-FOREIGN_OPTIONS = {'--feedback', '--show-args', '--symlink-install', '--system-site-packages'}
+FOREIGN_OPTIONS = {
+    '--feedback', '--generate', '--head', '--show-args', '--symlink-install',
+    '--system-site-packages',
+}  # fmt: skip
 _COMMENT = re.compile(r'<!-- (needs|small): (.+?) -->')
 _CODE = re.compile(r'`([^`\n]+)`')
 
@@ -309,7 +312,20 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
     'world_model': check_world_model,
     # of the system, or of others; never run
     **dict.fromkeys(
-        ('apt', 'cd', 'cp', 'export', 'git', 'hf', 'mkdir', 'pip', 'rosdep', 'sed', 'touch'),
+        (
+            'apt',
+            'cd',
+            'cp',
+            'export',
+            'git',
+            'hf',
+            'mkdir',
+            'pip',
+            'ray',
+            'rosdep',
+            'sed',
+            'touch',
+        ),
         lambda words: False,
     ),
 }

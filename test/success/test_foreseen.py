@@ -113,7 +113,7 @@ def test_motions_that_foresee_no_fingers_are_told_by_others(shares, told):
         names=(),
         cuts=np.zeros((2, 0, 4, 4, 4), np.uint8),
         poses=np.zeros((2, 0, 4, 4)),
-        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3))),
+        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3)), step_s=0.1),
         motions=tuple(map(motion, shares)),
         positions=positions,
     )

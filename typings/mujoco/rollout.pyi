@@ -1,5 +1,5 @@
-"""MuJoCo's names come from a compiled module, where pyright does not look."""
+"""MuJoCo's batches of rollouts."""
 
 from typing import Any
 
-def __getattr__(name: str) -> Any: ...
+Rollout: Any

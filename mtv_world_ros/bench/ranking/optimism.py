@@ -18,9 +18,9 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, in_order, parse_variant
-from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
+from mtv_world_ros.bench.ranking.judges import agreements, judged_by, JUDGES, probabilities, RULE
+from mtv_world_ros.bench.ranking.rollout_jobs import Result
 from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
-from mtv_world_ros.lab.evaluation.metrics.policy_agreement import rate_agreement, rates
 from mtv_world_ros.lab.evaluation.metrics.statistics import (
     clustered_wilson,
     Interval,
@@ -32,16 +32,6 @@ from mtv_world_ros.rendering.images import encode_png
 
 #: end of the names of pictures of where objects are
 OBJECTS = '.objects.png'
-#: who judges: field of a result -> words
-JUDGES = {
-    'foreseen': 'foreseen motions alone',
-    'pictures': 'pictures alone (paper)',
-    'imagined': 'both',
-    'no_picture': 'no-picture rule',
-    'seen': 'real frames',
-}
-#: of these, the columns of the optimism table
-COLUMNS = {'imagined': 'imagination', 'no_picture': 'no pictures', 'seen': "simulator's frames"}
 #: what is measured of each judge, in the order of the tables
 MEASURES = {
     'pearson': 'r observed',
@@ -163,12 +153,10 @@ class Optimism:
 
     def _agreement(self, results: Sequence[Result], judge: str) -> dict[str, Score]:
         """Pearson r and MMRV over the policies."""
-        true = outcomes(results, lambda r: float(r.final))
-        judged = outcomes(results, lambda r: judged_by(r, judge).probability)
-        count = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
         found = {}
-        for name, score in rate_agreement(judged, true).items():
-            found[name] = Score(value=score.observed, count=count)
+        for name, score in agreements(results, judge).items():
+            count = score.num_policies
+            found[name] = Score(value=score.value, count=count)
             found[f'{name}_noise_free'] = Score(
                 value=score.noise_free, interval=score.interval, count=count
             )
@@ -181,14 +169,14 @@ class Optimism:
 
     def _over_rule(self, results: Sequence[Result], judge: str) -> Score:
         """AUROC less that of the no-picture rule, over the rollouts that both judge."""
-        if judge == 'no_picture':
+        if judge == RULE:
             return Score()
         both = [
             r
             for r in results
             if isfinite(judged_by(r, judge).probability) and isfinite(r.no_picture.probability)
         ]
-        return self._area(both, [probabilities(both, judge), probabilities(both, 'no_picture')])
+        return self._area(both, [probabilities(both, judge), probabilities(both, RULE)])
 
     def _area(self, results: Sequence[Result], said: Sequence[FloatArray]) -> Score:
         """The first area under the ROC less the second one, if there is one."""
@@ -215,30 +203,9 @@ def is_contact(result: Result) -> bool:
     return all(FAULTS[kind].contact for kind in kinds_of(result))
 
 
-def judged_by(result: Result, judge: str) -> Judged:
-    """Returns the verdict of a judge, a key of `JUDGES`."""
-    return getattr(result, judge)
-
-
-def probabilities(results: Sequence[Result], judge: str) -> FloatArray:
-    """Returns the (N,) estimates of a judge; NaN = it abstains."""
-    return np.array([judged_by(r, judge).probability for r in results], dtype=np.float64)
-
-
 def true_rate(results: Sequence[Result]) -> Score:
     """Returns how often the rollouts really succeed."""
     return Score.share(results, lambda r: r.final)
-
-
-def outcomes(results: Sequence[Result], outcome: Callable[[Result], float]) -> FloatArray:
-    """Returns (P, K, E) outcomes by policy, task and episode; NaN where there is none."""
-    policies = list(dict.fromkeys(r.policy for r in results))
-    tasks = list(dict.fromkeys(r.task for r in results))
-    num_episodes = 1 + max((r.index for r in results), default=-1)
-    table = np.full((len(policies), len(tasks), num_episodes), nan)
-    for r in results:
-        table[policies.index(r.policy), tasks.index(r.task), r.index] = outcome(r)
-    return table
 
 
 def area_interval(

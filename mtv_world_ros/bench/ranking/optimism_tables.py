@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from mtv_world_ros.bench.expert.faults.catalogue import FAULTS
+from mtv_world_ros.bench.ranking.judges import COLUMNS, JUDGES
 from mtv_world_ros.bench.ranking.optimism import (
-    COLUMNS,
-    JUDGES,
     MEASURES,
     Optimism,
     Score,
@@ -41,7 +40,7 @@ def worth_table(results: Sequence[Result], worth: Mapping[str, Mapping[str, Scor
         results: rollouts.
         worth: of each judge over them, see `Summary.worth`.
     """
-    rows = [[words, *_worth(worth[judge])] for judge, words in JUDGES.items()]
+    rows = [[judge.title, *_worth(worth[key])] for key, judge in JUDGES.items()]
     rate = true_rate(results)
     return Table(
         caption=f'What a picture is worth: {rate.count} rollouts, {rate.value:.0%} really succeed',

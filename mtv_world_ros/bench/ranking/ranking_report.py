@@ -9,10 +9,10 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mtv_world_ros.bench.ranking.optimism import COLUMNS as SHORT_WORDS
+from mtv_world_ros.bench.ranking.judges import Agreement, COLUMNS, REPORTED
 from mtv_world_ros.bench.ranking.optimism_tables import optimism_tables, worth_table
 from mtv_world_ros.bench.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
-from mtv_world_ros.bench.ranking.ranking_summary import Agreement, ALL_TASKS, JUDGES, Rate, Summary
+from mtv_world_ros.bench.ranking.ranking_summary import ALL_TASKS, Rate, Summary
 from mtv_world_ros.bench.ranking.rollout_cards import rollout_cards
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.lab.documents import DASH, render, Table
@@ -69,7 +69,7 @@ def remarks(summary: Summary) -> list[str]:
     """Returns what has to be known to read the numbers."""
     found = [
         _MEANING,
-        _CEILING.format(seen=JUDGES['seen'].capitalize()),
+        _CEILING.format(seen=REPORTED['seen'].capitalize()),
         _truth_remark(summary),
         _WORTH,
         _agreement_remark(summary),
@@ -162,21 +162,21 @@ def _rates(summary: Summary, task: str | None) -> Table:
         [
             policy,
             _rate(summary.true_rate(policy, task)),
-            *(_rate(summary.judged_rate(policy, task, judge)) for judge in JUDGES),
+            *(_rate(summary.judged_rate(policy, task, judge)) for judge in REPORTED),
         ]
         for policy in summary.policies
         if summary.chosen(policy, task)
     ]
-    head = ['policy', 'simulator', *JUDGES.values()]
+    head = ['policy', 'simulator', *REPORTED.values()]
     return Table(caption=f'Success rates, {task or ALL_TASKS}', head=head, rows=rows)
 
 
 def _agreement(summary: Summary) -> Table:
     rows = []
     for label, task in {ALL_TASKS: None, **{name: name for name in summary.tasks}}.items():
-        found = {judge: summary.agreement(judge, task) for judge in JUDGES}
+        found = {judge: summary.agreement(judge, task) for judge in REPORTED}
         for judge, scores in found.items():
-            rows.append([label, SHORT_WORDS[judge], *_scores(scores)])
+            rows.append([label, COLUMNS[judge], *_scores(scores)])
     return Table(
         caption='Agreement with the simulator, over the policies',
         head=[
@@ -220,7 +220,7 @@ def _powered(summary: Summary) -> Table:
 
 def _confusion(summary: Summary) -> Table:
     rows = []
-    for judge, words in JUDGES.items():
+    for judge, words in REPORTED.items():
         counts = summary.confusion(judge)
         failures = counts['success_failure'] + counts['failure_failure']
         share = counts['success_failure'] / failures if failures else 0.0
@@ -324,9 +324,9 @@ def write_ranking(summary: Summary, out: Path) -> Path:
     write_whole(out / 'ranking.md', markdown(summary))
     path = out / 'ranking.html'
     charts = [
-        (f'{task or ALL_TASKS}: {JUDGES[judge]}', _chart(summary, judge, task))
+        (f'{task or ALL_TASKS}: {REPORTED[judge]}', _chart(summary, judge, task))
         for task in (None, *summary.tasks)
-        for judge in JUDGES
+        for judge in REPORTED
         if any(summary.judged_rate(p, task, judge).count for p in summary.policies)
     ]
     page = render(
@@ -335,7 +335,7 @@ def write_ranking(summary: Summary, out: Path) -> Path:
         answer=_answer(summary),
         tiles=_tiles(summary),
         charts=charts,
-        policies=_points(summary, next(iter(JUDGES)), None),
+        policies=_points(summary, next(iter(REPORTED)), None),
         rollouts=rollout_cards(summary.results, out),
         # the videos lie beside the page: a thousand of them would not fit into it
         files=" 'self' file:",
@@ -389,7 +389,7 @@ def _content(summary: Summary) -> dict[str, Any]:
 
 def _chart(summary: Summary, judge: str, task: str | None) -> Markup:
     return scatter_chart(
-        f'{task or ALL_TASKS}: {JUDGES[judge]}',
+        f'{task or ALL_TASKS}: {REPORTED[judge]}',
         _points(summary, judge, task),
         'success rate in the simulator',
         'judged success rate',

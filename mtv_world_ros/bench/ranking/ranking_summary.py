@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite, nan
@@ -10,15 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.bench.ranking.optimism import judged_by, Optimism, Score
-from mtv_world_ros.bench.ranking.optimism import JUDGES as ALL_JUDGES
+from mtv_world_ros.bench.ranking.judges import (
+    Agreement,
+    agreements,
+    judged_by,
+    JUDGES,
+    REPORTED,
+    RULE,
+)
+from mtv_world_ros.bench.ranking.optimism import Optimism, Score
 from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result
-from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
     powered_mean,
     PoweredMean,
-    rate_agreement,
-    rates,
 )
 from mtv_world_ros.lab.evaluation.metrics.statistics import (
     clustered_wilson,
@@ -29,13 +33,6 @@ from mtv_world_ros.lab.evaluation.metrics.statistics import (
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'
-#: who judges: name -> words
-JUDGES = {
-    'imagined': 'imagined episodes',
-    'seen': "the same estimator on the simulator's frames",
-}
-#: the judge that sees the commands and the first frame alone
-RULE = 'no_picture'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,33 +67,6 @@ class Rate:
             'hits': self.hits,
             'judged': self.count,
             'unknown': self.num_unknown,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Agreement:
-    """How well one judge's success rates of policies agree with the simulator's.
-
-    Attributes:
-        value: score of the observed rates; NaN where it is not defined, e.g. all rates alike.
-        noise_free: estimate of the score without the noise of few scenes; NaN where there is no
-            interval.
-        interval: 95 % interval of `noise_free`; NaN for too few scenes or policies.
-        num_policies: with a rate in both.
-    """
-
-    value: float
-    noise_free: float
-    interval: Interval
-    num_policies: int
-
-    def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
-        return {
-            'value': self.value,
-            'noise_free': self.noise_free,
-            'interval': self.interval,
-            'num_policies': self.num_policies,
         }
 
 
@@ -169,7 +139,7 @@ class Summary:
     def worth(self) -> dict[str, dict[str, Score]]:
         """What each judge's word is worth, by measure: foreseen motions, pictures, both, ..."""
         found = Optimism(results=self.results, flips={})
-        return {judge: found.scores(judge) for judge in ALL_JUDGES}
+        return {judge: found.scores(judge) for judge in JUDGES}
 
     @cached_property
     def rule_agreement(self) -> dict[str, Agreement]:
@@ -197,22 +167,13 @@ class Summary:
     @cached_property
     def _agreements(self) -> dict[tuple[str, str | None], dict[str, Agreement]]:
         groups = (None, *self.tasks)
-        return {(judge, task): self._agreement(judge, task) for judge in JUDGES for task in groups}
+        return {
+            (judge, task): self._agreement(judge, task) for judge in REPORTED for task in groups
+        }
 
     def _agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
-        tasks = self.tasks if task is None else (task,)
-        true = self._outcomes(tasks, lambda result: float(result.final))
-        judged = self._outcomes(tasks, lambda result: judged_by(result, judge).probability)
-        num = int((np.isfinite(rates(judged)) & np.isfinite(rates(true))).sum())
-        return {
-            name: Agreement(
-                value=found.observed,
-                noise_free=found.noise_free,
-                interval=found.interval,
-                num_policies=num,
-            )
-            for name, found in rate_agreement(judged, true).items()
-        }
+        results = [r for r in self.results if task in (None, r.task)]
+        return agreements(results, judge, self.policies)
 
     def powered(self, policy: str) -> PoweredMean:
         """Returns the success rate from few true outcomes and all imagined ones, all tasks.
@@ -282,10 +243,10 @@ class Summary:
                     label: {k: v.as_json() for k, v in self.agreement(judge, task).items()}
                     for label, task in groups.items()
                 }
-                for judge in JUDGES
+                for judge in REPORTED
             },
-            'abstained': {judge: self.abstained(judge).as_json() for judge in JUDGES},
-            'confusion': {judge: self.confusion(judge) for judge in JUDGES},
+            'abstained': {judge: self.abstained(judge).as_json() for judge in REPORTED},
+            'confusion': {judge: self.confusion(judge) for judge in REPORTED},
             'speed': self.speed(),
             'worth': {
                 judge: {measure: score.as_json() for measure, score in scores.items()}
@@ -305,7 +266,7 @@ class Summary:
             'rates': {
                 label: {
                     'simulator': self.true_rate(policy, task).as_json(),
-                    **{j: self.judged_rate(policy, task, j).as_json() for j in JUDGES},
+                    **{j: self.judged_rate(policy, task, j).as_json() for j in REPORTED},
                 }
                 for label, task in groups.items()
             },
@@ -317,16 +278,6 @@ class Summary:
                 'num_more': powered.num_more,
             },
         }
-
-    def _outcomes(self, tasks: Sequence[str], outcome: Callable[[Result], float]) -> FloatArray:
-        """(P, K, E) outcomes, NaN where there is none."""
-        num = 1 + max((result.index for result in self.results), default=-1)
-        table = np.full((len(self.policies), len(tasks), num), nan)
-        for result in self.results:
-            if result.task in tasks:
-                place = self.policies.index(result.policy), tasks.index(result.task)
-                table[(*place, result.index)] = outcome(result)
-        return table
 
 
 def _rightness(result: Result, judge: str) -> float:

@@ -178,7 +178,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     ]
     write_comparison(summaries, arguments.out)
     for entry, summary in zip(entries, summaries, strict=True):
-        print(f'{entry.label}: {in_short(summary.metrics())}')
+        print(f'{entry.label}: {summary.following.line}; {in_short(summary.metrics())}')
     print(f'tables: {" ".join(str(folder / "tables.md") for folder in folders)}')
     if arguments.report:
         from mtv_world_ros.lab.evaluation.report.html import write_report

@@ -15,9 +15,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'fit-contact',
         help='find how arms follow, friction, weight and grip: what foresight is told',
-        description='Finds how arms follow their commands, how fingers grip, what rubs and how '
-        'heavy objects are: the numbers with which solids, shaped as the masks show them, end '
-        'nearest to where objects ended in recorded episodes. Writes '
+        description='Finds how arms follow their commands and how late they do, how high the '
+        'table is, how fingers grip, what rubs and how heavy objects are: the numbers under which '
+        'solids, shaped as the first masks show them, keep nearest to where later masks show '
+        'them. Masks, commands and joint states are all it reads. Says each number with its '
+        'interval and how much it rests on. Numbers that OUT has are where it begins. Writes '
         'OUT/object_motion/arm_response.json and contact.json, with which a checkpoint foresees '
         "where objects go. OUT may be the checkpoint's folder.",
     )
@@ -33,9 +35,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument('--episodes', type=int, default=200, help='at most, spread evenly')
+    parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
     parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
-    parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument('--threads', type=int, default=0, help='that foresee; 0 = all but one')
     add_overwrite(parser)
     parser.set_defaults(handler=_fit)
 
@@ -46,24 +48,24 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.foresight.arms import Arms
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,
+        load_contact,
         load_response,
         save_contact,
         save_response,
     )
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
-        first_settings,
         fit_contact,
         read_recordings,
     )
     from mtv_world_ros.lab.training.object_motion.response_fit import found_response
     from mtv_world_ros.lab.training.training_run import find_episodes, spread
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.parallel import threads_each
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
-    file = robot_path(arguments.robot)
-    robot = load_robot(file)
+    robot = load_robot(robot_path(arguments.robot))
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
@@ -76,15 +78,14 @@ def _fit(arguments: argparse.Namespace) -> int:
     recordings, skipped = read_recordings(paths, robot, arguments.views)
     for path, reason in list(skipped.items())[:3]:
         print(f'left out: {path}: {reason}')
-    first = first_settings(arms).model_copy(update={'num_motions': arguments.motions})
-    settings = fit_contact(
+    settings, _ = fit_contact(
         recordings,
-        file,
-        response,
-        first,
-        workers=arguments.workers,
+        arms,
+        load_contact(folder),
+        threads=arguments.threads or threads_each(1),
         report=partial(print, flush=True),
     )
+    settings = settings.model_copy(update={'num_motions': arguments.motions})
     folder.mkdir(parents=True, exist_ok=True)
     if response is not None:
         save_response(response, folder)

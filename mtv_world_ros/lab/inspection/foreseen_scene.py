@@ -93,7 +93,7 @@ def load_scene(
     plan = match_joints(plan, robot, start)
     check_positions(robot, plan.positions)
     steps = round(float(plan.times[-1]) / STEP_S)
-    times = np.arange(steps * COMMANDS_A_STEP + 1) * PERIOD_S
+    times = np.arange(steps * COMMANDS_A_STEP + 1, dtype=np.float64) * PERIOD_S
     solids = tuple(entry.solid() for entry in file.objects)
     return tuple(e.name for e in file.objects), solids, resample(plan, start, times)
 

@@ -23,6 +23,7 @@ from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
+from mtv_world_ros.success.physics_watch import PhysicsWatch, unforeseen
 from mtv_world_ros.vision.jaccard import mean_of_known, object_scores, persistence_scores
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
@@ -94,6 +95,9 @@ class LiveFidelity:
 
     Chunks of imagine mode are not compared: nobody executes them.
 
+    Attributes:
+        watch: whether what came of plans was foreseen.
+
     Args:
         node: owner of the publisher.
         pipeline: observes the real frames as it does imagined ones.
@@ -108,7 +112,9 @@ class LiveFidelity:
         on_scored: Callable[[ScoredChunk], None],
         on_error: Callable[[Exception], None],
     ) -> None:
-        self._pipeline, self._spec = pipeline, pipeline.spec
+        self.watch = PhysicsWatch()
+        # imagined frames begin chunks, too, and cameras were checked before
+        self._pipeline, self._spec = replace(pipeline, camera_checker=None), pipeline.spec
         self._on_scored, self._on_error = on_scored, on_error
         self._tolerance_ns = round(MAX_OFFSET / self._spec.fps * NANO)
         self._changed = Condition()
@@ -250,6 +256,8 @@ class LiveFidelity:
             num_frames=len(indices),
         )
         self._results.append(ScoredChunk(chunk=expected.chunk, fidelity=fidelity))
+        if prediction.foreseen is not None and len(indices) == len(prediction.video.times):
+            self.watch.take(unforeseen(prediction.foreseen, episode.seen_points(len(indices))))
         self._done.trigger()
 
     def _real_episode(self, chunk: Chunk) -> ImaginedEpisode:

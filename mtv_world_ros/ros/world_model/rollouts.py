@@ -107,6 +107,7 @@ class Rollouts:
             self._robot, self._buffer, settings, lambda: self._worker.last_scene
         )
         self._fidelity = LiveFidelity(node, pipeline, reporter.scored, reporter.crash)
+        self._worker.doubt = lambda: self._fidelity.watch.doubt
         undo.callback(self._fidelity.close)
         self._publisher = PredictionPublisher(
             node,
@@ -200,6 +201,7 @@ class Rollouts:
             'views': self._spec.views,
             'busy': self._worker.busy,
             'cameras': self._worker.camera_check.text,
+            'physics': self._fidelity.watch.text,
             **self._live.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),

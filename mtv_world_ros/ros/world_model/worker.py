@@ -125,6 +125,7 @@ class RolloutWorker:
 
     Attributes:
         camera_check: what the newest episode's first pictures say about the cameras.
+        doubt: asked why futures are not to be believed here; empty = they are.
 
     Args:
         pipeline: the main path.
@@ -135,6 +136,7 @@ class RolloutWorker:
         self._pipeline, self._observed = pipeline, ObservedEpisode(pipeline)
         self._notify = notify
         self.camera_check = CameraCheck()
+        self.doubt: Callable[[], str] = str
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
@@ -415,6 +417,7 @@ class RolloutWorker:
             )
         episode.should_stop = self._should_stop
         self.camera_check = episode.camera_check
+        episode.doubt = '' if request.imagine else self.doubt()
         return scene, episode
 
     def _put(self, result: Result) -> None:

@@ -22,7 +22,7 @@ from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
-from mtv_world_ros.lab.training.object_motion.contact_fit import read_contact
+from mtv_world_ros.lab.training.object_motion.contact_fit import _Trial, read_contact
 
 #: of commands between two rows that come back
 ROWS = 5
@@ -44,7 +44,8 @@ AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
 
 @pytest.fixture(scope='module')
 def recording(robot):
-    return read_contact(share_path('resource', 'demo_episode'), robot, ('low', 'high'))
+    read = read_contact(share_path('resource', 'demo_episode'), robot, ('low', 'high'))
+    return _Trial.of(read, SETTINGS)
 
 
 def motions_of(response, *solids: Solid | None, **changed) -> ContactMotions:

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.bench.ranking.optimism import JUDGES
+from mtv_world_ros.bench.ranking.judges import JUDGES
 from mtv_world_ros.bench.ranking.ranking_report import (
     console,
     markdown,
@@ -171,6 +171,6 @@ def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
     said_in_json = summary.as_json()['worth']['pictures']['false_success']
     assert said_in_json['value'] == 1.0 and said_in_json['count'] == 10
     first = tables(summary)[0]
-    assert [row[0] for row in first.rows] == list(JUDGES.values())
+    assert [row[0] for row in first.rows] == [judge.title for judge in JUDGES.values()]
     assert 'Truth of the simulator: bold: x.' in remarks(summary)
     assert '[' in str(first.rows[0][3]), 'no interval'

@@ -36,7 +36,11 @@ def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsy
     printed = capsys.readouterr().out
     assert '1 of 3 episodes, split all' in printed and '| b c ' not in printed
     assert len(printed.splitlines()) == 5  # the data, a line a checkpoint, tables, report
-    assert 'b c: J of ' in printed and 'first frame held: ' in printed
+    assert (
+        'b c: follows the commands: cannot tell' in printed
+        and '; J of ' in printed
+        and 'first frame held: ' in printed
+    )
     assert 'no intervals below 3 episodes' in printed
     assert '| b c ' in (out / 'paper_tables.md').read_text()
     assert 'Cannot tell from 1 episode: give at least 3.' in (out / 'report.html').read_text()

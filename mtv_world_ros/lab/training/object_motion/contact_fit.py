@@ -1,30 +1,33 @@
-"""Friction, weight and the grip of fingers, from recordings of what commands did to objects.
+"""Friction, weight, grip, delay and table, from masks and joint states of what commands did.
 
-Settings of rigid bodies are tried on recorded episodes: those whose objects keep nearest to where
-they really were are kept. Nothing is taken from a simulator, and a robot's own recordings do.
+Settings are drawn, and objects foreseen under each of them; those under which objects keep nearest
+to where later masks show them are likelier. Draws are repeated where they are likely (population
+Monte Carlo, Cappe et al. 2004), so that every number has an interval, which becomes its spread in
+futures. Nothing is taken from a simulator, and no pose of an object but those that masks show.
 
-Shape letters: T steps, O objects, J joints, N settings, E episodes.
+Shape letters: T steps, O objects, J joints, N draws, P numbers, E episodes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import multivariate_normal, qmc
 
+from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
-from mtv_world_ros.foresight.futures import draw_futures
-from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.foresight.futures import Future
+from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S
+from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.lab.training.object_motion.finger_fit import fit_fingers, FreeGrippers
@@ -36,26 +39,46 @@ from mtv_world_ros.lab.training.object_motion.tracks import (
     read_each,
     recorded_positions,
 )
-from mtv_world_ros.parallel import run_all
 
-#: what is tried: each number by these factors, round by round
-_FITTED = (
-    'finger_stiffness',
-    'finger_damping',
-    'grip_friction',
-    'table_friction',
-    'density',
-    'tray_kg',
-    'rim_m',
-    'wall_m',
-)
-_FACTORS = (1.6, 1.6, 1.3, 1.3, 1.15)
-#: of these what grippers report says more, where fingers swing
-_OF_FINGERS = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
-#: standard errors by which a change must help: one in twenty that does nothing is taken
-_SURE = 1.64
-#: errors below the first are as good, above the second as bad [m]
-_LEAST_M, _MOST_M = 0.003, 0.1
+#: what is drawn, and as how large it may be thought before: factors are of the first settings
+RANGES = {
+    'grip_friction': (0.03, 3.0),
+    'table_friction': (0.15, 2.5),
+    'density': (60.0, 3000.0),
+    'finger_stiffness': (0.2, 3.0),
+}
+_FACTORS = frozenset({'finger_stiffness'})
+_WORDS = {
+    'grip_friction': 'friction of fingers',
+    'table_friction': 'friction of all else',
+    'density': 'density [kg/m^3]',
+    'finger_stiffness': 'stiffness of fingers [N/m]',
+    'delay_s': 'commands arrive late by [s]',
+    'table_m': 'height of the table [m]',
+}
+#: how far settings usually are from the first ones, as the deviation of a logarithm
+_USUAL = 1.0
+#: draws of a round, and rounds
+_DRAWS, _ROUNDS = 64, 3
+#: an object this far from where it was foreseen is about as unlikely as it gets [m]; farther ones
+#: may be lost by the masks
+_NEAR_M, _LOST_M = 0.008, 0.1
+#: later draws lie as wide as what is likely, times this; deviation of a logarithm, at least
+_WIDER, _LEAST = 1.3, 0.08
+#: an episode says something of a number whose low and high values differ by this likelihood
+_SAYS = 0.5
+#: delays and heights of a table that are tried [s], [m]
+_DELAYS = np.arange(0.0, 0.31, PERIOD_S)
+_HEIGHTS = np.arange(-0.03, 0.0301, 0.0075)
+#: recordings whose table is looked for
+_MOST_TABLES = 8
+#: objects of which less is shown than this share of the first frame's are hidden in part
+_SHOWN = 0.85
+#: slower joints do not show a delay [rad/s or m/s]
+_MOVES = 0.1
+_RESAMPLED, _SEED = 400, 5
+#: spreads in futures are no smaller and no larger: other scenes are not quite as these
+_LEAST_SPREAD, _MOST_SPREAD = 0.1, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,59 +86,92 @@ class ContactRecording:
     """What an episode says about contact.
 
     Attributes:
+        names: of O objects.
         frame: the first.
-        solids: O, as it shows them.
         positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
+        recorded: (1 + T * n, J) reported by the joints then.
+        ways: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
         grippers: before they close.
-        ways: (1 + T, O, 3) since the first step, as recorded; NaN = not known [m].
     """
 
+    names: tuple[str, ...]
     frame: FirstFrame
-    solids: tuple[Solid | None, ...]
     positions: FloatArray
-    grippers: FreeGrippers
+    recorded: FloatArray
     ways: FloatArray
+    grippers: FreeGrippers
 
-    def errors(self, engine: Engine, settings: ContactSettings) -> FloatArray:
-        """Returns (1 + T, O) how far objects are from where they were [m], NaN = not known."""
-        known = [number for number, solid in enumerate(self.solids) if solid is not None]
-        solids = [solid for solid in self.solids if solid is not None]
-        alone = settings.model_copy(update={'num_motions': 1})
-        batch = engine.begin(draw_futures(alone, solids, engine.arms.drives))
-        motion, state = batch.advance(self.positions, COMMANDS_A_STEP)
-        points = np.full(self.ways.shape, np.nan)
-        if not state.lost:
-            points[:, known] = motion.points[0]
-        return np.linalg.norm(points - points[0] - self.ways, axis=-1)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """A number that was found.
+
+    Attributes:
+        name: of the setting.
+        value: most likely.
+        low: lower end of its 90 % interval.
+        high: upper end.
+        spread: standard deviation, of factors that of the logarithm.
+        count: episodes, or objects, that say something of it.
+        of: that were looked at.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    spread: float
+    count: int
+    of: int
+
+    def __str__(self) -> str:
+        rests = f'rests on {self.count} of {self.of} recordings'
+        if not self.count:
+            rests = f'none of {self.of} recordings tells: this is what was thought before'
+        return f'{_WORDS[self.name]}: {self.value:.3g} [{self.low:.3g}, {self.high:.3g}] ({rests})'
 
 
 def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
-    """Reads what an episode says about contact.
+    """Reads what an episode says about contact: masks, commands and joint states.
 
     Raises:
         EpisodeError: see `object_ways`.
     """
-    episode = read_episode(path, views=tuple(views))
+    # poses of objects that a simulator recorded are not looked at
+    episode = replace(read_episode(path, views=tuple(views)), object_poses=None)
     ways = object_ways(episode, robot, views)
-    frame = first_frame(episode, robot, views)
     times, positions = fine_commands(episode, robot, views)
     assert episode.masks is not None and episode.joint_states is not None
-    stamps = episode.masks[views[0]].stamps_ns[0] + times * 1e9
-    recorded = recorded_positions(episode.joint_states, robot, stamps)
+    stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
+    shown = _unhidden(episode, views, len(ways))
+    recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
     return ContactRecording(
-        frame=frame,
-        solids=tuple(
-            fit_solid(
-                frame.masks[:, item], point, frame.cameras, frame.poses, is_open=is_vessel(name)
-            )
-            for item, (name, point) in enumerate(
-                zip(episode.info.objects, frame.points(), strict=True)
-            )
-        ),
+        names=tuple(episode.info.objects),
+        frame=first_frame(episode, robot, views),
         positions=positions,
+        recorded=recorded,
+        ways=np.where(shown[..., None], ways, np.nan),
         grippers=FreeGrippers.of(robot, positions, recorded),
-        ways=ways,
     )
+
+
+def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArray:
+    """(1 + T, O) whether all views show about as much of an object as at first."""
+    assert episode.masks is not None
+    count = len(episode.info.objects)
+    areas = []
+    for view in views:
+        track = episode.masks[view]
+        wanted = track.stamps_ns[0] + np.arange(num_rows) * STEP_S * 1e9
+        each = np.stack(
+            [
+                np.bincount(np.asarray(track.frames[k]).ravel(), minlength=1 + count)[1:]
+                for k in range(len(track.stamps_ns))
+            ]
+        )
+        areas.append(each[nearest_rows(track.stamps_ns, wanted)][:, :count])
+    shown = np.stack(areas)
+    return np.asarray((shown >= _SHOWN * shown[:, :1]).all(axis=0))
 
 
 def read_recordings(
@@ -148,24 +204,19 @@ def first_settings(arms: Arms) -> ContactSettings:
 
 def fit_contact(
     recordings: Sequence[ContactRecording],
-    robot_file: Path,
-    response: ArmResponse | None,
-    first: ContactSettings,
-    workers: int = 1,
+    arms: Arms,
+    first: ContactSettings | None = None,
+    threads: int = 1,
     report: Callable[[str], None] = lambda line: None,
-) -> ContactSettings:
-    """Returns the settings with which solids keep nearest to where objects were.
-
-    Fingers come first, see `fit_fingers`. Then, in each round, every other number is tried larger
-    and smaller; those that help by more than chance are changed, together if that is better still,
-    or else the one that helps most. The factors get smaller.
+) -> tuple[ContactSettings, list[Finding]]:
+    """Returns likely settings with their spread, and what was found with intervals.
 
     Args:
         recordings: E.
-        robot_file: of the robot.
-        response: of the arms to their commands.
-        first: start of the search.
-        workers: processes.
+        arms: of the robot that was recorded.
+        first: numbers that were found before, where the search begins; None = it begins with
+            `first_settings`, and with fingers as `fit_fingers` finds them.
+        threads: that foresee.
         report: is told how each round went.
 
     Raises:
@@ -174,69 +225,246 @@ def fit_contact(
     """
     if not any(np.isfinite(recording.ways).any() for recording in recordings):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
+    if first is None:
+        first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
+    table, delay = find_table(recordings), find_delay(recordings, arms)
+    report(str(table))
+    report(str(delay))
+    first = first.model_copy(update={'table_m': table.value, 'delay_s': delay.value})
+    engine = Engine(arms, threads)
+    trials = [_Trial.of(one, first) for one in recordings]
+    factors, likelihoods, weights = _populations(engine, trials, first, report)
+    found = [
+        _finding(name, column, np.log(_scales(first)[name]) + factors, likelihoods, weights)
+        for column, name in enumerate(RANGES)
+    ]
+    values = {one.name: one.value for one in found}
+    heavier = values['density'] / first.density
+    stiffer = values['finger_stiffness'] / first.finger_stiffness
+    values |= {
+        'tray_kg': float(np.clip(first.tray_kg * heavier, 1e-3, 100)),
+        'finger_damping': first.finger_damping * stiffer,
+    }
+    spreads = {
+        key: float(np.clip(one.spread, _LEAST_SPREAD, _MOST_SPREAD))
+        for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
+    }
+    spread = first.spread.model_copy(
+        update={**spreads, 'delay_s': max(delay.spread, first.spread.delay_s)}
+    )
+    for one in found:
+        report(str(one))
+    return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found]
 
-    def losses(settings: Sequence[ContactSettings]) -> FloatArray:
-        """(N, E)."""
-        jobs = [(n, e, one) for e in range(len(recordings)) for n, one in enumerate(settings)]
-        make_run = partial(_Trial, robot_file, response, recordings)
-        found = np.full((len(settings), len(recordings)), np.nan)
-        for (number, episode, _), loss in run_all(jobs, make_run, workers):
-            found[number, episode] = loss
+
+def _scales(first: ContactSettings) -> dict[str, float]:
+    """What a drawn number is multiplied by."""
+    return {name: getattr(first, name) if name in _FACTORS else 1.0 for name in RANGES}
+
+
+def _populations(
+    engine: Engine,
+    trials: Sequence[_Trial],
+    first: ContactSettings,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Draws (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
+    low, high = np.log(np.array(list(RANGES.values())).T)
+    uniform = -float(np.log(high - low).sum())
+    middle = np.log([1.0 if n in _FACTORS else getattr(first, n) for n in RANGES])
+    drawn = qmc.scale(
+        qmc.Sobol(len(RANGES), rng=np.random.default_rng(_SEED)).random(_DRAWS), low, high
+    )
+    draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, len(trials)))
+    proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
+    weights = np.zeros(0)
+    for number in range(_ROUNDS):
+        draws = np.concatenate([draws, drawn])
+        settings = [_settings(first, one) for one in drawn]
+        rows = np.stack([trial.likelihoods(engine, settings) for trial in trials], axis=-1)
+        likelihoods = np.concatenate([likelihoods, rows])
+        densities = [
+            np.full(len(draws), uniform)
+            if one is None
+            else multivariate_normal.logpdf(draws, one[0], one[1])  # type: ignore[arg-type]
+            for one in proposals
+        ]
+        mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
+        usual = -(((draws - middle) / _USUAL) ** 2).sum(-1) / 2
+        logs = likelihoods.sum(-1) + usual - mixture
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        mean = weights @ draws
+        spread = np.sqrt(weights @ (draws - mean) ** 2)
+        report(f'round {number + 1}: {len(draws)} draws, worth {1 / (weights**2).sum():.1f} alike')
+        wide = np.diag(np.maximum(_WIDER * spread, _LEAST) ** 2)
+        proposals.append((mean, wide))
+        rng = np.random.default_rng((_SEED, number))
+        drawn = np.clip(rng.multivariate_normal(mean, wide, _DRAWS), low, high)
+    return draws, likelihoods, weights
+
+
+def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:
+    """Settings of a draw (P,)."""
+    numbers = dict(zip(RANGES, np.exp(logs).tolist(), strict=True))
+    values = {name: numbers[name] * scale for name, scale in _scales(first).items()}
+    heavier, stiffer = values['density'] / first.density, numbers['finger_stiffness']
+    return first.model_copy(
+        update={
+            **values,
+            'tray_kg': first.tray_kg * heavier,
+            'finger_damping': first.finger_damping * stiffer,
+        }
+    )
+
+
+def _finding(
+    name: str, column: int, logs: FloatArray, likelihoods: FloatArray, weights: FloatArray
+) -> Finding:
+    """What draws (N, P), given as logarithms with their likelihoods, say of a number."""
+    values = logs[:, column]
+    order = np.argsort(values)
+    shares = np.cumsum(weights[order]) - weights[order] / 2
+    low, middle, high = np.interp((0.05, 0.5, 0.95), shares, values[order])
+    spread = float(np.sqrt(weights @ (values - weights @ values) ** 2))
+    thirds = np.quantile(values[:_DRAWS], (1 / 3, 2 / 3))
+    ends = [likelihoods[:_DRAWS][part].mean(0) for part in
+            (values[:_DRAWS] < thirds[0], values[:_DRAWS] > thirds[1])]  # fmt: skip
+    count = int((np.abs(ends[0] - ends[1]) > _SAYS).sum())
+    low, middle, high = np.exp([low, middle, high]).tolist()
+    return Finding(
+        name=name,
+        value=middle,
+        low=low,
+        high=high,
+        spread=spread,
+        count=count,
+        of=likelihoods.shape[1],
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Trial:
+    """An episode whose objects are foreseen under several settings.
+
+    Attributes:
+        solids: of the O objects that two views see at first.
+        positions: (1 + T * n, J) commanded.
+        ways: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+    """
+
+    solids: tuple[Solid, ...]
+    positions: FloatArray
+    ways: FloatArray
+
+    @classmethod
+    def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
+        """Returns the trial of a recording on a table as high as the settings say."""
+        frame, points = recording.frame, recording.frame.points()
+        found = [
+            fit_solid(
+                frame.masks[:, item], points[item], frame.cameras, frame.poses, settings.table_m,
+                is_vessel(name),
+            )
+            for item, name in enumerate(recording.names)
+        ]  # fmt: skip
+        known = [item for item, solid in enumerate(found) if solid is not None]
+        return cls(
+            solids=tuple(solid for solid in found if solid is not None),
+            positions=recording.positions,
+            ways=recording.ways[:, known],
+        )
+
+    def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
+        """Returns (N,) log likelihoods of where masks show the objects."""
+        still = np.zeros(len(engine.arms.drives.names))
+        futures = [
+            Future(settings=one, solids=self.solids, zeros=still, delay_s=one.delay_s)
+            for one in settings
+        ]
+        motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
+        rows = min(motion.points.shape[1], len(self.ways))
+        # how it ends counts: at first nothing has moved whatever the settings
+        late = slice(rows // 2, rows)
+        foreseen = motion.points[:, late] - motion.points[:, :1]
+        away = np.linalg.norm(foreseen - self.ways[late], axis=-1)
+        away = np.clip(np.nan_to_num(away, nan=np.nan), 0.0, _LOST_M)
+        unlikely = np.log1p((away / _NEAR_M) ** 2)
+        known = np.isfinite(self.ways[late]).all(-1)
+        counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)
+        found = -(counted / np.maximum(known.sum(0), 1)).sum(-1)
+        found[list(state.lost)] = -np.log1p((_LOST_M / _NEAR_M) ** 2) * len(self.solids)
         return found
 
-    arms = Arms(load_robot(robot_file), response)
-    best = fit_fingers([recording.grippers for recording in recordings], arms, first)
-    swing = 'swing' if best.fingers_swing else 'do not swing'
-    report(f'fingers {swing}: {best.model_dump(mode="json", include=set(_OF_FINGERS))}')
-    fitted = [name for name in _FITTED if not (best.fingers_swing and name in _OF_FINGERS)]
-    (loss,) = losses([best])
-    report(f'begins at {np.nanmean(loss):.3f}')
-    for factor in _FACTORS:
-        tried = [
-            best.model_copy(update={name: getattr(best, name) * by})
-            for name in fitted
-            for by in (factor, 1 / factor)
-        ]
-        found = losses(tried)
-        gains = np.array([_sure_gain(loss - one) for one in found])
-        changes = {}
-        for number, name in enumerate(fitted):
-            better = 2 * number + int(gains[2 * number + 1] > gains[2 * number])
-            if gains[better] > 0:
-                changes[name] = getattr(tried[better], name)
-        if changes:
-            together = best.model_copy(update=changes)
-            (of_all,), alone = losses([together]), int(np.argmax(gains))
-            best, loss = (
-                (together, of_all)
-                if np.nanmean(of_all) <= np.nanmean(found[alone])
-                else (tried[alone], found[alone])
-            )
-        report(f'by {factor}: {np.nanmean(loss):.3f} with {best.model_dump(mode="json")}')
-    return best
+
+def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> Finding:
+    """Returns how much later joints move than commands of now would have them move."""
+    errors = np.stack([_delay_errors(one, arms) for one in recordings])
+    return _least('delay_s', errors, _DELAYS)
 
 
-def _sure_gain(gains: FloatArray) -> float:
-    """The lower end of the mean of what episodes (E,) gain; a few of them may gain a lot."""
-    known = gains[np.isfinite(gains)]
-    return float(known.mean() - _SURE * known.std() / np.sqrt(len(known)))
+def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
+    """Error of the joints by delay; NaN = they do not move."""
+    expected = recording.positions
+    if arms.response is not None:
+        free = replace(arms.response, floor=None)
+        expected = free.follow(arms.robot, recording.positions)[0]
+    speeds = np.abs(np.gradient(expected, PERIOD_S, axis=0))
+    moving = speeds > _MOVES
+    errors = []
+    for delay in np.rint(_DELAYS / PERIOD_S).astype(int):
+        late = np.concatenate([np.repeat(expected[:1], delay, 0), expected])[: len(expected)]
+        off = np.abs(late - recording.recorded)[moving]
+        errors.append(float(np.mean(off)) if len(off) else np.nan)
+    return np.array(errors)
 
 
-class _Trial:
-    """Tries settings on recordings, in a process of its own."""
+def find_table(recordings: Sequence[ContactRecording]) -> Finding:
+    """Returns the height at which the outlines of what stands on a table fit best."""
+    errors = []
+    for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
+        frame, points = recording.frame, recording.frame.points()
+        for item, name in enumerate(recording.names):
+            row = [
+                fit_solid(
+                    frame.masks[:, item], points[item], frame.cameras, frame.poses, height,
+                    is_vessel(name),
+                )
+                for height in _HEIGHTS
+            ]  # fmt: skip
+            # logarithms: what is no box or cylinder fits badly at any height
+            errors.append([np.nan if s is None else np.log(s.error_px + 0.05) for s in row])
+    return _least('table_m', np.array(errors), _HEIGHTS)
 
-    def __init__(
-        self,
-        robot_file: Path,
-        response: ArmResponse | None,
-        recordings: Sequence[ContactRecording],
-    ) -> None:
-        self._engine = Engine(Arms(load_robot(robot_file), response))
-        self._recordings = recordings
 
-    def __call__(self, job: tuple[int, int, ContactSettings]) -> float:
-        """Returns the mean logarithm of errors, between the bounds [log m]; NaN = not known."""
-        _, episode, settings = job
-        errors = self._recordings[episode].errors(self._engine, settings)
-        errors = errors[np.isfinite(errors)]
-        return float(np.log(np.clip(errors, _LEAST_M, _MOST_M)).mean()) if len(errors) else np.nan
+def _least(name: str, errors: FloatArray, values: FloatArray) -> Finding:
+    """The value with the least errors (E, N), with an interval from resampled episodes."""
+    known = errors[np.isfinite(errors).all(-1)]
+    if not len(known):
+        return Finding(
+            name=name, value=0.0, low=0.0, high=0.0, spread=0.0, count=0, of=len(errors)
+        )
+    rng = np.random.default_rng(_SEED)
+    rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
+    found = np.array([_lowest(known[row].mean(0), values) for row in rows])
+    low, high = np.quantile(found, (0.05, 0.95))
+    return Finding(
+        name=name,
+        value=float(_lowest(known.mean(0), values)),
+        low=float(low),
+        high=float(high),
+        spread=float(found.std()),
+        count=len(known),
+        of=len(errors),
+    )
+
+
+def _lowest(errors: FloatArray, values: FloatArray) -> float:
+    """Where errors (N,) are least, between the values by a parabola."""
+    at = int(errors.argmin())
+    if not 0 < at < len(values) - 1:
+        return float(values[at])
+    before, least, after = errors[at - 1 : at + 2]
+    bend = before - 2 * least + after
+    shift = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return float(values[at] + shift * (values[1] - values[0]))

@@ -72,7 +72,7 @@ def object_ways(episode: Episode, robot: RobotModel, views: Sequence[str]) -> Fl
     if episode.masks is None or states is None or not episode.trajectories:
         raise EpisodeError(f"'{path}' has no object masks, joint states or commands")
     start = first_frame(episode, robot, views).points()
-    seen = np.isfinite(start).all(-1)
+    seen = np.asarray(np.isfinite(start).all(-1))
     if not seen.any():
         raise EpisodeError(f"'{path}': no object is seen by two views in the first frame")
     times = fine_commands(episode, robot, views)[0][::COMMANDS_A_STEP]
