@@ -201,11 +201,11 @@ def _tool(
     hand = _Hand(model, urdf, arm, mimics)
     T = link_pose.inverse().homogeneous @ hand.tool_pose()
     tool |= {
-        'position': [round(float(x), 5) for x in T[:3, 3]],
-        'quaternion_xyzw': [round(float(x), 7) for x in quaternion(T[:3, :3])],
+        'position': [round(float(x), 5) + 0.0 for x in T[:3, 3]],
+        'quaternion_xyzw': [round(float(x), 7) + 0.0 for x in quaternion(T[:3, :3])],
         'gripper_joint': model.names[hand.joint],
-        'gripper_closed': round(hand.closed, 6),
-        'gripper_open': round(hand.open, 6),
+        'gripper_closed': round(hand.closed, 6) + 0.0,  # no -0.0
+        'gripper_open': round(hand.open, 6) + 0.0,
         'finger_travel_m': hand.travel_m,
     }
     notes.append(

@@ -28,6 +28,7 @@ def test_a_urdf_becomes_a_robot_file_with_a_picture(crane, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'joint roll: turns without end' in printed
     assert 'gripper jaw_left: closed at 0, open at 0.04' in printed
+    assert '-0.0\n' not in out.read_text()
     guessed, written = load_robot(out), load_robot(crane)
     assert guessed.joint_names == written.joint_names
     assert guessed.base_link == written.base_link == 'plinth'
