@@ -84,7 +84,8 @@ def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
     """(H, W) structural similarity of two frames (H, W, 3), the mean of the channels."""
 
     def blurred(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(cv2.GaussianBlur(x, (11, 11), _SIGMA, borderType=cv2.BORDER_REFLECT_101))
+        found = cv2.GaussianBlur(x, (11, 11), _SIGMA, borderType=cv2.BORDER_REFLECT_101)
+        return np.asarray(found, np.float64)
 
     x, y = a.astype(np.float64), b.astype(np.float64)
     mx, my = blurred(x), blurred(y)
