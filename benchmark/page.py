@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
     'camera_calibration': ('mtv_world_ros/lab/inspection',),
+    'camera_check': ('mtv_world_ros/vision',),
     'control_representations': ('mtv_world_ros/lab/training', 'mtv_world_ros/model'),
     'doctor': ('mtv_world_ros/lab/inspection',),
     'foresight': ('mtv_world_ros/ros',),

@@ -29,7 +29,7 @@ from mtv_world_ros.assembly import fingerprint, load_pipeline
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed
 from mtv_world_ros.bench.collect.record import carry_out, RecordConfig
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults import draw_variant, EXPERT, FAULTS
+from mtv_world_ros.bench.expert.faults.catalogue import draw_variant, EXPERT, FAULTS
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.bench.ranking.optimism import area_interval
@@ -37,11 +37,11 @@ from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.data_types import FloatArray, Observation
 from mtv_world_ros.errors import MtvWorldError, PolicyError, SimulatorError
+from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
-from mtv_world_ros.model.object_motion.arm_response import PERIOD_S
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell

@@ -50,8 +50,8 @@ def _no_truth(value: Any) -> Any:
 _Pixels = Annotated[
     int,
     Strict(False),
-    Field(ge=1, le=100_000),
-    expected('a whole number from 1 to 100000'),
+    Field(ge=2, le=100_000),
+    expected('a whole number from 2 to 100000'),
     BeforeValidator(_no_truth),
 ]
 

@@ -262,7 +262,9 @@ def _add_export_dataset(commands: argparse._SubParsersAction) -> None:
         help='write episodes as a LeRobot dataset (v3.0)',
         epilog='OUT/meta/mapping.yaml is the mapping with which import-dataset reads it back.',
     )
-    parser.add_argument('episodes', type=Path, help='folder of episodes, or one episode')
+    parser.add_argument(
+        'episodes', type=Path, nargs='+', help='folder of episodes, or one episode'
+    )
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--fps', type=int, default=10, help='rows a second')
     parser.add_argument(
@@ -293,7 +295,7 @@ def _export(arguments: argparse.Namespace) -> int:
     path = bundled('robots', arguments.robot, '--robot')
     named = arguments.robot if path.stem == arguments.robot else str(path.resolve())
     count = export_dataset(
-        list_episodes(arguments.episodes),
+        [path for folder in arguments.episodes for path in list_episodes(folder)],
         arguments.out,
         load_robot(path),
         named,

@@ -105,3 +105,11 @@ def test_a_wrong_size_is_refused(size, tmp_path, capsys):
     out = str(tmp_path / 'new')
     assert main(['export-dataset', str(DEMO), '--out', out, '--size', size]) == 1
     assert f"--size is '{size}'; it must be WIDTHxHEIGHT" in capsys.readouterr().err
+
+
+def test_several_paths_are_one_data_set(tmp_path, capsys):
+    out = tmp_path / 'set'
+    command = ['export-dataset', str(DEMO), str(DEMO), '--out', str(out), '--fps', '2']
+    assert main([*command, '--size', '64x48', '--images']) == 0
+    assert '2 episodes' in capsys.readouterr().out
+    assert len(LeRobotDataset(out).episodes) == 2
