@@ -284,5 +284,5 @@ def _leans(footage: Footage, frame: int) -> FloatArray:
     for item in map(int, np.flatnonzero(known.any(0))):
         views = np.flatnonzero(known[:, item])
         cameras = [footage.cameras[int(view)] for view in views]
-        leans[item] = lean(cameras, footage.poses[views, frame], masks[views, item])
+        leans[item] = lean(cameras, list(footage.poses[views, frame]), list(masks[views, item]))
     return leans
