@@ -39,6 +39,9 @@ _STILL_ROWS = 1
 _FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
 #: a plan may take so many times as long as what it shows, and so long more [s]
 _SLOW, _LEAST_CAP_S = 20.0, 60.0
+#: constraints (three a contact) from which a step takes so long that each is computed alone, and
+#: which are those of objects that cannot all be where they were found
+_CROWDED, _OVERLAPPING = 500, 1500
 
 logger = logging.getLogger(__name__)
 
@@ -192,7 +195,7 @@ class Batch:
             commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].
             every: periods between two rows.
             state: where they are; None = where they begin.
-            should_stop: asked after every row.
+            should_stop: asked after every row, and within one that takes long.
 
         Raises:
             RolloutPreempted: `should_stop` said so.
@@ -203,31 +206,61 @@ class Batch:
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
         cap_s = time.monotonic() + _SLOW * rows * every * PERIOD_S + _LEAST_CAP_S
-        for row in range(rows):
+
+        def check() -> None:
             if should_stop():
                 raise RolloutPreempted('stopped while objects were foreseen')
             if time.monotonic() > cap_s:
                 run.lose_all('took too long')
-            self._advance_row(run, row)
+
+        for row in range(rows):
+            check()
+            self._advance_row(run, row, check)
         return run.motion(), replace(
             state, physics=run.physics, arms=arms, last=course, still=run.still, lost=run.lost
         )
 
-    def _advance_row(self, run: _Run, row: int) -> None:
+    def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
         passing = [
             number in run.lost or (run.may_pass(number, row) and self._is_clear(run, number, row))
             for number in range(len(self.futures))
         ]
         moving = np.flatnonzero(~np.array(passing))
         if len(moving):
-            states = self._engine.run(
-                [self._models[number] for number in moving],
-                self._data,
-                run.physics[moving],
-                np.stack([self._controls(run, int(number), row) for number in moving]),
-            )
-            run.take(moving, states)
+            self._compute_row(run, row, moving, check)
         run.finish_row(row, moving)
+
+    def _compute_row(
+        self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
+    ) -> None:
+        """Computes a row of some futures, step by step where one takes long."""
+        controls = np.stack([self._controls(run, int(number), row) for number in moving])
+        steps = controls.shape[1]
+        constraints = self._constraints(run.physics[moving[0]], int(moving[0]))
+        if constraints > _OVERLAPPING:
+            run.lose_all('objects overlap: more touches than things on a table can have')
+            return
+        piece = 1 if constraints > _CROWDED else steps
+        for first in range(0, steps, piece):
+            if first:
+                check()
+            kept = np.array([int(number) not in run.lost for number in moving])
+            if not kept.any():
+                return
+            states = self._engine.run(
+                [self._models[number] for number in moving[kept]],
+                self._data,
+                run.physics[moving[kept]],
+                controls[kept, first : first + piece],
+            )
+            run.take(moving[kept], states)
+
+    def _constraints(self, physics: FloatArray, number: int) -> int:
+        """Number of constraints, of contacts most, where a future is; they make steps slow."""
+        model, data = self._models[number], self._data[0]
+        mujoco.mj_setState(model, data, physics, FULL)
+        mujoco.mj_fwdPosition(model, data)
+        return data.nefc
 
     def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
         """(S, D) numbers of the drives of a future in a row."""

@@ -111,6 +111,17 @@ def test_it_stops_within_50_ms(lift):
     assert np.max(np.diff(asked)) < 0.05
 
 
+def test_objects_that_cannot_all_be_where_they_were_found_are_refused_at_once(lift):
+    places = np.random.default_rng(0).normal([0.0, 0.0, 0.1], 0.01, (20, 3))
+    heap = [Solid(centre=place, size=np.full(3, 0.2)) for place in places]
+    begun = time.process_time()
+    one = tracked(lift, *heap)
+    motions, one = one.advance(picking())
+    assert time.process_time() - begun < 5
+    assert all(np.isnan(motion.points).all() for motion in motions)
+    assert 'objects overlap' in one.reasons[-1] and one.refusal
+
+
 @pytest.mark.parametrize('threads', [1, 2])
 def test_a_future_that_cannot_be_is_dropped_and_said(
     lift, threads, capfd, caplog, tmp_path, monkeypatch
