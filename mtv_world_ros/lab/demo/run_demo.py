@@ -84,8 +84,8 @@ def run_demo(
     scored = _score(recording, predictions.chunks, spec.views)
     report = _report(recording, predictions, scored, spec.views)
     write_whole(out / 'report.json', json.dumps(report, indent=2) + '\n')
-    text = _table(report, spec.views)
-    notes = text.split('\n')[-len(spec.views) - 2 :]
+    notes = sheet_notes(report, spec.views)
+    text = '\n'.join([*_object_rows(report), *notes])
     sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=notes)
     write_png(out / 'contact_sheet.png', sheet)
     write_video(out / 'comparison.mp4', side_by_side(scored.comparison), spec.fps)
@@ -181,7 +181,7 @@ def _known(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
-def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
+def _object_rows(report: dict[str, Any]) -> list[str]:
     lines = [f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"J copy":>6}']
     for row in report['objects']:
         lines.append(
@@ -189,6 +189,17 @@ def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
             f'{"yes" if row["moving"] else "no":>5} {_number(row["j"])} {_number(row["j_copy"])}'
             f'{"" if row["status"] == "ok" else "  " + row["status"]}'
         )
+    return lines
+
+
+def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
+    """Returns the lines below the contact sheet, which also end the table.
+
+    Args:
+        report: what `report.json` holds.
+        views: cameras; each has a line.
+    """
+    lines = []
     for view in views:
         means = report['views'][view]
         lines.append(
@@ -209,7 +220,7 @@ def _table(report: dict[str, Any], views: tuple[str, ...]) -> str:
         f'{report["frames_published"]} frames received; latency {latencies} s; '
         f'real-time factor {report["real_time_factor"]:.1f}'
     )
-    return '\n'.join(lines)
+    return lines
 
 
 def _number(value: float | None) -> str:
