@@ -24,6 +24,7 @@ from mtv_world_ros.cli.shared_options import (
 )
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import check_free
+from mtv_world_ros.lab.cli.evaluate import say_failed
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
@@ -36,7 +37,8 @@ Every episode is imagined as a whole from its first frame with its own commands;
 estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
 success_calibration.json and horizon.json; DIR gets calibration.md, reliability.html and
 calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5.
-Running the same command again continues an interrupted run.
+Running the same command again continues an interrupted run. Exit status: 1 if an episode could
+not be scored; it is not in the fit.
 """
 
 
@@ -103,7 +105,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         if horizon is not None:
             print(f'stored: {save_horizon(folder, horizon)}')
     print(text)
-    return 0
+    return int(say_failed([run.failed for run in runs]))
 
 
 def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:

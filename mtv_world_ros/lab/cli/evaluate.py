@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 import re
+import sys
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 _EPILOG = """\
 DIR gets metrics.json, rows.csv, tables.md, numbers.csv, paper_tables.md and report.html. Several
 checkpoints share the last three; the others of each are in DIR/NAME. Running the same command
-again continues an interrupted run.
+again continues an interrupted run. Exit status: 1 if an episode could not be scored.
 """
 
 
@@ -184,7 +185,22 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         from mtv_world_ros.lab.evaluation.report.html import write_report
 
         print(f'report: {write_report(folders, arguments.out / "report.html")}')
-    return 0
+    return int(say_failed([summary.failed for summary in summaries]))
+
+
+def say_failed(failed: Sequence[Mapping[str, str]]) -> bool:
+    """Writes which episodes have no result, and why, to standard error; returns if any.
+
+    Args:
+        failed: reason by episode, of every run; what runs have in common is said once.
+    """
+    lines = dict.fromkeys(
+        f'mtv-world: {episode} was not scored: {reason}\n'
+        for run in failed
+        for episode, reason in run.items()
+    )
+    sys.stderr.write(''.join(lines))
+    return bool(lines)
 
 
 #: (number, words, the same of what knows nothing): the first that was measured is shown

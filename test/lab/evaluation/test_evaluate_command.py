@@ -54,6 +54,22 @@ def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsy
     assert (out / 'report.html').stat().st_size > 10_000
 
 
+def test_an_episode_without_a_result_is_told_and_is_in_the_exit_status(
+    make_episode, tmp_path, capsys
+):
+    dataset = tmp_path / 'data'
+    good, garbage = (make_episode(dataset / name) for name in ('good', 'garbage'))
+    next(garbage.glob('*.mcap')).write_bytes(b'no recording at all')
+    options = ['--steps', '1', '--no-ceiling', '--actions', 'true', '--threads', '1']
+    command = ['evaluate', 'a=bundled', 'b=bundled', str(dataset), '--no-report', *options]
+    assert main([*command, '--out', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr().err
+    assert said.count(f'mtv-world: {garbage} was not scored: ') == 1  # not once a checkpoint
+    assert f'{good} was not' not in said
+    metrics = json.loads((tmp_path / 'out' / 'a' / 'metrics.json').read_text())
+    assert f'{garbage} was not scored: {metrics["failed"][str(garbage)]}\n' in said
+
+
 def test_mistakes_are_told_in_a_line(episodes, tmp_path, capsys):
     dataset, out = str(episodes[0].parent), str(tmp_path)
     for options, words in (
