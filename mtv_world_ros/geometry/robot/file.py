@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+import re
 from typing import Annotated, Any, Literal, Self
 from xml.etree import ElementTree
 
@@ -18,9 +19,14 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
+from mtv_world_ros.geometry.robot.parser_output import parser_errors
 from mtv_world_ros.geometry.robot.shape import find_mesh, write_convex_hull
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
+#: expanded URDFs may keep xacro in comments, and `$(find ...)` in what is not of the robot
+_COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)
+_EXPRESSION = re.compile(r'\$[{(]')
+_EXPAND = '; expand it first: xacro FILE > robot.urdf'
 #: of a joint [rad or m]; many turns, no encoder counts
 Position = Annotated[float, Field(ge=-1000, le=1000)]
 
@@ -240,19 +246,35 @@ def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
     Raises:
         RobotError: the file is not a usable URDF.
     """
+    written = _COMMENT.sub('', text)
+    if '<xacro:' in written:
+        raise RobotError(f'{what} is unexpanded xacro{_EXPAND}')
     try:
         root = ElementTree.fromstring(text)
         # Pinocchio must see mimic joints as ordinary ones: RobotModel moves them itself.
         mimics = [mimic for joint in root.iter('joint') for mimic in _take_mimics(joint)]
-        model = pin.buildModelFromXML(ElementTree.tostring(root, encoding='unicode'))
+        model = _build(ElementTree.tostring(root, encoding='unicode'))
     except (ElementTree.ParseError, ValueError, KeyError, RuntimeError) as error:
-        raise RobotError(
-            f'{what} cannot be used: {error} (a .xacro file must be expanded first)'
-        ) from error
+        xacro = f'; it has expressions of xacro{_EXPAND}' if _EXPRESSION.search(written) else ''
+        raise RobotError(f'{what} cannot be used: {error}{xacro}') from error
     children = {child.get('link') for child in root.iter('child')}
     base = next(link.attrib['name'] for link in root.iter('link')
                 if link.get('name') not in children)  # fmt: skip
     return model, _resolved(mimics), base
+
+
+def _build(urdf: str) -> pin.Model:
+    """Builds the model; why urdfdom refuses one, which it only prints, is in the error.
+
+    Raises:
+        ValueError: it is not a usable URDF.
+    """
+    with parser_errors() as reasons:
+        try:
+            return pin.buildModelFromXML(urdf)
+        except ValueError as error:
+            refused = error
+    raise ValueError('; '.join(reasons) or str(refused)) from refused
 
 
 def _resolved(mimics: Sequence[Mimic]) -> list[Mimic]:

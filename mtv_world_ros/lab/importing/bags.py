@@ -19,6 +19,7 @@ from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import (
+    ConfigError,
     EpisodeError,
     RobotError,
     TrajectoryError,
@@ -78,38 +79,46 @@ def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path,
     Raises:
         RobotError: the bag has no description, or no robot can be made of it.
     """
-    text, chosen = robot_description(bag, mapping)
+    text, topic, chosen = robot_description(bag, mapping)
     with tempfile.TemporaryDirectory(prefix='mtv_world_robot_') as place:
         urdf = Path(place) / 'robot.urdf'
         urdf.write_text(text, encoding='utf-8')
-        guessed = guess_robot(urdf)
         file = Path(place) / ROBOT_YAML
-        file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
-        return save_robot(file, folder), (*chosen, *guessed.notes)
+        try:
+            guessed = guess_robot(urdf)
+            file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
+            return save_robot(file, folder), (*chosen, *guessed.notes)
+        except (RobotError, ConfigError) as error:
+            source, said = f"'{topic}' of '{bag}'", str(error)
+            for temporary in (urdf, file):
+                said = said.replace(f"'{temporary}'", source)
+            raise RobotError(
+                f"{said}; --robot, or 'robot' in the mapping, names another file"
+            ) from error
 
 
-def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, tuple[str, ...]]:
+def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, str, tuple[str, ...]]:
     """Returns the URDF that a bag holds; of several, the one whose joints are recorded most.
 
     Returns:
-        The text, and how it was chosen, where there was a choice.
+        The text, its topic, and how it was chosen, where there was a choice.
 
     Raises:
         RobotError: the bag holds no robot description.
     """
     topics = {mapping.topic(mapping.robot_description), '/robot_description'}
-    texts = dict.fromkeys(
-        str(messages.deserialize(messages.STRING, message.data).data)
+    texts = {
+        str(messages.deserialize(messages.STRING, message.data).data): message.topic
         for message in BagReader(bag).messages(topics)
         if message.msgtype == messages.STRING
-    )
+    }
     if not texts:
         raise RobotError(
             f"'{bag}' has no '{mapping.topic(mapping.robot_description)}'; name the robot's file "
             "with --robot or as 'robot' in the mapping"
         )
     if len(texts) == 1:
-        return next(iter(texts)), ()
+        return *next(iter(texts.items())), ()
     topic = mapping.topic(mapping.joint_states)
     named = [
         {f'name="{mapping.joints.get(name, name)}"' for name in state.name}
@@ -123,7 +132,7 @@ def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, tuple[str, .
         f"the bag describes {len(texts)} robots: taken is the one whose joints '{topic}' names "
         f'most ({counts[best]} of {len(named)} messages); --robot takes another'
     )
-    return best, (note,)
+    return best, texts[best], (note,)
 
 
 def import_bags(

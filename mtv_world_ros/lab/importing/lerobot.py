@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -256,15 +257,44 @@ class LeRobotDataset:
         return self.root / relative
 
     def _table(self, entry: EpisodeEntry, columns: Sequence[str]) -> Any:
+        if not entry.data_file.is_file():
+            raise EpisodeError(
+                f"'{entry.data_file}' is not there{self._stale(entry) or ', but in the metadata'}"
+            )
         table = _read_table(
             entry.data_file, columns=columns, filters=[('episode_index', '==', entry.index)]
         )
         if table.num_rows != entry.length:
             raise EpisodeError(
                 f"'{entry.data_file}' has {table.num_rows} rows of episode {entry.index}, the "
-                f'metadata say {entry.length}'
+                f'metadata say {entry.length}{self._stale(entry)}'
             )
         return table
+
+    def _stale(self, entry: EpisodeEntry) -> str:
+        """Says which other files have the episode's rows; empty where none has."""
+        files = [f for f in self._files_by_episode.get(entry.index, ()) if f != entry.data_file]
+        if not files:
+            return ''
+        named = ', '.join(f"'{file.relative_to(self.root)}'" for file in files)
+        return (
+            f'; rows of it are in {named}: the file index in meta/ is of an earlier state of the '
+            "dataset (the columns 'data/chunk_index' and 'data/file_index' of meta/episodes in "
+            'v3.0); write it again, or merge or convert the dataset anew with LeRobot'
+        )
+
+    @cached_property
+    def _files_by_episode(self) -> dict[int, list[Path]]:
+        """Data files by the number of the episodes that have rows in them."""
+        found: dict[int, list[Path]] = {}
+        for file in sorted((self.root / 'data').rglob('*.parquet')):
+            try:
+                column = _read_table(file, columns=['episode_index']).column('episode_index')
+            except EpisodeError:
+                continue  # the file that is asked for is what is reported
+            for index in column.unique().to_pylist():
+                found.setdefault(int(index), []).append(file)
+        return found
 
     def _images(self, entry: EpisodeEntry, feature: str) -> Iterator[ByteArray]:
         table = self._table(entry, [feature, 'frame_index', 'episode_index'])

@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
 
+from pyarrow import compute, parquet
+
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
@@ -214,6 +216,24 @@ def test_an_unknown_column_names_the_nearest(datasets, make_mapping, tmp_path):
     mapping = make_mapping(('column: gripper.pos', 'column: griper.pos'))
     summary = import_dataset(datasets('v2.1'), mapping, tmp_path / 'out')
     assert "no column 'griper.pos' (did you mean 'gripper.pos'?)" in summary.failed[0]
+
+
+@pytest.mark.parametrize('is_there', [True, False])
+def test_a_stale_file_index_is_the_reason(is_there, datasets, make_mapping, tmp_path):
+    root = Path(shutil.copytree(datasets('v3.0'), tmp_path / 'set'))
+    data = root / 'data/chunk-000/file-000.parquet'
+    table = parquet.read_table(data)
+    parts = [table.filter(compute.equal(table['episode_index'], k)) for k in (0, 1)]
+    parquet.write_table(parts[1], data.with_name('file-001.parquet'))
+    parquet.write_table(parts[0], data)
+    if not is_there:
+        data.rename(data.with_name('file-002.parquet'))
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == ([0] if is_there else [])
+    said = summary.failed[1]
+    assert ('has 0 rows of episode 1' if is_there else 'is not there') in said
+    assert "rows of it are in 'data/chunk-000/file-001.parquet': the file index" in said
+    assert 'earlier state of the dataset' in said
 
 
 def test_what_is_no_readable_dataset_is_refused(datasets, make_mapping, tmp_path):

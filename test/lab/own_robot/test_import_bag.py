@@ -186,6 +186,30 @@ def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, scene, tmp_p
     assert len(episode.joint_states.positions) == NUM
 
 
+@pytest.mark.parametrize(
+    ('urdf', 'reason'),
+    [
+        (URDF.replace('<robot ', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1)
+         .replace('</robot>', '<xacro:tool/></robot>'),
+         'is unexpanded xacro; expand it first: xacro FILE > robot.urdf'),
+        (re.sub('lower="[^"]*"', 'lower="${-pi}"', URDF, count=1),
+         'it has expressions of xacro; expand it first'),
+        (re.sub('<child link="[^"]*"', '<child link="nowhere"', URDF, count=1), 'nowhere'),
+        ('<robot name="box"><link name="box"/></robot>', 'has no arm'),
+    ],
+)  # fmt: skip
+def test_a_description_that_is_no_robot_is_named_by_its_topic(
+    urdf, reason, robot, scene, tmp_path, capfd
+):
+    cameras, positions, frames = scene
+    bag = record(tmp_path / 'bag', robot, cameras, positions, frames=frames, urdf=urdf)
+    assert run(tmp_path, bag) == 1
+    said = capfd.readouterr().err.splitlines()
+    assert len(said) == 1, said  # urdfdom prints lines of its own
+    assert reason in said[0] and f"'/cell/robot_description' of '{bag}'" in said[0]
+    assert "robot.urdf'" not in said[0] and '--robot' in said[0]
+
+
 def test_bags_are_read_as_they_are_with_the_mapping(robot, scene, tmp_path, capsys):
     cameras, positions, frames = scene
     bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
