@@ -74,12 +74,13 @@ def make_episode(robot: RobotModel) -> Callable[..., Path]:
         offset: float = 0.0,
         outcome: str = 'success',
         objects: tuple[str, ...] = OBJECTS,
+        instruction: str = INSTRUCTION,
     ) -> Path:
         cameras = [camera(view) for view in SPEC.views]
         with EpisodeWriter(
             path,
             task='place_block_a2b_left',
-            instruction=INSTRUCTION,
+            instruction=instruction,
             robot=robot.name,
             cameras=cameras,
             objects=objects,
@@ -100,7 +101,8 @@ def make_episode(robot: RobotModel) -> Callable[..., Path]:
                 for model in cameras:
                     frame, ids = scene(speed * index, model.view, grey)
                     writer.write_image(model.view, stamp, frame, compressed=False)
-                    writer.write_mask(model.view, stamp, ids)
+                    if objects:
+                        writer.write_mask(model.view, stamp, ids)
                     writer.write_camera_info(model.view, stamp, model)
                 writer.write_joint_states(stamp, robot.joint_names, middle)
             writer.outcome = outcome

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import isfinite, nan
 from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from mtv_world_ros.lab.documents import number, Table
+from mtv_world_ros.lab.documents import number, Table, with_interval
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import HELD, MEASURES, SHUFFLED
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import Judgement, reliability_bins
 from mtv_world_ros.lab.evaluation.report.charts import reliability_chart
 from mtv_world_ros.lab.evaluation.report.headline import all_views, cell, hue, letter, Mark, mark
@@ -119,6 +120,29 @@ def task_tables(evaluations: Sequence[Evaluated]) -> list[Table]:
         caption = _name(index, evaluations)
         tables.append(Table(head=head, rows=rows, num_labels=2, caption=caption))
     return tables
+
+
+def pictures(evaluations: Sequence[Evaluated]) -> list[tuple[Mark | None, Table]]:
+    """Returns picture scores beside the held frame and other commands, where they were made."""
+    kinds = {'': 'imagined', f'_{HELD}': 'first frame held', f'_{SHUFFLED}': 'other commands'}
+    tables = []
+    for index, found in enumerate(evaluations):
+        rows = [
+            [view, words, *(_estimate(numbers.get(f'{key}{suffix}')) for key in MEASURES)]
+            for view, numbers in found.metrics.get('pictures', {}).items()
+            for suffix, words in kinds.items()
+            if f'psnr{suffix}' in numbers
+        ]
+        if rows:
+            table = Table(head=['View', 'Shown', *MEASURES.values()], rows=rows, num_labels=2)
+            tables.append((mark(index, evaluations), table))
+    return tables
+
+
+def _estimate(found: Mapping[str, Any] | None) -> str:
+    low, high = (found or {}).get('interval') or (None, None)
+    ends = (nan, nan) if low is None or high is None else (low, high)
+    return with_interval((found or {}).get('value'), ends)
 
 
 def success(evaluations: Sequence[Evaluated]) -> dict[str, Any] | None:

@@ -31,6 +31,10 @@ BRACKETS = (
     f'Brackets: {METHOD}. J moving, persistence and shuffled actions: of the '
     'objects that really move.'
 )
+_NO_OBJECTS = (
+    'No object is named in any episode, so that none is scored: pictures are compared instead. '
+    'Name objects with `--describer`, or in the episodes.'
+)
 #: why a column is empty although objects that move were scored
 _NOT_MADE = {
     'j_shuffled_moving': "no rollout was imagined with another episode's actions (`--actions`, "
@@ -172,9 +176,7 @@ class EvaluationSummary:
                 for name in self.zero_shot_sets for view in views]  # fmt: skip
         by_task = [(f'{task} · {view}', self.estimates(view, Group(task=task)))
                    for task in self.tasks for view in views]  # fmt: skip
-        parts = [
-            self.following.line,
-            f'# {self.name or "Evaluation"}\n\n{len(self.results)} episodes: {counts}.',
+        of_objects = [
             self._truth(),
             BRACKETS,
             tables.markdown_table([*by_view, ('all views', self.estimates(None))], 'view'),
@@ -183,9 +185,16 @@ class EvaluationSummary:
             tables.markdown_table(by_task, 'task · view'),
             tables.controls_table(by_view),
             self._chunks_table(),
+        ]
+        parts = [
+            self.following.line,
+            f'# {self.name or "Evaluation"}\n\n{len(self.results)} episodes: {counts}.',
+            *(of_objects if self._has_objects else [_NO_OBJECTS, BRACKETS]),
             tables.quality_table(by_view),
             self._pictures_table(),
-            tables.status_table({view: self._statuses(view) for view in views}),
+            tables.status_table({view: self._statuses(view) for view in views})
+            if self._has_objects
+            else '',
             '\n'.join(f'- not scored: {path}: {why}' for path, why in self.failed.items()),
             '\n'.join(f'- {r.episode}: {note}' for r in self.results for note in r.notes),
         ]
@@ -220,6 +229,10 @@ class EvaluationSummary:
         ]  # fmt: skip
         return Table(head=['pictures', *MEASURES.values()], rows=rows).text()
 
+    @property
+    def _has_objects(self) -> bool:
+        return bool(self._rows(None, ALL))
+
     def _why_dashes(self) -> str:
         """Why numbers of objects are not there, a line each; empty where all are."""
         missing = [
@@ -229,11 +242,6 @@ class EvaluationSummary:
         scored = [row for row in named if np.isfinite(row.j)]
         if not missing:
             return ''
-        if not named:
-            return (
-                'Dashes: no object is named in any episode, so that none is scored. Name them '
-                'with `--describer`, or in the episodes.'
-            )
         if not scored:
             counts = ', '.join(f'{n} {word}' for word, n in self._statuses(None).items())
             return f'Dashes: no named object could be scored in any stretch ({counts}).'

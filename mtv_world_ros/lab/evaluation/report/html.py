@@ -13,7 +13,11 @@ from mtv_world_ros.lab.evaluation.metrics.statistics import METHOD
 from mtv_world_ros.lab.evaluation.report import details
 from mtv_world_ros.lab.evaluation.report.episode_cards import episode_cards
 from mtv_world_ros.lab.evaluation.report.headline import cell, compared, headline, horizon, mark
-from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, read_evaluations
+from mtv_world_ros.lab.evaluation.report.read_back import (
+    Evaluated,
+    has_objects,
+    read_evaluations,
+)
 
 
 def write_report(folders: Sequence[Path], path: Path) -> Path:
@@ -49,6 +53,8 @@ def page(evaluations: Sequence[Evaluated]) -> str:
         horizon=horizon(evaluations),
         compared=compared(evaluations),
         cards=episode_cards(evaluations),
+        has_objects=any(map(has_objects, evaluations)),
+        pictures=details.pictures(evaluations),
         paper=details.paper_tables(evaluations),
         tasks=details.task_tables(evaluations),
         success=details.success(evaluations),
@@ -74,10 +80,14 @@ def _tiles(found: Evaluated) -> list[tuple[str, str, str]]:
         'margin_over_shuffled': 'margin over shuffled actions',
     }  # fmt: skip
     tiles = []
-    for key, name in shown.items():
+    for key, name in shown.items() if has_objects(found) else ():
         text, bracket, rest = cell(metrics['overall'], key).partition(' [')
         below = 'not measured' if text == DASH else f'[{rest}' if bracket else ''
         tiles.append((name, text, below))
+    for suffix, name in {'': 'PSNR, imagined', '_held': 'PSNR, first frame held'}.items():
+        psnr = metrics.get('pictures', {}).get('overall', {}).get(f'psnr{suffix}')
+        if psnr and not has_objects(found):
+            tiles.append((name, number(psnr['value'], 1), 'dB'))
     failed = f'{len(metrics["failed"])} failed'
     tiles.append(('episodes scored', str(len(found.results)), failed))
     factor = metrics.get('real_time_factor')

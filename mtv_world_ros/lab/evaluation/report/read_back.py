@@ -161,3 +161,8 @@ def picks(evaluations: Sequence[Evaluated]) -> list[EpisodePick]:
         EpisodePick(title=title, episode=ranked[place], score=means[ranked[place]])
         for place, title in chosen.items()
     ]
+
+
+def has_objects(found: Evaluated) -> bool:
+    """Returns whether any episode names an object; else only pictures are compared."""
+    return any(numbers.get('num_rows', 1) for numbers in found.metrics['views'].values())

@@ -318,3 +318,23 @@ def test_points_at_one_place_are_one_mark_within_the_axes():
 def test_equal_charts_are_equal_bytes():
     dots = [Dot(label='x', value=0.5, interval=(0.4, 0.6), colour='c0')]
     assert dot_chart('t', dots) == dot_chart('t', dots)
+
+
+def test_without_named_objects_pictures_are_what_is_compared(
+    make_pipeline, make_episode, tmp_path
+):
+    # no word of the instruction is a thing, as with a robot of one's own
+    episodes = [
+        make_episode(tmp_path / name, objects=(), instruction='wave') for name in ('a', 'b', 'c')
+    ]
+    found = report(scored(make_pipeline(), episodes, tmp_path / 'out'))
+    assert 'No object is named in any episode' in found.text
+    ids = {attributes.get('id') for attributes in found.all('section')}
+    assert 'pictures' in ids and not ids & {'headline', 'horizon', 'paper', 'tasks'}
+    assert 'Objects by status' not in found.text and 'Not shown in every view' not in found.text
+    metrics = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    psnr = metrics['pictures']['overall']
+    for key in ('psnr', 'psnr_held'):
+        assert f'{psnr[key]["value"]:.1f}' in found.text.splitlines()
+    assert 'follows the commands: ' in found.text
+    assert '|' in (tmp_path / 'out' / 'tables.md').read_text()  # of pictures

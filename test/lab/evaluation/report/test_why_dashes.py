@@ -40,7 +40,6 @@ def tables_of(*rows: ScoreRow) -> str:
 @pytest.mark.parametrize(
     ('rows', 'why'),
     [
-        ((), 'no object is named in any episode'),
         ((NOT_SCORED,), 'no named object could be scored in any stretch (1 absent)'),
         ((replace(ROW, moving=False),), 'no object that was scored really moves'),
         (
@@ -52,3 +51,9 @@ def tables_of(*rows: ScoreRow) -> str:
 )
 def test_a_dash_has_its_reason(rows, why):
     assert why in tables_of(*rows)
+
+
+def test_without_named_objects_there_are_no_tables_of_them():
+    said = tables_of()
+    assert 'No object is named in any episode' in said and '--describer' in said
+    assert '|' not in said and 'Dashes' not in said
