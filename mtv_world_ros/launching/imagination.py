@@ -10,6 +10,9 @@ from pathlib import Path
 import shutil
 import subprocess
 import time
+from typing import Any
+
+from tqdm import tqdm
 
 from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, policy_settings
 from mtv_world_ros.bounded_input import read_json
@@ -18,7 +21,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free, check_room
 from mtv_world_ros.launching.node_processes import ROOM_BYTES
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.policies.policy_config import RecordedPolicySettings
+from mtv_world_ros.policies.policy_config import RecordedPolicySettings, ScriptedPolicySettings
 from mtv_world_ros.processes import (
     how_it_ended,
     module_command,
@@ -93,6 +96,12 @@ def imagine_episodes(
             f"policy '{options.policy}' repeats what was commanded in a recorded episode: give "
             '--episodes'
         )
+    if isinstance(policy, ScriptedPolicySettings) and options.start_s > 0:
+        raise ConfigError(
+            f"policy '{options.policy}' plans for the scene as it is in the recording's first "
+            f'frame, --start is {options.start_s:g} s: leave --start out, or take --policy '
+            'recorded or one that looks at the pictures'
+        )
     commands = {
         'world_model': _world_model_command(options, views),
         'policy': _policy_command(options, views),
@@ -110,7 +119,8 @@ def imagine_episodes(
     try:
         for name, command in commands.items():
             started[name] = start_process(name, command, logs, environment)
-        _wait(started, logs)
+        with tqdm(total=_count(options), unit='ep', disable=None) as bar:
+            _wait(started, logs, bar)
     finally:
         # the runner first: it closes its record
         for name in reversed(commands):
@@ -125,11 +135,18 @@ def imagine_episodes(
         ) from error
 
 
-def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:
+def _count(options: ImagineOptions) -> int:
+    """Episodes that will be run; from live cameras one by default."""
+    return options.count or len(options.episodes) or 1
+
+
+def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:
     """Until the runner ends; before its first episode nobody else would notice a dead node."""
     runner = processes['runner']
     while runner.poll() is None:
         time.sleep(0.2)
+        bar.n = episodes_done(logs.parent)
+        bar.refresh()
         dead = [n for n, p in processes.items() if p is not runner and p.poll() is not None]
         if dead and not (logs.parent / 'episodes.json').is_file():
             said = how_it_ended(dead[0], processes[dead[0]], logs)
@@ -137,6 +154,14 @@ def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path) -> None:
                 with suppress(subprocess.TimeoutExpired):
                     runner.wait(60.0)
             raise EpisodeError(said)
+
+
+def episodes_done(out: Path) -> int:
+    """Returns how many episodes have ended, by the runner's `episodes.json`."""
+    try:
+        return len(read_json(out / 'episodes.json'))
+    except (OSError, ValueError, TypeError):  # before the first has ended
+        return 0
 
 
 def _common(options: ImagineOptions, views: Sequence[str]) -> dict[str, object]:

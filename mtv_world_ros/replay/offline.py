@@ -114,7 +114,7 @@ def replay_offline(
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         limits: greatest age and spread of images and joint states.
         overwrite: replace an existing folder of predictions.
-        show_progress: draw a progress bar.
+        show_progress: draw a progress bar, on a terminal.
 
     Raises:
         EpisodeError: the episode cannot be read, or none of its trajectories can be imagined.
@@ -135,7 +135,7 @@ def replay_offline(
     stored = episode.info.objects if pipeline.describer is None else ()
     limits, observed = limits or ReplayLimits(), ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
-    bar = tqdm(total=len(starts), unit='trajectory', disable=not show_progress)
+    bar = tqdm(total=len(starts), unit='trajectory', disable=None if show_progress else True)
     with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
         for index, (stamp, trajectory) in enumerate(episode.trajectories):
             until = starts[index + 1] if index + 1 < len(starts) else None

@@ -87,3 +87,10 @@ def test_a_ranking_refuses_it(tmp_path):
     file.write_text('policies: [{name: again, policy: {kind: recorded}}]')
     with pytest.raises(ConfigError, match="'again' is of kind 'recorded': .* scenes of its own"):
         load_policy_list(file, ROBOT)
+
+
+def test_a_scripted_policy_begins_where_its_plan_does(tmp_path):
+    options = ImagineOptions(policy='expert-miss-0.5', episodes=(tmp_path,), start_s=1.5)
+    with pytest.raises(ConfigError, match=r"'expert-miss-0.5' plans .* --start is 1.5 s: leave"):
+        imagine_episodes(options, tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()

@@ -85,7 +85,7 @@ def collect(
         config: what is randomised and how it is sampled.
         failures_of_ten: how many of ten episodes of a task miss their grasp; not of zero-shot.
         sheets: also write a larger contact sheet of every task.
-        progress: show a progress bar.
+        progress: show a progress bar, on a terminal.
 
     Returns:
         The entries of the episodes that were asked for.
@@ -198,7 +198,9 @@ class _DataSet:
         done = len(jobs) - len(missing)
         try:
             finished = run_all(missing, partial(_maker, config), workers)
-            with tqdm(total=len(jobs), initial=done, unit='ep', disable=not progress) as bar:
+            with tqdm(
+                total=len(jobs), initial=done, unit='ep', disable=None if progress else True
+            ) as bar:
                 self._show(bar, jobs)
                 for number, (job, _) in enumerate(finished, 1):
                     self.entries[job.path.name] = read_entry(job.path)

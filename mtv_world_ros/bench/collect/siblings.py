@@ -237,12 +237,12 @@ def search_siblings(
         make_search: called once in every process; picklable.
         out: folder of the data set; gets `SIBLINGS_FILE`.
         workers: processes.
-        progress: show a progress bar.
+        progress: show a progress bar, on a terminal.
     """
     found = _read(out / SIBLINGS_FILE)
     missing = [scene for scene in scenes if scene.name not in found]
     done = run_all(missing, make_search, workers)
-    with tqdm(total=len(missing), unit='scene', disable=not progress) as bar:
+    with tqdm(total=len(missing), unit='scene', disable=None if progress else True) as bar:
         for scene, searched in done:
             found[scene.name] = searched
             write_json(out / SIBLINGS_FILE, {name: asdict(one) for name, one in found.items()})

@@ -60,7 +60,7 @@ def run_jobs(
         workers: processes; with Ray, at most so many at once.
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
         overwrite: replace results of other settings.
-        show_progress: draw a progress bar.
+        show_progress: draw a progress bar, on a terminal.
 
     Raises:
         ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
@@ -73,7 +73,7 @@ def run_jobs(
     failed: dict[Job, str] = {}
     make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
     outcomes = _scored(left, make, workers, ray_address)
-    bar = tqdm(outcomes, total=len(left), unit='rollout', disable=not show_progress)
+    bar = tqdm(outcomes, total=len(left), unit='rollout', disable=None if show_progress else True)
     for done, outcome in bar:
         if isinstance(outcome, str):
             failed[done.job] = outcome

@@ -132,7 +132,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         robot,
         calibration=arguments.calibration,
         stage=_object_stage(arguments),
-        progress=lambda paths: tqdm(paths, unit='bag'),
+        progress=lambda paths: tqdm(paths, unit='bag', disable=None),
     )
     values = mapping.replace(robot='robot/robot.yaml').model_dump(
         mode='json', exclude_defaults=True
@@ -207,7 +207,7 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
         arguments.out,
         episodes=_numbers(arguments.episodes),
         stage=_object_stage(arguments),
-        progress=lambda numbers: tqdm(numbers, unit='ep'),
+        progress=lambda numbers: tqdm(numbers, unit='ep', disable=None),
     )
     for number, lines in summary.warnings.items():
         for line in lines:
@@ -300,7 +300,7 @@ def _export(arguments: argparse.Namespace) -> int:
         load_robot(path),
         named,
         arguments.fps,
-        progress=lambda paths: tqdm(paths, unit='ep'),
+        progress=lambda paths: tqdm(paths, unit='ep', disable=None),
         size=_size(arguments.size),
         as_videos=not arguments.images,
     )

@@ -190,7 +190,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     file, source = robot_file(arguments, paths[0])
     inspector = load_inspector(file)
     found, pictures = inspect_folder(
-        tqdm(paths, unit='ep'),
+        tqdm(paths, unit='ep', disable=None),
         inspector,
         lambda path: read_for_checks(path, arguments.views, source, inspector.robot),
     )

@@ -89,7 +89,7 @@ def evaluate(
         parallel: processes to score with; None = this one.
         describer: names the objects from each episode's first frame; None = see `Job.objects`.
         overwrite: replace results of other settings; only asked where there is a name.
-        show_progress: draw a progress bar.
+        show_progress: draw a progress bar, on a terminal.
 
     Returns:
         What was found.
@@ -105,7 +105,9 @@ def evaluate(
     check_same_settings(out / 'episodes', run.settings, overwrite or not name)
     jobs = make_jobs(episode_paths, zero_shot, config.seed)
     results, failed = [], {}
-    bar = tqdm(run.results(jobs), total=len(jobs), unit='ep', disable=not show_progress)
+    bar = tqdm(
+        run.results(jobs), total=len(jobs), unit='ep', disable=None if show_progress else True
+    )
     for job, result in bar:
         if isinstance(result, EpisodeResult):
             results.append(result)

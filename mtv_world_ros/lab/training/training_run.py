@@ -105,7 +105,7 @@ def load_recordings(
         DiskError: the cache cannot be written.
     """
     recordings, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+    for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
         try:
             with disk_errors_named(cache):
                 recording = cached_recording(path, spec, robot, cache, source)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+import re
 import shutil
+import subprocess
 import sys
+import termios
 
 import numpy as np
 import pytest
@@ -234,6 +238,23 @@ def test_a_stale_file_index_is_the_reason(is_there, datasets, make_mapping, tmp_
     assert ('has 0 rows of episode 1' if is_there else 'is not there') in said
     assert "rows of it are in 'data/chunk-000/file-001.parquet': the file index" in said
     assert 'earlier state of the dataset' in said
+
+
+def test_bars_with_the_time_left_are_drawn_on_a_terminal_only(datasets, make_mapping, tmp_path):
+    command = ['import-dataset', str(datasets('v2.1')), '--mapping', str(make_mapping())]
+    words = [sys.executable, '-m', 'mtv_world_ros.cli', *command]
+    main_end, process_end = os.openpty()
+    termios.tcsetwinsize(process_end, (24, 100))
+    shown = subprocess.run(
+        [*words, '--out', str(tmp_path / 'seen')], stderr=process_end, check=True
+    )
+    os.close(process_end)
+    drawn = os.read(main_end, 1 << 16).decode()
+    assert shown.returncode == 0 and re.search(r'2/2 \[\d\d:\d\d<\d\d:\d\d', drawn), drawn
+    piped = subprocess.run(
+        [*words, '--out', str(tmp_path / 'log')], capture_output=True, text=True, check=True
+    )
+    assert '2/2' not in piped.stderr and '%|' not in piped.stderr
 
 
 def test_what_is_no_readable_dataset_is_refused(datasets, make_mapping, tmp_path):

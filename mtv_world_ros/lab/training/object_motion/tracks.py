@@ -51,7 +51,7 @@ def read_each(
 ) -> tuple[list[Read], dict[str, str]]:
     """Returns what is read of each episode, and why others cannot be used, by path."""
     found, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep'):
+    for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
         try:
             found.append(read(path))
         except MtvWorldError as error:
