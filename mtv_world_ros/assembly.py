@@ -36,6 +36,7 @@ from mtv_world_ros.success.calibration import (
     load_horizon,
 )
 from mtv_world_ros.success.estimator import SuccessEstimator
+from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
 from mtv_world_ros.vision.camera_check import CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, InstructionDescriber
@@ -176,7 +177,21 @@ def load_pipeline(
         horizon=load_horizon(checkpoint_path(checkpoint)),
         object_motion=motion,
         camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
+        setting=fitting_setting(checkpoint, model),
     )
+
+
+def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:
+    """Returns what a calibration of a checkpoint is fitted to, but for cameras.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        robot: that is imagined.
+    """
+    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+
+    folder = checkpoint_path(checkpoint) / OBJECT_MOTION_FOLDER
+    return Setting.of(robot, content_digest(folder)[:16] if folder.is_dir() else '')
 
 
 def assemble(
@@ -192,6 +207,7 @@ def assemble(
     horizon: HorizonCurve | None = None,
     object_motion: ObjectMotionModel | None = None,
     camera_checker: CameraChecker | None = None,
+    setting: Setting | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
     segmenter = segmenter or assemble_segmenter()
@@ -203,6 +219,7 @@ def assemble(
             *_tasks(task),
             calibration=calibration,
             segmenter=segmenter,
+            setting=setting,
         ),
         rendering=TrajectoryVideoConfig(**card.rendering),
         object_mask=card.object_mask,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import json
 from math import exp, isfinite, nan
 from pathlib import Path
@@ -12,8 +12,10 @@ from pydantic import Field, model_validator
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import ListOf, Model, Positive, Schema
+from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.files import write_whole
+from mtv_world_ros.success.fitted_to import FittedTo, Setting
 
 CALIBRATION = 'success_calibration.json'
 HORIZON = 'horizon.json'
@@ -89,6 +91,8 @@ class Calibration(Weights):
         l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
         scores: before and after, the latter on tasks that were left out of the fit.
         made: command, date, machine.
+        fitted_to: robot, cameras and foresight of these episodes; None = it does not say, as
+            those of before 0.2.0, whose foresight was another.
     """
 
     observed: Weights | None = None
@@ -100,6 +104,7 @@ class Calibration(Weights):
     l2: float = 1.0
     scores: Mapping[str, Mapping[str, Any]] = {}
     made: Mapping[str, str] = {}
+    fitted_to: FittedTo | None = None
 
     def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
         """Returns the weights for frames that are real, or imagined with motions foreseen."""
@@ -113,6 +118,21 @@ class Calibration(Weights):
         if task not in self.tasks:
             return f"uncalibrated for the task '{task}' (fitted on {len(self.tasks)} others)"
         return ''
+
+    def elsewhere(
+        self, setting: Setting, cameras: Sequence[CameraModel], *, is_foreseen: bool
+    ) -> str:
+        """Returns why what was fitted is none here; empty = it was fitted here.
+
+        Its weights are used all the same: stated ones know less. Arguments as in
+        `FittedTo.objection`.
+        """
+        if self.fitted_to is not None:
+            return self.fitted_to.objection(setting, cameras, is_foreseen=is_foreseen)
+        if not is_foreseen:
+            return ''
+        version = self.made.get('versions', 'an unknown version').split(',')[0]
+        return f'fitted with the foresight of {version}'
 
 
 def save_calibration(folder: Path, calibration: Calibration) -> Path:

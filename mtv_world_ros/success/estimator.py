@@ -12,6 +12,7 @@ from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
+from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds, ForeseenMotions
 from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
@@ -63,6 +64,7 @@ class SuccessEstimator:
         task: str | None = None,
         calibration: Calibration | None = None,
         segmenter: Segmenter | None = None,
+        setting: Setting | None = None,
     ) -> None:
         """Sets the tasks that may be judged.
 
@@ -72,6 +74,7 @@ class SuccessEstimator:
                 instruction names no objects for it, they take the task's placeholders in order.
             calibration: fitted weights, used where they hold.
             segmenter: what finds the masks; finds objects in the pictures of tasks, too.
+            setting: where it judges; None = as where the calibration was fitted.
 
         Raises:
             ConfigError: `task` is not among `tasks`.
@@ -85,6 +88,7 @@ class SuccessEstimator:
         self.tasks = tuple(known for known in tasks if task in (None, known.name))
         self.is_given = task is not None
         self.calibration = calibration
+        self.setting = setting
         self.segmenter = '' if segmenter is None else segmenter.name
         self._picture_masks = PictureMasks(segmenter)
 
@@ -199,15 +203,15 @@ class SuccessEstimator:
         elif features['released'] == 0.0:
             low = 0.0
             reasons.append('a gripper is still closed')
-        given = 'frames that were seen' if is_real else 'the world model'
-        reasons.append(basis or f'calibrated: {_origin(self.calibration)}, given {given}')
+        strange = self._strange(views, ends is not None) if weights else ''
+        reasons.append(basis or self._origin(strange, is_real))
         return SuccessEstimate(
             probability=middle,
             interval=(low, high),
             jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
             reasons=tuple(reasons),
             features=features,
-            is_calibrated=not basis,
+            is_calibrated=not (basis or strange),
         )
 
     def _objection(self, task: TaskSpec) -> str:
@@ -218,10 +222,23 @@ class SuccessEstimator:
         objection = self.calibration.objection(task.name, self.segmenter)
         return objection and f'{objection}: {stated}'
 
+    def _strange(self, views: Views, is_foreseen: bool) -> str:
+        """Why fitted weights were not fitted here; empty = they were."""
+        if self.calibration is None or self.setting is None:
+            return ''
+        cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
+        return self.calibration.elsewhere(self.setting, cameras, is_foreseen=is_foreseen)
 
-def _origin(calibration: Calibration | None) -> str:
-    assert calibration is not None
-    return f'fitted on {calibration.num_episodes} episodes of {len(calibration.tasks)} tasks'
+    def _origin(self, strange: str, is_real: bool) -> str:
+        """Where fitted weights come from."""
+        calibration = self.calibration
+        assert calibration is not None
+        called = f'uncalibrated: {strange}; weights' if strange else 'calibrated:'
+        given = 'frames that were seen' if is_real else 'the world model'
+        return (
+            f'{called} fitted on {calibration.num_episodes} episodes of '
+            f'{len(calibration.tasks)} tasks, given {given}'
+        )
 
 
 def _released(task: TaskSpec, openings: FloatArray | None) -> float:

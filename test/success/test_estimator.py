@@ -7,6 +7,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.success.calibration import Calibration, Weights
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
+from mtv_world_ros.success.fitted_to import FittedTo, Setting
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
@@ -216,6 +217,26 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
     assert found.is_calibrated == words.startswith('calibrated')
     # weights of zero say one half, whatever is seen; the stated ones do not
     assert (found.probability == 0.5) == found.is_calibrated
+
+
+def test_elsewhere_fitted_weights_are_used_and_called_uncalibrated():
+    shown, tasks = put_to_the_left(), load_tasks(share_path('config', 'tasks'))
+    here = Setting(robot='one', tools=((0.0, 0.0, 0.0),))
+    calibration = CALIBRATION.replace(fitted_to=FittedTo.episodes(here, [shown.cameras]))
+    for setting, words in (
+        (here, 'calibrated: fitted on 40'),
+        (
+            here.replace(robot='two'),
+            "uncalibrated: fitted with another robot than this 'two'; weights fitted on 40",
+        ),
+    ):
+        estimator = SuccessEstimator(
+            tasks, calibration=calibration, segmenter=Named('colour'), setting=setting
+        )
+        found = estimator.estimate(shown, LEFT).estimate
+        assert found.reasons[-1].startswith(words)
+        assert found.is_calibrated == words.startswith('calibrated')
+        assert found.probability == 0.5
 
 
 def test_frames_that_were_seen_have_weights_of_their_own():

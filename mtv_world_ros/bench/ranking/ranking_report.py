@@ -77,10 +77,12 @@ def remarks(summary: Summary) -> list[str]:
         _INTERVALS,
         OPTIMISM_REMARK if summary.optimism else '',
     ]
-    if any('uncalibrated' in ' '.join(result.imagined.reasons) for result in summary.results):
-        found.append(
-            'The estimates are not calibrated: their weights are stated ones, not fitted ones.'
+    told = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
+    if 'uncalibrated' in told:
+        weights = (
+            'stated ones, not fitted ones' if 'stated weights' in told else 'fitted elsewhere'
         )
+        found.append(f'The estimates are not calibrated: their weights are {weights}.')
     cut = sum(not result.is_over for result in summary.results)
     if cut:
         found.append(f'{cut} rollouts were cut off by the limit of chunks.')

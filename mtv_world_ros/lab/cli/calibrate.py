@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -22,7 +23,7 @@ from mtv_world_ros.cli.shared_options import (
     provenance,
     threads_of_workers,
 )
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_free
 from mtv_world_ros.lab.cli.evaluate import say_failed
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
     from mtv_world_ros.lab.evaluation.results import EpisodeResult
     from mtv_world_ros.success.calibration import HorizonCurve
+    from mtv_world_ros.success.fitted_to import FittedTo
 
 _EPILOG = """\
 Every episode is imagined as a whole from its first frame with its own commands; the success
@@ -101,11 +103,29 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
     if arguments.store:
-        print(f'stored: {save_calibration(folder, found.calibration)}')
+        fitted_to = _fitted_to(arguments, selection)
+        stored = found.calibration.replace(fitted_to=fitted_to)
+        print(f'stored: {save_calibration(folder, stored)}')
         if horizon is not None:
             print(f'stored: {save_horizon(folder, horizon)}')
     print(text)
     return int(say_failed([run.failed for run in runs]))
+
+
+def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:
+    """Robot, foresight and cameras of the episodes; of those only that can be read."""
+    from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fitting_setting
+    from mtv_world_ros.data.episode_reader import read_episode
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.success.fitted_to import FittedTo
+
+    views = read_card(checkpoint_path(arguments.checkpoint)).views
+    cameras = []
+    for path in selection.paths:
+        with suppress(MtvWorldError):  # was named when it was imagined
+            cameras.append(tuple(read_episode(path, views=views).cameras.values()))
+    robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
+    return FittedTo.episodes(fitting_setting(arguments.checkpoint, robot), cameras)
 
 
 def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:

@@ -1,0 +1,115 @@
+from dataclasses import replace
+from shutil import copytree
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_robot, fitting_setting
+from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.calibration_file import load_calibration as load_cameras
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.success.calibration import load_calibration
+from mtv_world_ros.success.fitted_to import CameraRange, FittedTo, Setting
+
+ROBOT = checkpoint_robot('bundled')
+HERE = Setting.of(ROBOT, 'contact')
+CAMERAS = tuple(load_cameras(checkpoint_cameras('bundled')).values())
+FITTED = FittedTo.episodes(HERE, [CAMERAS])
+
+
+def turned(degrees):
+    """A turn about the optical axis."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def moved(metres=0.0, degrees=0.0, focal=1.0, view='low'):
+    """The cameras, of which one stands elsewhere."""
+    found = []
+    for camera in CAMERAS:
+        pose, K = camera.T_mount_camera @ turned(degrees), camera.K * [[focal], [focal], [1]]
+        pose[0, 3] += metres
+        same = camera.view != view
+        found.append(camera if same else replace(camera, K=K, T_mount_camera=pose))
+    return tuple(found)
+
+
+def test_where_it_was_fitted_nothing_is_objected():
+    assert FITTED.objection(HERE, CAMERAS, is_foreseen=True) == ''
+
+
+@pytest.mark.parametrize(
+    ('change', 'is_other'),
+    [
+        ({'metres': 0.01, 'degrees': 1.0}, False),
+        ({'metres': 0.08}, True),
+        ({'metres': -0.08}, True),
+        ({'degrees': 10.0}, True),
+        ({'focal': 1.3}, True),
+    ],
+)
+def test_a_camera_that_stands_elsewhere_is_named(change, is_other):
+    found = FITTED.objection(HERE, moved(**change), is_foreseen=True)
+    assert found == ('fitted with other cameras of low' if is_other else '')
+
+
+def test_between_the_cameras_of_the_episodes_is_within():
+    fitted = FittedTo.episodes(HERE, [CAMERAS, moved(metres=0.2)])
+    assert fitted.objection(HERE, moved(metres=0.1), is_foreseen=True) == ''
+    assert 'low' in fitted.objection(HERE, moved(metres=0.3), is_foreseen=True)
+
+
+def test_the_size_of_pictures_does_not_count():
+    large = [
+        replace(
+            camera, width=2 * camera.width, height=2 * camera.height, K=camera.K * [[2], [2], [1]]
+        )
+        for camera in CAMERAS
+    ]
+    assert FITTED.objection(HERE, large, is_foreseen=True) == ''
+
+
+def test_a_view_that_was_not_there_is_named():
+    other = [replace(camera, view='wrist') for camera in CAMERAS[:1]]
+    assert FITTED.objection(HERE, other, is_foreseen=True).endswith('cameras of wrist')
+
+
+def test_another_foresight_counts_where_motions_are_foreseen():
+    other = HERE.replace(foresight='another')
+    assert 'another foresight' in FITTED.objection(other, CAMERAS, is_foreseen=True)
+    assert FITTED.objection(other, CAMERAS, is_foreseen=False) == ''
+
+
+def test_another_robot_and_a_longer_arm_are_other_robots():
+    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    assert "'franka'" in FITTED.objection(Setting.of(franka), CAMERAS, is_foreseen=False)
+    for metres, is_other in ((0.01, False), (0.05, True)):
+        tools = np.array(HERE.tools) + [metres, 0, 0]
+        arm = HERE.replace(tools=tuple(map(tuple, tools.tolist())))
+        assert bool(FITTED.objection(arm, CAMERAS, is_foreseen=False)) == is_other
+
+
+def test_other_numbers_of_contact_are_another_setting(tmp_path):
+    own = tmp_path / 'own'
+    copytree(share_path('resource', 'checkpoint'), own)
+    assert fitting_setting(own, ROBOT) == fitting_setting('bundled', ROBOT)
+    file = own / 'object_motion' / 'contact.json'
+    file.write_text(file.read_text().replace('"table_friction": 0.8', '"table_friction": 0.4'))
+    assert fitting_setting(own, ROBOT) != fitting_setting('bundled', ROBOT)
+
+
+def test_the_bundled_estimate_was_fitted_with_an_earlier_foresight():
+    calibration = load_calibration(share_path('resource', 'checkpoint'))
+    found = calibration.elsewhere(fitting_setting('bundled', ROBOT), CAMERAS, is_foreseen=True)
+    assert found == 'fitted with the foresight of mtv_world_ros 0.1.0'
+    assert not calibration.elsewhere(HERE, CAMERAS, is_foreseen=False)
+
+
+def test_it_is_read_back_as_it_was_written():
+    assert FittedTo(**FITTED.model_dump(mode='json')) == FITTED
+
+
+def test_a_range_of_too_few_numbers_is_refused():
+    with pytest.raises(ConfigError, match='10 numbers'):
+        CameraRange(mount_link='base', low=(0.0,), high=(1.0,))
