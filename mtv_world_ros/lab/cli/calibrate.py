@@ -125,7 +125,10 @@ def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:
         with suppress(MtvWorldError):  # was named when it was imagined
             cameras.append(tuple(read_episode(path, views=views).cameras.values()))
     robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
-    return FittedTo.episodes(fitting_setting(arguments.checkpoint, robot), cameras)
+    setting = fitting_setting(arguments.checkpoint, robot)
+    if not arguments.foresight:
+        setting = setting.replace(foresight='')
+    return FittedTo.episodes(setting, cameras)
 
 
 def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
