@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 import importlib
 import multiprocessing
@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import plain
+from mtv_world_ros.processes import StandStill, STILL_S
 
 #: scores as plain values, or why there are none
 Outcome = dict[str, Any] | str
@@ -23,6 +24,8 @@ Outcome = dict[str, Any] | str
 Run = Callable[[Any], Any]
 #: libraries that start threads read these when they are loaded
 _THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+#: between two looks at the workers of a pool [s]
+_LOOK_S = 0.5
 
 Job = TypeVar('Job')
 
@@ -81,6 +84,7 @@ def _in_processes(
 ) -> Iterator[tuple[Job, Any]]:
     context = multiprocessing.get_context('spawn')
     pool = ProcessPoolExecutor(workers, context, _start_worker, (make_run, threads))
+    watch = WorkerWatch(pool)
     try:
         with _environment(dict.fromkeys(_THREAD_VARIABLES, str(threads))):
             futures = {pool.submit(_run_job, job): job for job in jobs}
@@ -88,11 +92,37 @@ def _in_processes(
             yield futures[future], future.result()
     except BrokenProcessPool as error:
         raise MtvWorldError(
-            f'one of {workers} workers died, most likely of lack of memory; what is done is kept: '
-            'run the command again, with fewer --workers'
+            f'one of {workers} workers died, most likely of lack of memory (one that is stopped '
+            f'for {STILL_S:g} s is ended, too); what is done is kept: run the command again, with '
+            'fewer --workers'
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+        watch.close()
+
+
+class WorkerWatch:
+    """Kills workers of a pool that stand still (SIGSTOP): the pool breaks, and nobody waits on.
+
+    Args:
+        pool: whose workers are looked at, until `close`.
+    """
+
+    def __init__(self, pool: ProcessPoolExecutor) -> None:
+        self._pool, self._closed = pool, threading.Event()
+        threading.Thread(target=self._look, daemon=True).start()
+
+    def close(self) -> None:
+        """Looks no more."""
+        self._closed.set()
+
+    def _look(self) -> None:
+        still = StandStill()
+        while not self._closed.wait(_LOOK_S):
+            found = still.find(list(self._pool._processes or ()))
+            if found is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(found, signal.SIGKILL)
 
 
 @contextmanager

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 import os
 from pathlib import Path
 import random
 import signal
 import subprocess
 import sys
+import time
 
 #: tells a node whose child it is: it ends with that process, however that ends
 PARENT_VARIABLE = 'MTV_WORLD_PARENT'
 _STOP_S = 30.0
+#: a process that stands still (SIGSTOP) for longer is given up [s]
+STILL_S = 5.0
+#: who looks no oftener than this may have stood still as well [s]
+_LONGEST_GAP_S = 2.0
 _TAIL_BYTES = 4000
 
 
@@ -74,11 +80,48 @@ def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str
     return f"'{name}' ended with status {process.returncode}: {text} (logs are in '{logs}')"
 
 
+class StandStill:
+    """Tells processes that somebody stopped (SIGSTOP) from those that are at work.
+
+    What waits for a process looks here, many times a second: one that stands still never ends.
+    """
+
+    def __init__(self) -> None:
+        self._since: dict[int, float] = {}
+        self._looked_s = 0.0
+
+    def find(self, pids: Iterable[int]) -> int | None:
+        """Returns the number of a process that has stood still for `STILL_S`, or None."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s > _LONGEST_GAP_S:  # a terminal stopped this process as well
+            self._since.clear()
+        self._looked_s = now_s
+        self._since = {pid: self._since.get(pid, now_s) for pid in pids if _is_stopped(pid)}
+        still = (pid for pid, since_s in self._since.items() if now_s - since_s > STILL_S)
+        return next(still, None)
+
+    def said(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> str:
+        """Says which of named processes has stood still for `STILL_S`; empty = none."""
+        found = self.find(process.pid for process in processes.values())
+        names = [name for name, process in processes.items() if process.pid == found]
+        return f"'{names[0]}' was stopped and stood still for {STILL_S:g} s" if names else ''
+
+
+def _is_stopped(pid: int) -> bool:
+    try:
+        text = Path(f'/proc/{pid}/stat').read_text()
+    except OSError:  # it ended, or the system has no such files
+        return False
+    return text.rpartition(')')[2].split()[0] == 'T'
+
+
 def stop_process(process: subprocess.Popen[bytes] | None) -> None:
     """Ends a node with SIGINT and waits for it; kills it where that does not help."""
     if process is None or process.poll() is not None:
         return
     process.send_signal(signal.SIGINT)
+    with suppress(ProcessLookupError):
+        process.send_signal(signal.SIGCONT)  # one that stands still hears nothing
     try:
         process.wait(_STOP_S)
     except subprocess.TimeoutExpired:

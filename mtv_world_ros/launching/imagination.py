@@ -27,6 +27,7 @@ from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
+    StandStill,
     start_process,
     stop_process,
 )
@@ -142,11 +143,13 @@ def _count(options: ImagineOptions) -> int:
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:
     """Until the runner ends; before its first episode nobody else would notice a dead node."""
-    runner = processes['runner']
+    runner, still = processes['runner'], StandStill()
     while runner.poll() is None:
         time.sleep(0.2)
         bar.n = episodes_done(logs.parent)
         bar.refresh()
+        if said := still.said(processes):
+            raise EpisodeError(f"{said} (logs are in '{logs}')")
         dead = [n for n, p in processes.items() if p is not runner and p.poll() is not None]
         if dead and not (logs.parent / 'episodes.json').is_file():
             said = how_it_ended(dead[0], processes[dead[0]], logs)

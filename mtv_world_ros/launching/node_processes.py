@@ -15,6 +15,7 @@ from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
+    StandStill,
     start_process,
     stop_process,
 )
@@ -103,11 +104,15 @@ def _node_command(options: DemoOptions) -> list[str]:
 def _wait(
     player: subprocess.Popen[bytes], others: Mapping[str, subprocess.Popen[bytes]], logs: Path
 ) -> None:
+    still = StandStill()
     while player.poll() is None:
         for name, process in others.items():
             if process.poll() is not None:
                 stop_process(player)
                 raise EpisodeError(how_it_ended(name, process, logs))
+        if said := still.said({'player': player, **others}):
+            stop_process(player)
+            raise EpisodeError(f"{said} (logs are in '{logs}')")
         time.sleep(0.1)
     if player.returncode != 0:
         raise EpisodeError(how_it_ended('player', player, logs))

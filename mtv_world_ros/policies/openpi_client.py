@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 import os
+import socket
+import struct
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -152,6 +154,7 @@ class OpenPiPolicy:
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
             )
             self._connection = self._opened.enter_context(connecting)
+            _limit_sending(self._connection.socket, config.timeout_s)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
             raise PolicyServerError(
                 f"no connection to the policy server '{config.server}': "
@@ -192,6 +195,13 @@ class OpenPiPolicy:
 
     def _gone(self, error: Exception) -> PolicyServerError:
         return PolicyServerError(f"the policy server '{self._config.server}' is gone: {error}")
+
+
+def _limit_sending(connected: socket.socket, seconds: float) -> None:
+    """A server that stands still takes nothing: what is sent would wait for ever."""
+    whole = int(seconds)
+    value = struct.pack('ll', whole, int((seconds - whole) * 1e6))
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
 
 
 #: kinds of dtype that have no plain bytes: structures, objects, complex numbers

@@ -13,7 +13,7 @@ import time
 import weakref
 
 from mtv_world_ros.errors import PolicyServerError
-from mtv_world_ros.processes import last_line, start_process
+from mtv_world_ros.processes import last_line, StandStill, start_process
 
 #: stands for the port in a command
 PORT = '{port}'
@@ -91,7 +91,7 @@ class ServerProcess:
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
         """Waits until the server listens."""
-        deadline = time.monotonic() + self._start_timeout_s
+        deadline, still = time.monotonic() + self._start_timeout_s, StandStill()
         while time.monotonic() < deadline:
             status = process.poll()
             if status is not None:
@@ -99,6 +99,9 @@ class ServerProcess:
                     f"the server of policy '{self._name}' ended with status {status} when it was "
                     f"started: {last_line(self._log, 'its log is empty')} ('{self._log}')"
                 )
+            if said := still.said({f'{self._name}, its server': process}):
+                self.stop()
+                raise PolicyServerError(f"{said}; its log is '{self._log}'")
             if _listens(self.port):
                 return
             time.sleep(_POLL_S)
@@ -137,6 +140,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     for number in (signal.SIGTERM, signal.SIGKILL):
         try:
             os.killpg(process.pid, number)
+            os.killpg(process.pid, signal.SIGCONT)  # one that stands still hears nothing
         except ProcessLookupError:
             break
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import subprocess
+import time
 
 from mtv_world_ros.data.episode import (
     camera_info_topic,
@@ -14,7 +15,13 @@ from mtv_world_ros.data.episode import (
     JOINT_TRAJECTORY,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.processes import last_line, module_command, start_process, stop_process
+from mtv_world_ros.processes import (
+    last_line,
+    module_command,
+    StandStill,
+    start_process,
+    stop_process,
+)
 
 
 def record_topics(
@@ -26,14 +33,18 @@ def record_topics(
 
     Raises:
         ConfigError: the time is not positive.
-        EpisodeError: the recorder failed, e.g. since nobody publishes joint states.
+        EpisodeError: the recorder failed, e.g. since nobody publishes joint states, or stands
+            still.
     """
     if not seconds > 0:
         raise ConfigError(f'--seconds is {seconds}, must be positive')
     log = out.with_suffix('.log')
-    process = _start(views, out, log, seconds, wait_s)
+    process, still = _start(views, out, log, seconds, wait_s), StandStill()
     try:
-        process.wait()
+        while process.poll() is None:
+            if said := still.said({'recorder': process}):
+                raise EpisodeError(f"{said}; its log is '{log}'")
+            time.sleep(0.1)
     finally:
         stop_process(process)
     if process.returncode != 0:

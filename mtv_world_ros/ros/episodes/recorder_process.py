@@ -9,7 +9,13 @@ import subprocess
 from std_srvs.srv import Trigger
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.processes import last_line, module_command, start_process, stop_process
+from mtv_world_ros.processes import (
+    last_line,
+    module_command,
+    StandStill,
+    start_process,
+    stop_process,
+)
 from mtv_world_ros.ros.peers import Peers
 
 _VIEW_TOPICS = ('predicted/image_raw', 'predicted/camera_info')
@@ -35,6 +41,7 @@ class RecorderProcess:
         self._out, self._peers = out, peers
         self._process: subprocess.Popen[bytes] | None = None
         self._bag: Path | None = None
+        self._still = StandStill()
 
     def start(self, topics: Sequence[str]) -> None:
         """Starts the recorder and waits until it is connected to every topic.
@@ -64,11 +71,15 @@ class RecorderProcess:
         """Refuses to go on without the recorder.
 
         Raises:
-            EpisodeError: the recorder ended, e.g. because the disk is full.
+            EpisodeError: the recorder ended, e.g. because the disk is full, or was stopped.
         """
-        if self._process is not None and self._process.poll() is not None:
+        if self._process is None:
+            return
+        if self._process.poll() is not None:
             status, text = self._process.returncode, last_line(self._log, 'its log is empty')
             raise EpisodeError(f'the recorder ended with status {status}: {text}')
+        if said := self._still.said({'recorder': self._process}):
+            raise EpisodeError(f"{said}; its log is '{self._log}'")
 
     def end(self) -> None:
         """Lets the recorder take what is still on its way, and waits for the closed bag.

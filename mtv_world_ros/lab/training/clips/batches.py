@@ -32,6 +32,7 @@ from mtv_world_ros.lab.training.clips.past import (
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.actions import ActionEncoding, collate
+from mtv_world_ros.parallel import WorkerWatch
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -158,6 +159,7 @@ class BatchSource:
     def close(self) -> None:
         """Stops preparing."""
         self._pool.shutdown(cancel_futures=True)
+        self._watch.close()
         if self._workers is not None:
             self._workers.close()
 
@@ -285,6 +287,7 @@ class ClipWorkers:
             initializer=_begin,
             initargs=(make_clip, os.getpid()),
         )
+        self._watch = WorkerWatch(self._pool)
 
     def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
         """Returns the clips of a step.
