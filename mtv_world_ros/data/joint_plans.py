@@ -52,7 +52,9 @@ class PlanError(TrajectoryError):
 def read_plan(message: Any) -> JointTrajectory:
     """Returns the trajectory of a message, of rclpy's or rosbags' class.
 
-    Times count from the message's stamp. Velocities are kept where every point has them.
+    Times count from the message's stamp. Velocities are kept where every point has them. Limits
+    are not looked at: what was commanded in a recording is a fact. Who imagines a plan checks it
+    (`check_plan_joints`, `plan_limits.check_plan`).
 
     Raises:
         PlanError: empty, names repeated, points of the wrong length, NaN, times not increasing.

@@ -154,7 +154,7 @@ class OpenPiPolicy:
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
             )
             self._connection = self._opened.enter_context(connecting)
-            _limit_sending(self._connection.socket, config.timeout_s)
+            limit_sending(self._connection.socket, config.timeout_s)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
             raise PolicyServerError(
                 f"no connection to the policy server '{config.server}': "
@@ -197,7 +197,7 @@ class OpenPiPolicy:
         return PolicyServerError(f"the policy server '{self._config.server}' is gone: {error}")
 
 
-def _limit_sending(connected: socket.socket, seconds: float) -> None:
+def limit_sending(connected: socket.socket, seconds: float) -> None:
     """A server that stands still takes nothing: what is sent would wait for ever."""
     whole = int(seconds)
     value = struct.pack('ll', whole, int((seconds - whole) * 1e6))

@@ -1,8 +1,10 @@
 """The client against a server process that speaks openpi's protocol."""
 
 from pathlib import Path
+import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.policies.openpi_client import limit_sending
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import fitted
 
@@ -175,3 +178,13 @@ def test_relative_actions_count_from_the_observed_positions(tmp_path, server):
 def test_wrong_configurations_say_what_would_be_right(tmp_path, changes, text):
     with pytest.raises(ConfigError, match=text):
         make_policy(tmp_path, 1, **changes)
+
+
+def test_what_is_sent_to_one_that_takes_nothing_ends_in_time():
+    near, far = socket.socketpair()
+    with near, far:
+        limit_sending(near, 0.3)
+        begin_s = time.monotonic()
+        with pytest.raises(BlockingIOError):
+            near.sendall(bytes(2**25))
+        assert time.monotonic() - begin_s < 5.0

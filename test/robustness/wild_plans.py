@@ -141,9 +141,10 @@ def check_plausible(episode: Any, prediction: Any) -> None:
         steps = np.linalg.norm(np.diff(poses, axis=1), axis=-1)
         assert steps.max() < REACH_M, f'a tool went {steps.max():.1f} m in a frame'
     objects = episode._rollouts[0].objects
-    if objects is None or np.isnan(success):
+    found = None if objects is None else objects.found
+    if found is None or np.isnan(success):
         return
-    for motion in objects.motions or ():
+    for motion in found.motions:
         way = np.linalg.norm(motion.points - motion.points[:1], axis=-1)
         far = np.nanmax(way, initial=0.0)
         assert far < FARTHEST_M, f'an object went {far:.0f} m, and it was judged'

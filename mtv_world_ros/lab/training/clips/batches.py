@@ -159,7 +159,6 @@ class BatchSource:
     def close(self) -> None:
         """Stops preparing."""
         self._pool.shutdown(cancel_futures=True)
-        self._watch.close()
         if self._workers is not None:
             self._workers.close()
 
@@ -307,6 +306,7 @@ class ClipWorkers:
     def close(self) -> None:
         """Ends the processes."""
         self._pool.shutdown(cancel_futures=True)
+        self._watch.close()
 
 
 def _begin(make_clip: MakeClip, parent: int) -> None:

@@ -1,0 +1,61 @@
+"""Processes that stand still are found and ended."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.parallel import run_all
+from mtv_world_ros.processes import StandStill, STILL_S, stop_process
+
+
+class StopsItself:
+    """A job that stops the process it runs in; travels to workers by its module's name."""
+
+    def __call__(self):
+        return stop_on_three
+
+
+def stop_on_three(number):
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return number
+
+
+@pytest.fixture
+def child():
+    with subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']) as process:
+        yield process
+        process.kill()
+
+
+def test_one_that_stands_still_is_named_and_one_at_work_is_not(child):
+    still = StandStill()
+    child.send_signal(signal.SIGSTOP)
+    begin_s = time.monotonic()
+    while not (said := still.said({'child': child, 'self': child})):
+        assert time.monotonic() - begin_s < 4 * STILL_S
+        time.sleep(0.1)
+    assert "'child' was stopped" in said and time.monotonic() - begin_s >= STILL_S
+    child.send_signal(signal.SIGCONT)
+    time.sleep(0.3)
+    assert not still.said({'child': child})
+
+
+def test_one_that_stands_still_hears_that_it_is_to_end(child):
+    time.sleep(1.0)
+    child.send_signal(signal.SIGSTOP)
+    begin_s = time.monotonic()
+    stop_process(child)
+    assert child.poll() is not None and time.monotonic() - begin_s < 10.0
+
+
+def test_a_stopped_worker_is_an_error_within_seconds():
+    begin_s = time.monotonic()
+    with pytest.raises(MtvWorldError, match='2 workers died'):
+        list(run_all([1, 2, 3, 4], StopsItself(), 2))
+    assert time.monotonic() - begin_s < 60.0
