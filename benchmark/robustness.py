@@ -118,6 +118,16 @@ def servers_table(file: Path) -> str:
     )
 
 
+def children_table(folders: list[Path]) -> str:
+    """How what waits for a child that is stopped or killed ended, a row a kind."""
+    keys = ('kind', 'commit', 'tried', 'done', 'said', 'worst_s', 'failures')
+    rows = [row for at in folders for row in json.loads((at / 'children.json').read_text())]
+    return table(
+        ('child', 'commit', 'tried', 'done', 'said', 'worst [s]', 'failed'),
+        [[_cell(row[key]) for key in keys] for row in rows],
+    )
+
+
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
         return ', '.join(f'{key} {count}' for key, count in value.items())
@@ -143,6 +153,8 @@ def attacks_text(options: argparse.Namespace) -> list[str]:
             body.append(f'![Memory, processes and descriptors over cycles]({name})')
     if options.worlds:
         body += ['## Odd worlds', worlds_table(options.worlds)]
+    if options.children:
+        body += ['## Children that are stopped or killed', children_table(options.children)]
     if options.servers:
         body += ['## Policy servers that misbehave', servers_table(options.servers)]
     return body
@@ -160,6 +172,7 @@ def main() -> None:
         parser.add_argument('--rate', **several, help='folders of rate.py, the earliest first')
         parser.add_argument('--cycles', **several, help='folders of cycles.py, likewise')
         parser.add_argument('--worlds', type=Path, help='folder of odd_worlds.py')
+        parser.add_argument('--children', **several, help='folders of children.py')
         parser.add_argument('--servers', type=Path, help='what policy_servers.py wrote')
 
     options = parse_arguments(__doc__, 1, more)

@@ -35,7 +35,8 @@ def message_of(names, rows, times, velocities):
     points = []
     for number, (row, time_s) in enumerate(zip(rows, times, strict=True)):
         speeds = nothing if velocities is None else np.array(velocities[number])
-        after = make('builtin_interfaces/msg/Duration', sec=int(time_s), nanosec=round(time_s % 1 * 1e9))
+        rest = round(time_s % 1 * 1e9)
+        after = make('builtin_interfaces/msg/Duration', sec=int(time_s), nanosec=rest)
         points.append(
             make(
                 'trajectory_msgs/msg/JointTrajectoryPoint', positions=np.array(row),
