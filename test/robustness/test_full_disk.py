@@ -86,7 +86,7 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 
 def _as_guessed(camera: FixedCamera, **options: object) -> CameraEstimate:
     """In place of a search of a minute, whose result is written like any other."""
-    return CameraEstimate(camera=camera._camera, std_mm=1.0, std_deg=0.1, evidence='none')
+    return CameraEstimate(camera=camera.camera, std_mm=1.0, std_deg=0.1, evidence='none')
 
 
 @pytest.fixture(scope='module')

@@ -63,6 +63,7 @@ def scene(shift: float, view: str, grey: int) -> tuple[ByteArray, ByteArray]:
 def make_episode(robot: RobotModel) -> Callable[..., Path]:
     """Records an episode of 19 frames at 10 Hz; the red block moves `speed` px a frame."""
     middle = (robot.lower + robot.upper) / 2
+    first = np.arange(len(middle)) == 0
 
     def make(
         path: Path,
@@ -104,7 +105,7 @@ def make_episode(robot: RobotModel) -> Callable[..., Path]:
                     if objects:
                         writer.write_mask(model.view, stamp, ids)
                     writer.write_camera_info(model.view, stamp, model)
-                writer.write_joint_states(stamp, robot.joint_names, middle)
+                writer.write_joint_states(stamp, robot.joint_names, middle + offset * first)
             writer.outcome = outcome
         return path
 

@@ -173,7 +173,7 @@ def test_refuses_images_of_another_size_than_their_camera_info(node, client, ros
     client.send_scene(stamp_ns, image_low=small)
     ended = client.imagine_one(scene='sent')
     assert ended['reason'] == 'camera_info_invalid'
-    assert '48x36' in ended['text'] and '96x72' in ended['text']
+    assert '96x36' in ended['text'] and '96x72' in ended['text']
     expect_goes_on(client)
 
 
