@@ -16,6 +16,8 @@ from node_messages import FLOATS, WORDS
 import numpy as np
 import wild_plans
 
+#: beyond those of tests that start nodes as processes of their own (1 to 100)
+_DOMAIN = 101
 NODES = ('world_model', 'policy')
 #: names that nobody declared
 STRANGE_NAMES = ('', 'x', 'adapter.x', 'x' * 300, 'use_sim_time', '\N{SNOWMAN}', 'a\nb', 'qos')
@@ -60,7 +62,8 @@ def _node(name: str) -> Any:
     from mtv_world_ros.ros.world_model.node import WorldModelNode
 
     if not rclpy.ok():
-        rclpy.init(args=['x', '--ros-args', '--log-level', 'FATAL'])
+        # a domain of its own: tests of other processes look for nodes of the same names
+        rclpy.init(args=['x', '--ros-args', '--log-level', 'FATAL'], domain_id=_DOMAIN)
     if name == 'policy':
         return PolicyNode(load=lambda settings: None)  # type: ignore[arg-type,return-value]
     node = WorldModelNode(load=lambda settings: wild_plans.bundled())
