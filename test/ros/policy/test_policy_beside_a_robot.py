@@ -11,9 +11,9 @@ from mtv_world_ros.ros.messages.conversions import values_of
 @pytest.fixture
 def observing_policy(tmp_path, ros):
     ros.make_checkpoint(tmp_path / 'checkpoint')
-    world = ros.start_node(tmp_path, 'pace:=burst', 'max_image_age_s:=0.6')
+    world = ros.start_node(tmp_path, 'pace:=burst', 'max_image_age_s:=1.5')
     policy = ros.start_policy(
-        tmp_path, 'mode:=observe', 'max_image_age_s:=0.6', 'observation_timeout_s:=1.2'
+        tmp_path, 'mode:=observe', 'max_image_age_s:=1.5', 'observation_timeout_s:=3.0'
     )
     yield policy
     assert [process.stop() for process in (policy, world)] == [0, 0]
