@@ -77,7 +77,7 @@ install_torch
 # setuptools first, so that the package builds in place instead of in an environment of its own.
 pip install --quiet -c requirements/constraints.txt setuptools
 say 'Installing the other packages'
-pip install --quiet --no-build-isolation -c requirements/constraints.txt -e '.[sim,train,describe,vision,evaluate,import,wan,policies,ros,view,test,lint,docs]'
+pip install --quiet --no-build-isolation -c requirements/constraints.txt -e '.[sim,dart,train,describe,vision,evaluate,import,wan,policies,ros,view,test,lint,docs]'
 if ! "$VENV/bin/python" -c 'import rclpy' 2>/dev/null; then
     say 'rclpy is not available: its wheels exist for x86_64 Linux only. Elsewhere use a native'
     say 'ROS 2 Jazzy (docs/native_ros.md). What needs no ROS works, the rest is skipped.'

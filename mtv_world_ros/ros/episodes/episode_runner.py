@@ -81,10 +81,10 @@ class EpisodeRunner(Node):
         options.out.mkdir(parents=True, exist_ok=True)
         request, timeout = SetBool.Request(data=True), options.wait_timeout
         self._peers.call(SetBool, f'{options.world_model}/imagine', request, timeout)
-        self._wait_for(
-            lambda: self._peers.silence_s(options.policy_node) < timeout,
-            f"the node '{options.policy_node}'",
-        )
+        for node in (options.policy_node, options.world_model):
+            self._wait_for(
+                lambda node=node: self._peers.silence_s(node) < timeout, f"the node '{node}'"
+            )
         self._connect()
         for number, start in enumerate(self._starts()):
             result = self._run_one(number, start)

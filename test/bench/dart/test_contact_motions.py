@@ -8,6 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
+pytest.importorskip('dartpy', reason='dartpy is not installed (pip install .[dart])')
+
 from mtv_world_ros.bench.dart import contact_motions
 from mtv_world_ros.bench.dart.contact_motions import (
     check_robot,
