@@ -26,6 +26,7 @@ from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arm_response import ArmResponse
+from mtv_world_ros.foresight.arms import finger_travels
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import find_mesh
@@ -561,20 +562,6 @@ def _described(path: Path) -> ElementTree.Element:
             raise RobotError(f"'{path}': mesh '{name}' is missing; contact needs it")
         mesh.set('filename', file.resolve().as_uri())
     return tree
-
-
-def finger_travels(robot: RobotModel) -> dict[str, float]:
-    """Gripper joint -> how far a finger goes as it moves by one [m / m or m / rad]."""
-    ends = np.zeros((2, len(robot.joint_names)))
-    travels = {}
-    for tool, name in enumerate(tool.gripper_joint for tool in robot.tools):
-        if name is None:
-            continue
-        column = robot.joint_names.index(name)
-        ends[:, column] = robot.tools[tool].gripper_closed, robot.tools[tool].gripper_open
-        shut, wide = robot.finger_gaps(ends)[:, tool]
-        travels[name] = float((wide - shut) / (ends[1, column] - ends[0, column]))
-    return travels
 
 
 def _add_drive(joint: Any, armature: float, *, is_finger: bool) -> None:
