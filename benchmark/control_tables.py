@@ -99,19 +99,6 @@ def body(summaries: dict[str, EvaluationSummary], rows: dict[str, Any], seed: in
     return '\n\n'.join(parts)
 
 
-def _costs(rows: dict[str, Any]) -> str:
-    lines = [
-        [
-            ROWS[name].title,
-            f'{row["parameters"] / 1e6:.2f} M',
-            f'{row["loss"]:.4f}',
-            f'{row["seconds"]:.0f}',
-        ]
-        for name, row in rows.items()
-    ]
-    return table(['row', 'parameters', 'training loss', 'training [s]'], lines)
-
-
 def verdict(gaps: dict[str, Estimate]) -> str:
     """Whether the trajectory video is first among the controls, by J moving over all views."""
     lines = [[ROWS[name].title, cell(gap), str(gap.num_episodes)] for name, gap in gaps.items()]

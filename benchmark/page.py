@@ -35,9 +35,7 @@ DESCRIBES = {
     'foresight': ('mtv_world_ros/ros',),
     'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),
     'learned_policies': ('mtv_world_ros/bench', 'mtv_world_ros/policies'),
-    'outcome_sensitivity': ('mtv_world_ros/bench',),
     'policy_in_the_loop': ('mtv_world_ros/ros',),
-    'ros_overhead': ('mtv_world_ros/ros',),
     'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
     'serving': ('mtv_world_ros/model',),
@@ -52,7 +50,6 @@ OF_A_CHECKPOINT = (
     'foresight',
     'learned_policies',
     'policy_in_the_loop',
-    'ros_overhead',
     'serving',
 )
 _MADE = re.compile(

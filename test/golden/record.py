@@ -181,7 +181,7 @@ def _policies() -> list[str]:
     if recorded.exists():
         return list(json.loads(recorded.read_text()))
     faults = module('faults', 'catalogue').FAULTS
-    return ['expert', *(f'expert-{kind}-{fault.typical:g}' for kind, fault in faults.items())]
+    return ['expert', *(f'expert-{kind}-{fault.size.typical:g}' for kind, fault in faults.items())]
 
 
 def helps() -> dict[str, list[str]]:

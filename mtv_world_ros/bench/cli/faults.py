@@ -32,9 +32,10 @@ def _faults(arguments: argparse.Namespace) -> int:
     for kind in map(kind_named, names):
         fault = FAULTS[kind]
         typical, largest = (
-            f'{size:g} {fault.unit}'.strip() for size in (fault.typical, fault.largest)
+            f'{size:g} {fault.size.unit}'.strip()
+            for size in (fault.size.typical, fault.size.largest)
         )
-        called = f' ({", ".join(fault.aliases)})' if fault.aliases else ''
+        called = f' ({fault.alias})' if fault.alias else ''
         print(f'{kind}{called}: {fault.family}, {fault.split}; {typical}, at most {largest}')
         print(f'    {fault.text}')
     return 0

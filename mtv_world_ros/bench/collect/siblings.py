@@ -189,7 +189,7 @@ def find_boundary(
         kind: of the fault.
         succeeds: whether a variant succeeds; may raise PolicyError where there is no plan.
     """
-    fault = FAULTS[kind_named(kind)]
+    fault = FAULTS[kind_named(kind)].size
     if fault.typical == fault.largest:
         return 'it is there or not, and has no size'
     if fault.none:

@@ -69,7 +69,7 @@ def test_the_catalogue_is_wide_enough_and_its_splits_are_apart():
 def test_every_kind_changes_the_plan_and_a_larger_size_changes_it_more(expert, kind):
     fault = FAULTS[kind]
     expert_plan = plan(expert, 'expert')
-    changed = plan(expert, f'expert-{kind}-{fault.typical:g}')
+    changed = plan(expert, f'expert-{kind}-{fault.size.typical:g}')
     length = min(len(changed), len(expert_plan))
     assert np.abs(changed[:length] - expert_plan[:length]).max() > 1e-3
     tools = [expert.robot.lower - 1e-6, expert.robot.upper + 1e-6]
@@ -105,7 +105,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
     kinds = [kind for kind, fault in FAULTS.items() if 'two_arms' in fault.needs]
     assert len(kinds) == 12
     for kind in kinds:
-        variant = parse_variant(f'expert-{kind}-{FAULTS[kind].typical:g}')
+        variant = parse_variant(f'expert-{kind}-{FAULTS[kind].size.typical:g}')
         with pytest.raises(PolicyError, match=f"{kind} takes two arms, robot 'franka' has 1"):
             with_faults(one, variant, franka, np.random.default_rng(0))
 
@@ -122,7 +122,7 @@ def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
         mimics=robot.mimics,
     )
     given = trajectory(expert, 'expert')
-    rng, name = np.random.default_rng(0), f'expert-{kind}-{FAULTS[kind].typical:g}'
+    rng, name = np.random.default_rng(0), f'expert-{kind}-{FAULTS[kind].size.typical:g}'
     assert len(with_faults(given, PolicyVariant(), bare, rng).times) > 0
     with pytest.raises(PolicyError, match=f"{kind} takes a gripper, robot 'bare' has none"):
         with_faults(given, parse_variant(name), bare, rng)
@@ -580,9 +580,9 @@ def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert, kind):
     np.testing.assert_array_equal(*lasts)
 
 
-@pytest.mark.parametrize('kind', [kind for kind, fault in FAULTS.items() if fault.none == 0])
+@pytest.mark.parametrize('kind', [kind for kind, fault in FAULTS.items() if fault.size.none == 0])
 def test_sizes_out_of_range_are_refused(kind):
-    largest = FAULTS[kind].largest
+    largest = FAULTS[kind].size.largest
     assert parse_variant(f'expert-{kind}-{largest:g}').size(kind) == largest
     assert parse_variant(f'expert-{kind}-0') == PolicyVariant()
     with pytest.raises(PolicyError, match=f"'{kind}' is .*; it must be 0 to {largest:g}"):

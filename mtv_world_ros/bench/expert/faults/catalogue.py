@@ -30,51 +30,64 @@ _FILES = (
 Steps = ListOf[dict[str, dict[str, Any]]]
 
 
-class FaultKind(Schema):
-    """One way in which a policy fails.
+class FaultSize(Schema):
+    """How large a fault may be.
 
     Attributes:
-        aliases: other names, which earlier recordings have.
+        typical: at which success and failure are about as frequent.
+        largest: that a policy may have.
+        unit: of all of them.
+        none: at which there is no fault.
+        ranked: in the rankings of the kind's split.
+    """
+
+    typical: float
+    largest: float
+    unit: str = ''
+    none: float = 0.0
+    ranked: ListOf[float] = ()
+
+
+class FaultKind(Schema):
+    """One way in which a policy fails: an entry of `config/faults`.
+
+    Attributes:
+        alias: another name, which earlier recordings have.
         family: what it is an error of.
         split: `train`, `calibrate` or `test`.
-        typical: a size at which success and failure are about as frequent.
-        largest: largest size.
-        unit: of the size.
-        none: the size at which there is no fault.
+        size: how large it may be.
         text: what the size means.
         contact: whether its failures are failures of contact, which do not show in the arm's path
             alone.
         needs: what a robot needs for it.
         keeps_tempo: added way points take time of their own; else they share the move's.
-        ranked: sizes in the rankings of its split.
         edits: steps that change the way points of a move.
         second_arm: what another arm does meanwhile.
         commands: steps that change the commands of the whole plan.
     """
 
-    aliases: ListOf[str] = ()
+    alias: str = ''
     family: str
     split: Literal['train', 'calibrate', 'test']
-    typical: float
-    largest: float
-    unit: str = ''
-    none: float = 0.0
+    size: FaultSize
     text: str
     contact: bool = True
     needs: ListOf[Literal['gripper', 'two_arms']] = ()
     keeps_tempo: bool = False
-    ranked: ListOf[float] = ()
     edits: Steps = ()
     second_arm: dict[str, Any] = {}
     commands: Steps = ()
 
 
 def _read() -> dict[str, FaultKind]:
+    """All kinds; `defaults` of a file hold for its entries where these do not say otherwise."""
     kinds: dict[str, FaultKind] = {}
     for name in _FILES:
         path = share_path('config', 'faults', f'{name}.yaml')
-        for kind, values in read_yaml(path, 'fault file', 'config/faults').items():
-            kinds[kind] = validated(FaultKind, values, f"{path}: '{kind}'")
+        entries = read_yaml(path, 'fault file', 'config/faults')
+        defaults = entries.pop('defaults')
+        for kind, values in entries.items():
+            kinds[kind] = validated(FaultKind, {**defaults, **values}, f"{path}: '{kind}'")
     return kinds
 
 
@@ -89,7 +102,7 @@ class _Catalogue(dict[str, FaultKind]):
 
 #: kinds by name
 FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
-_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, *fault.aliases)}
+_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias)}
 _ALL = f"the {len(FAULTS)} kinds that 'mtv-world faults' prints"
 
 
@@ -152,7 +165,7 @@ class PolicyVariant:
 
     def __post_init__(self) -> None:
         for name, value in self.sizes:
-            largest = FAULTS[kind_named(name)].largest
+            largest = FAULTS[kind_named(name)].size.largest
             if not (isfinite(value) and 0 <= value <= largest):
                 raise PolicyError(f"policy fault '{name}' is {value}; it must be 0 to {largest:g}")
 
@@ -161,11 +174,11 @@ class PolicyVariant:
         """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
         names = in_order(sizes)
         given = ((name, float(sizes[name])) for name in names)
-        return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].none))
+        return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].size.none))
 
     def size(self, kind: str) -> float:
         """Returns the size of one fault."""
-        return dict(self.faults).get(kind_named(kind), FAULTS[kind_named(kind)].none)
+        return dict(self.faults).get(kind_named(kind), FAULTS[kind_named(kind)].size.none)
 
     @property
     def faults(self) -> tuple[tuple[str, float], ...]:
@@ -232,8 +245,8 @@ def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVarian
     chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
     sizes = {}
     for kind in map(str, chosen):
-        fault = FAULTS[kind_named(kind)]
-        size = min(fault.typical * 2 ** rng.normal(0.0, 0.9), fault.largest)
+        allowed = FAULTS[kind_named(kind)].size
+        size = min(allowed.typical * 2 ** rng.normal(0.0, 0.9), allowed.largest)
         sizes[kind] = float(f'{size:.3g}')
     return PolicyVariant.of(sizes)
 
@@ -244,7 +257,7 @@ def policies_of(split: str) -> tuple[str, ...]:
     Raises:
         PolicyError: no such split.
     """
-    faults = ((kind, size) for kind in kinds_of(split) for size in FAULTS[kind].ranked)
+    faults = ((kind, size) for kind in kinds_of(split) for size in FAULTS[kind].size.ranked)
     return (EXPERT, *(PolicyVariant.of({kind: size}).name for kind, size in faults))
 
 

@@ -74,12 +74,10 @@ def drawn_values(name: str) -> dict[str, Any]:
     return {
         'family': 'drawn',
         'split': 'test',
-        'typical': 1.0,
-        'largest': LARGEST,
+        'size': {'typical': 1.0, 'largest': LARGEST, 'ranked': list(RANKED)},
         'text': f'factor of what was drawn: {"; ".join(said)}',
         'needs': ['gripper'],
         'keeps_tempo': True,
-        'ranked': list(RANKED),
         'edits': edits,
         'commands': commands,
     }
