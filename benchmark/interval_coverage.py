@@ -18,7 +18,7 @@ import numpy as np
 from page import parse_arguments, publish, table
 from scipy.special import betaincinv, ndtr, ndtri
 
-from mtv_world_ros.bench.ranking.optimism import area_interval, areas_under_roc
+from mtv_world_ros.bench.ranking.scores import area_interval, areas_under_roc
 from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
     mean_maximum_rank_violation,
     pearson,

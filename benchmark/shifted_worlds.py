@@ -32,7 +32,7 @@ from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import draw_variant, EXPERT, FAULTS
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.bench.ranking.optimism import area_interval
+from mtv_world_ros.bench.ranking.scores import area_interval
 from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.data_types import FloatArray, Observation

@@ -125,11 +125,10 @@ def _rank(arguments: argparse.Namespace) -> int:
     check_model(arguments.device, *names)
     listed = _listed(arguments)
     jobs = _jobs(arguments, listed)
-    from mtv_world_ros.bench.ranking.flip_sheet import flip_sheet
-    from mtv_world_ros.bench.ranking.optimism import Optimism
+    from mtv_world_ros.bench.ranking.flips import flip_sheet
     from mtv_world_ros.bench.ranking.policy_list import ListedPolicies
     from mtv_world_ros.bench.ranking.ranking_report import console, write_ranking
-    from mtv_world_ros.bench.ranking.ranking_summary import Summary
+    from mtv_world_ros.bench.ranking.ranking_summary import Optimism, Summary
     from mtv_world_ros.bench.ranking.rollout_runner import RolloutConfig
     from mtv_world_ros.bench.ranking.run_jobs import FOLDER, run_jobs
     from mtv_world_ros.rendering.images import write_png

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from mtv_world_ros.bench.ranking.judges import Agreement, COLUMNS, REPORTED
-from mtv_world_ros.bench.ranking.optimism_tables import optimism_tables, worth_table
-from mtv_world_ros.bench.ranking.optimism_tables import REMARK as OPTIMISM_REMARK
-from mtv_world_ros.bench.ranking.ranking_summary import ALL_TASKS, Rate, Summary
+from mtv_world_ros.bench.expert.faults.catalogue import FAULTS
+from mtv_world_ros.bench.ranking.ranking_summary import ALL_TASKS, Optimism, Summary
 from mtv_world_ros.bench.ranking.rollout_cards import rollout_cards
+from mtv_world_ros.bench.ranking.scores import (
+    COLUMNS,
+    JUDGES,
+    MEASURES,
+    REPORTED,
+    RULE,
+    Score,
+    true_rate,
+)
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.lab.documents import DASH, render, Table
 from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_SCENES
@@ -48,12 +55,26 @@ _INTERVALS = (
     'and its 95 % interval; none below 4 scenes or 3 policies. MMRV weighs a wrongly ranked pair '
     'by how far its true rates lie apart; 0 is perfect.'
 )
+_OPTIMISM = (
+    'Cells: value [95 % interval] count. False success: real failures called a success, of those '
+    'with a verdict. AUROC: of the rollouts with an estimate. Flips: a command whose true '
+    "outcome differs from the expert's in the same scene; how often the imagined last frame is "
+    'nearer to what really happened than to what happened under the expert, over the pixels in '
+    'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
+    'frame alone: an object sticks to a gripper that closes near it. AUROC - rule: on the same '
+    'rollouts. Intervals, over scenes: of shares clustered Wilson, of AUROC jackknife; none for '
+    'few scenes. r and MMRV, noise-free: estimated for endless scenes, posterior median and '
+    'interval; not below 3 policies. r, MMRV and AUROC of a kind: over its policies and the '
+    'expert.'
+)
+#: characters in the head of a column
+_NAME_LENGTH = 17
 
 
 def tables(summary: Summary) -> list[Table]:
     """Returns the ranking's tables."""
     return [
-        worth_table(summary.results, summary.worth),
+        _worth(summary),
         *optimism_tables(summary.optimism),
         _agreement(summary),
         *(_rates(summary, task) for task in (None, *summary.tasks)),
@@ -75,7 +96,7 @@ def remarks(summary: Summary) -> list[str]:
         _agreement_remark(summary),
         _unknown_remark(summary),
         _INTERVALS,
-        OPTIMISM_REMARK if summary.optimism else '',
+        _OPTIMISM if summary.optimism else '',
     ]
     told = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
     if 'uncalibrated' in told:
@@ -101,15 +122,15 @@ def _truth_remark(summary: Summary) -> str:
 
 
 def _agreement_remark(summary: Summary) -> str:
-    found = summary.agreement('imagined', None)['pearson']
-    if not isfinite(found.value):
+    found = summary.agreement('imagined', None)
+    if not isfinite(found['pearson'].value):
         return (
             'r is not defined: less than two policies have an imagined rate, or all rates are '
             'alike.'
         )
-    if found.num_policies == 2:
+    if found['pearson'].count == 2:
         return 'Of two policies r is 1 or -1 whatever they do: it says nothing here.'
-    low = found.interval[0]
+    low = found['pearson_noise_free'].interval[0]
     if not isfinite(low):
         return (
             f'r has no interval, so nothing follows from it: that takes at least {MIN_SCENES} '
@@ -146,7 +167,7 @@ def _unknown_remark(summary: Summary) -> str:
     return text
 
 
-def _rate(rate: Rate) -> str:
+def _rate(rate: Score) -> str:
     unknown = f'{rate.num_unknown} without an estimate'
     if not rate.count:
         return f'{DASH} ({unknown})' if rate.num_unknown else DASH
@@ -173,6 +194,111 @@ def _rates(summary: Summary, task: str | None) -> Table:
     return Table(caption=f'Success rates, {task or ALL_TASKS}', head=head, rows=rows)
 
 
+def _worth(summary: Summary) -> Table:
+    """What a picture is worth: one row a judge."""
+    rate = true_rate(summary.results)
+    return Table(
+        caption=f'What a picture is worth: {rate.count} rollouts, {rate.value:.0%} really succeed',
+        head=['judged by', 'n', 'AUROC', 'false success', 'no verdict', 'r'],
+        rows=[[judge.title, *_worth_of(summary.worth[key])] for key, judge in JUDGES.items()],
+    )
+
+
+def _worth_of(found: Mapping[str, Score]) -> list[str]:
+    r, free = found['pearson'], found['pearson_noise_free']
+    low, high = free.interval
+    around = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
+    return [
+        str(found['auroc'].count),
+        _value(found['auroc']),
+        _cell(found['false_success']),
+        _value(found['abstention']),
+        f'{_number(r.value)}{around}',
+    ]
+
+
+def _value(score: Score) -> str:
+    return _cell(score).rpartition(' ')[0] or DASH
+
+
+def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
+    """Returns the tables: overall, then by fault kind.
+
+    Args:
+        by_model: label of the checkpoint -> its numbers; the first one's stand for the judges
+            that do not depend on imagination.
+    """
+    if not by_model:
+        return []
+    return [_overall(by_model), *(_by_kind(name, found) for name, found in by_model.items())]
+
+
+def _overall(by_model: Mapping[str, Optimism]) -> Table:
+    first = next(iter(by_model.values()))
+    heads = _heads(list(by_model)) if len(by_model) > 1 else [COLUMNS['imagined']]
+    columns = {
+        head: found.scores('imagined')
+        for head, found in zip(heads, by_model.values(), strict=True)
+    }
+    columns |= {COLUMNS[judge]: first.scores(judge) for judge in COLUMNS if judge != 'imagined'}
+    rows = [
+        [words, *(_cell(scores[measure]) for scores in columns.values())]
+        for measure, words in MEASURES.items()
+    ]
+    rate = true_rate(first.rollouts(None))
+    caption = f'Optimism: {rate.count} rollouts, of which {rate.value:.0%} really succeed'
+    return Table(caption=caption, head=['judged on', *columns], rows=rows)
+
+
+def _by_kind(name: str, found: Optimism) -> Table:
+    rows = []
+    for kind in found.kinds:
+        scores, rule = (found.scores(judge, kind) for judge in ('imagined', RULE))
+        rate = true_rate(found.rollouts(kind))
+        rows.append(
+            [
+                kind if FAULTS[kind].contact else f'{kind} *',
+                str(rate.count),
+                _number(rate.value),
+                f'{_number(scores["auroc"].value)} / {_number(rule["auroc"].value)}',
+                _cell(scores['false_success']),
+                _number(rule['false_success'].value),
+                _number(scores['abstention'].value),
+                _cell(scores['flips']),
+            ]
+        )
+    head = ['kind', 'n', 'true', 'AUROC/rule', 'false success', 'rule', 'open', 'flips']
+    caption = f'{name}, by fault kind (* shows in the path of the arm)'
+    return Table(caption=caption, head=head, rows=rows)
+
+
+def _heads(names: Sequence[str]) -> list[str]:
+    """The ends of checkpoints' paths as heads of columns, without the folders in which all end."""
+    parts = [name.rstrip('/').split('/') for name in names]
+    while min(map(len, parts)) > 1 and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
+    ends = ['/'.join(part) for part in parts]
+    ends = [end if len(end) <= _NAME_LENGTH else f'…{end[1 - _NAME_LENGTH :]}' for end in ends]
+    return ends if len(set(ends)) == len(ends) else [f'{n} {end}' for n, end in enumerate(ends, 1)]
+
+
+def _cell(score: Score) -> str:
+    if not isfinite(score.value):
+        return DASH
+    low, high = score.interval
+    interval = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
+    return f'{_number(score.value)}{interval} {score.count}'
+
+
+def _number(value: float) -> str:
+    """Two decimals without the zero in front, 0 or 1 without any; a dash where there is none."""
+    if not isfinite(value):
+        return DASH
+    return {'0.00': '0', '-0.00': '0', '1.00': '1'}.get(
+        f'{value:.2f}', f'{value:.2f}'.replace('0.', '.', 1)
+    )
+
+
 def _agreement(summary: Summary) -> Table:
     rows = []
     for label, task in {ALL_TASKS: None, **{name: name for name in summary.tasks}}.items():
@@ -190,13 +316,14 @@ def _agreement(summary: Summary) -> Table:
     )  # fmt: skip
 
 
-def _scores(found: Mapping[str, Agreement]) -> list[str]:
+def _scores(found: Mapping[str, Score]) -> list[str]:
     cells = []
-    for one in found.values():
+    for name in ('pearson', 'mmrv'):
+        one, free = found[name], found[f'{name}_noise_free']
         cells.append(f'{one.value:.3f}' if isfinite(one.value) else 'not defined')
-        free = f'{one.noise_free:.3f} {_interval(one.interval, 3)}'
-        cells.append(free if isfinite(one.noise_free) else '[n too small]')
-    return [*cells, str(next(iter(found.values())).num_policies)]
+        text = f'{free.value:.3f} {_interval(free.interval, 3)}'
+        cells.append(text if isfinite(free.value) else '[n too small]')
+    return [*cells, str(found['pearson'].count)]
 
 
 def _powered(summary: Summary) -> Table:
@@ -223,16 +350,13 @@ def _powered(summary: Summary) -> Table:
 def _confusion(summary: Summary) -> Table:
     rows = []
     for judge, words in REPORTED.items():
-        counts = summary.confusion(judge)
-        failures = counts['success_failure'] + counts['failure_failure']
-        share = counts['success_failure'] / failures if failures else 0.0
-        interval = _interval(summary.false_success_interval(judge))
+        found = summary.false_success(judge)
         rows.append(
             [
                 words,
-                *(str(count) for count in counts.values()),
+                *map(str, summary.confusion(judge).values()),
                 str(summary.abstained(judge).hits),
-                f'{share:.2f} {interval}' if failures else DASH,
+                f'{found.value:.2f} {_interval(found.interval)}' if found.count else DASH,
             ]
         )
     return Table(
@@ -303,7 +427,7 @@ def _failures(summary: Summary) -> list[Table]:
 def console(summary: Summary) -> str:
     """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
     tables = [
-        worth_table(summary.results, summary.worth),
+        _worth(summary),
         *optimism_tables(summary.optimism),
         _agreement(summary),
         _rates(summary, None),
@@ -348,15 +472,15 @@ def write_ranking(summary: Summary, out: Path) -> Path:
 
 def _answer(summary: Summary) -> tuple[str, bool]:
     """Returns whether looking at the imagined pictures pays, and whether that is shown."""
-    found = summary.gain_over_rule
+    imagined, rule, gain = summary.gain_over_rule
     shares = (
-        f'imagination is right in {found.imagined:.2f} of {len(summary.results)} rollouts, a rule '
-        f'that sees the commands and the first frame alone in {found.rule:.2f}: '
-        f'{found.difference:+.2f} {_interval(found.interval)}'
+        f'imagination is right in {imagined:.2f} of {gain.count} rollouts, a rule that sees the '
+        f'commands and the first frame alone in {rule:.2f}: {gain.value:+.2f} '
+        f'{_interval(gain.interval)}'
     )
-    if found.interval[0] > 0:
+    if gain.interval[0] > 0:
         return f'Yes: {shares}.', True
-    if found.interval[1] < 0:
+    if gain.interval[1] < 0:
         return f'No, they mislead: {shares}.', False
     return f'Not shown: {shares}.', False
 
@@ -364,17 +488,15 @@ def _answer(summary: Summary) -> tuple[str, bool]:
 def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
     """Name, number and what is below it."""
     tiles = []
+    judges = {'imagined': 'imagined', RULE: 'no-picture rule', 'seen': "simulator's frames"}
     for name, label in (('pearson', "Pearson's r"), ('mmrv', 'MMRV, 0 is perfect')):
-        judges = {
-            'imagined': summary.agreement('imagined', None)[name],
-            'no-picture rule': summary.rule_agreement[name],
-            "simulator's frames": summary.agreement('seen', None)[name],
-        }
-        for who, found in judges.items():
-            value = f'{found.value:.2f}' if isfinite(found.value) else DASH
+        for judge, who in judges.items():
+            found = summary.agreement(judge, None)
+            observed, free = found[name], found[f'{name}_noise_free']
+            value = f'{observed.value:.2f}' if isfinite(observed.value) else DASH
             below = 'not defined' if value == DASH else '[n too small]'
-            if isfinite(found.noise_free):
-                below = f'noise-free {found.noise_free:.2f} {_interval(found.interval)}'
+            if isfinite(free.value):
+                below = f'noise-free {free.value:.2f} {_interval(free.interval)}'
             tiles.append((f'{label}, {who}', value, below))
     return tiles
 

@@ -6,85 +6,88 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite, nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.bench.ranking.judges import (
-    Agreement,
+from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, in_order
+from mtv_world_ros.bench.ranking.flips import find_flips
+from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result
+from mtv_world_ros.bench.ranking.scores import (
     agreements,
+    false_success,
+    has_verdict,
     judged_by,
     JUDGES,
+    kinds_of,
     REPORTED,
     RULE,
+    Score,
+    scores,
+    true_rate,
 )
-from mtv_world_ros.bench.ranking.optimism import Optimism, Score
-from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result
-from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
-    powered_mean,
-    PoweredMean,
-)
-from mtv_world_ros.lab.evaluation.metrics.statistics import (
-    clustered_wilson,
-    Interval,
-    mean_interval,
-    wilson,
-)
+from mtv_world_ros.lab.evaluation.metrics.policy_agreement import powered_mean, PoweredMean
+from mtv_world_ros.lab.evaluation.metrics.statistics import mean_interval
 
 #: label of all tasks together
 ALL_TASKS = 'all tasks'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rate:
-    """How often a policy succeeded.
+@dataclass(frozen=True)
+class Optimism:
+    """Scores of all judges over a ranking's rollouts and over those of each fault kind.
 
     Attributes:
-        hits: successes; as estimates expect them, their sum.
-        count: rollouts with an outcome or estimate.
-        num_unknown: without.
+        results: one a rollout; some of the policy `expert`.
+        flips: of rollouts whose true outcome is another than the expert's in the same scene, by
+            name: whether the imagined last frame is nearer to what really happened than to what
+            happened under the expert's commands, where objects are in either. Arms do not count:
+            they follow the commands in imagination as well.
     """
 
-    hits: float
-    count: int
-    num_unknown: int = 0
+    results: Sequence[Result]
+    flips: Mapping[str, bool]
 
-    @property
-    def value(self) -> float:
-        """Share of successes among the judged ones; NaN where there is none."""
-        return self.hits / self.count if self.count else nan
+    @classmethod
+    def of(cls, results: Sequence[Result], folder: Path) -> Optimism:
+        """Returns the numbers of results whose last frames lie in a folder."""
+        return cls(results=results, flips=find_flips(results, folder))
 
-    @property
-    def interval(self) -> Interval:
-        """95 % Wilson interval; of estimates, which scatter less than outcomes, a wide one."""
-        return wilson(self.hits, self.count)
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The policies' fault kinds, in the catalogue's order."""
+        return tuple(in_order({kind for result in self.results for kind in kinds_of(result)}))
+
+    def rollouts(self, kind: str | None) -> list[Result]:
+        """Returns the rollouts of policies with a fault kind; None = all rollouts."""
+        return [r for r in self.results if kind is None or kind in kinds_of(r)]
+
+    def scores(self, judge: str, kind: str | None = None) -> dict[str, Score]:
+        """Returns the `MEASURES` of a judge.
+
+        Args:
+            judge: key of `JUDGES`.
+            kind: of the policies' faults; None = all. r, MMRV and AUROC of a kind are over its
+                policies and the expert.
+        """
+        chosen = self.rollouts(kind)
+        compared = [
+            r for r in self.results if kind is None or r.policy == EXPERT or kind in kinds_of(r)
+        ]
+        return scores(chosen, compared, judge, self.flips)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Returns everything as plain values."""
+        groups = {'all': None, **{kind: kind for kind in self.kinds}}
         return {
-            'rate': self.value,
-            'interval': self.interval,
-            'hits': self.hits,
-            'judged': self.count,
-            'unknown': self.num_unknown,
+            group: {
+                'rollouts': len(self.rollouts(kind)),
+                'true_success': true_rate(self.rollouts(kind)).as_json(),
+                **{judge: _plain(self.scores(judge, kind)) for judge in JUDGES},
+            }
+            for group, kind in groups.items()
         }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gain:
-    """How often imagination and the no-picture rule are right; an abstention is half right.
-
-    Attributes:
-        imagined: share of the rollouts.
-        rule: share of the same rollouts.
-        difference: of the two.
-        interval: 95 % t interval of the difference over scenes; NaN where these are too few.
-    """
-
-    imagined: float
-    rule: float
-    difference: float
-    interval: Interval
 
 
 @dataclass(frozen=True)
@@ -120,35 +123,40 @@ class Summary:
         """Returns a policy's results on a task; None = all."""
         return [r for r in self.results if r.policy == policy and task in (None, r.task)]
 
-    def true_rate(self, policy: str, task: str | None) -> Rate:
-        """Returns how often it really succeeded: the task was done at the end."""
+    def true_rate(self, policy: str, task: str | None) -> Score:
+        """Returns how often it succeeded in the simulator: the task was done at the end."""
         found = self.chosen(policy, task)
-        return Rate(hits=sum(result.final for result in found), count=len(found))
+        return Score.rate(sum(result.final for result in found), len(found))
 
-    def judged_rate(self, policy: str, task: str | None, judge: str) -> Rate:
+    def judged_rate(self, policy: str, task: str | None, judge: str) -> Score:
         """Returns how often it succeeds by the estimates, their mean; NaN is counted apart."""
         found = [judged_by(result, judge).probability for result in self.chosen(policy, task)]
         known = [value for value in found if isfinite(value)]
-        return Rate(hits=sum(known), count=len(known), num_unknown=len(found) - len(known))
+        return Score.rate(sum(known), len(known), len(found) - len(known))
 
-    def agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
+    def agreement(self, judge: str, task: str | None) -> dict[str, Score]:
         """Returns r and MMRV of a judge's rates with the simulator's, over the policies."""
+        if (judge, task) not in self._agreements:
+            results = [r for r in self.results if task in (None, r.task)]
+            self._agreements[judge, task] = agreements(results, judge, self.policies)
         return self._agreements[judge, task]
 
     @cached_property
+    def _agreements(self) -> dict[tuple[str, str | None], dict[str, Score]]:
+        return {}
+
+    @cached_property
     def worth(self) -> dict[str, dict[str, Score]]:
-        """What each judge's word is worth, by measure: foreseen motions, pictures, both, ..."""
-        found = Optimism(results=self.results, flips={})
-        return {judge: found.scores(judge) for judge in JUDGES}
+        """Scores of each judge, by measure."""
+        return {judge: scores(self.results, self.results, judge) for judge in JUDGES}
 
     @cached_property
-    def rule_agreement(self) -> dict[str, Agreement]:
-        """Agreement of the no-picture rule's rates, all tasks."""
-        return self._agreement(RULE, None)
+    def gain_over_rule(self) -> tuple[float, float, Score]:
+        """How often imagination and the no-picture rule are right, and the difference by scene.
 
-    @cached_property
-    def gain_over_rule(self) -> Gain:
-        """How much more often imagination is right than the no-picture rule, by scene."""
+        An abstention is half right. The difference has a t interval over scenes, NaN where these
+        are too few.
+        """
         scenes: dict[tuple[str, int], list[tuple[float, float]]] = {}
         for result in self.results:
             pair = _rightness(result, 'imagined'), _rightness(result, RULE)
@@ -157,23 +165,9 @@ class Summary:
         counts = np.array([float(len(pairs)) for pairs in scenes.values()])
         mean, ends = mean_interval(sums[:, None], counts[:, None], low=-1.0, high=1.0)
         shares = np.mean([pair for pairs in scenes.values() for pair in pairs], axis=0)
-        return Gain(
-            imagined=float(shares[0]),
-            rule=float(shares[1]),
-            difference=float(mean[0]),
-            interval=(float(ends[0, 0]), float(ends[1, 0])),
-        )
-
-    @cached_property
-    def _agreements(self) -> dict[tuple[str, str | None], dict[str, Agreement]]:
-        groups = (None, *self.tasks)
-        return {
-            (judge, task): self._agreement(judge, task) for judge in REPORTED for task in groups
-        }
-
-    def _agreement(self, judge: str, task: str | None) -> dict[str, Agreement]:
-        results = [r for r in self.results if task in (None, r.task)]
-        return agreements(results, judge, self.policies)
+        interval = float(ends[0, 0]), float(ends[1, 0])
+        gain = Score(value=float(mean[0]), interval=interval, count=len(self.results))
+        return float(shares[0]), float(shares[1]), gain
 
     def powered(self, policy: str) -> PoweredMean:
         """Returns the success rate from few true outcomes and all imagined ones, all tasks.
@@ -187,10 +181,10 @@ class Summary:
             [float(result.final) for result in true], _expected(true), _expected(more)
         )
 
-    def abstained(self, judge: str) -> Rate:
+    def abstained(self, judge: str) -> Score:
         """Returns how often a judge gave no verdict."""
-        missing = sum(not isfinite(judged_by(r, judge).success) for r in self.results)
-        return Rate(hits=missing, count=len(self.results))
+        missing = sum(not has_verdict(result, judge) for result in self.results)
+        return Score.rate(missing, len(self.results))
 
     def confusion(self, judge: str) -> dict[str, int]:
         """Returns how estimates and true outcomes go together, by `said_true`."""
@@ -203,18 +197,9 @@ class Summary:
                 counts[f'{words[bool(said)]}_{words[result.final]}'] += 1
         return counts
 
-    def false_success_interval(self, judge: str) -> Interval:
-        """Returns the interval of the share of real failures that were called a success.
-
-        Policies that meet the same scene are a cluster.
-        """
-        scenes: dict[tuple[str, int], list[float]] = {}
-        for result in self.results:
-            said = judged_by(result, judge).success
-            if isfinite(said) and not result.final:
-                scenes.setdefault((result.task, result.index), []).append(said)
-        hits = [sum(said) for said in scenes.values()]
-        return clustered_wilson(np.array(hits), np.array([len(s) for s in scenes.values()]))
+    def false_success(self, judge: str) -> Score:
+        """Returns the share of true failures that were called a success."""
+        return false_success(self.results, judge)
 
     def speed(self) -> dict[str, float]:
         """Returns episodes an hour of one process, and seconds an episode by stage."""
@@ -240,18 +225,15 @@ class Summary:
             'policies': {name: self._policy_json(name, groups) for name in self.policies},
             'agreement': {
                 judge: {
-                    label: {k: v.as_json() for k, v in self.agreement(judge, task).items()}
+                    label: _agreement_json(self.agreement(judge, task))
                     for label, task in groups.items()
                 }
                 for judge in REPORTED
             },
-            'abstained': {judge: self.abstained(judge).as_json() for judge in REPORTED},
+            'abstained': {judge: self.abstained(judge).rate_json() for judge in REPORTED},
             'confusion': {judge: self.confusion(judge) for judge in REPORTED},
             'speed': self.speed(),
-            'worth': {
-                judge: {measure: score.as_json() for measure, score in scores.items()}
-                for judge, scores in self.worth.items()
-            },
+            'worth': {judge: _plain(found) for judge, found in self.worth.items()},
             'optimism': {name: found.as_json() for name, found in self.optimism.items()},
             'num_true_for_powered': self.num_true,
             'num_rollouts': len(self.results),
@@ -265,8 +247,8 @@ class Summary:
         return {
             'rates': {
                 label: {
-                    'simulator': self.true_rate(policy, task).as_json(),
-                    **{j: self.judged_rate(policy, task, j).as_json() for j in REPORTED},
+                    'simulator': self.true_rate(policy, task).rate_json(),
+                    **{j: self.judged_rate(policy, task, j).rate_json() for j in REPORTED},
                 }
                 for label, task in groups.items()
             },
@@ -278,6 +260,22 @@ class Summary:
                 'num_more': powered.num_more,
             },
         }
+
+
+def _plain(found: Mapping[str, Score]) -> dict[str, Any]:
+    return {measure: score.as_json() for measure, score in found.items()}
+
+
+def _agreement_json(found: Mapping[str, Score]) -> dict[str, Any]:
+    return {
+        name: {
+            'value': found[name].value,
+            'noise_free': found[f'{name}_noise_free'].value,
+            'interval': found[f'{name}_noise_free'].interval,
+            'num_policies': found[name].count,
+        }
+        for name in ('pearson', 'mmrv')
+    }
 
 
 def _rightness(result: Result, judge: str) -> float:

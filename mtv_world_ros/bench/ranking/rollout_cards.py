@@ -11,7 +11,6 @@ from urllib.parse import quote
 from markupsafe import escape, Markup
 
 from mtv_world_ros.bench.ranking.both_worlds import SHEET, VIDEO
-from mtv_world_ros.bench.ranking.optimism import name_of
 from mtv_world_ros.bench.ranking.rollout_jobs import Course, Judged, Result
 from mtv_world_ros.bench.ranking.run_jobs import FOLDER
 from mtv_world_ros.lab.documents import number
@@ -95,7 +94,7 @@ def _rank(result: Result) -> tuple[float, float, str]:
     said = result.imagined.probability
     off = abs(said - result.final) if isfinite(said) else 0.5
     part = result.course.part_s if result.course else float('nan')
-    return -off, part if isfinite(part) else float('inf'), name_of(result)
+    return -off, part if isfinite(part) else float('inf'), result.name
 
 
 def _word(final: bool) -> str:
@@ -136,7 +135,7 @@ def when_they_part(course: Course) -> list[tuple[float, str]]:
 
 def rollout_file(out: Path, result: Result, suffix: str) -> Path:
     """Returns where a file of a rollout lies in a ranking's folder."""
-    return out / FOLDER / f'{name_of(result)}{suffix}'
+    return out / FOLDER / f'{result.name}{suffix}'
 
 
 def _address(out: Path, result: Result, suffix: str) -> str:

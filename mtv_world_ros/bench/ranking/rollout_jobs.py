@@ -230,6 +230,11 @@ class Result:
     course: Course | None = None
     files: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f'{self.task}_{self.index:05d}_{self.policy}'
+
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""
         return asdict(self)

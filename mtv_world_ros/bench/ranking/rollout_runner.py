@@ -14,8 +14,8 @@ import numpy as np
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.ranking.both_worlds import BothWorlds
+from mtv_world_ros.bench.ranking.flips import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.bench.ranking.optimism import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.bench.ranking.rollout_jobs import Job, Judged, Result
 from mtv_world_ros.bench.ranking.worlds import (
     ImaginedWorld,

@@ -9,18 +9,17 @@ from mtv_world_ros.bench.expert.faults.catalogue import (
     parse_variant,
     policies_of,
 )
-from mtv_world_ros.bench.ranking.flip_sheet import flip_sheet
-from mtv_world_ros.bench.ranking.optimism import (
-    area_interval,
+from mtv_world_ros.bench.ranking.flips import (
     find_flips,
+    flip_sheet,
     is_nearer,
     last_frames_png,
-    name_of,
     objects_png,
-    Optimism,
     read_last_frames,
 )
-from mtv_world_ros.bench.ranking.optimism_tables import optimism_tables
+from mtv_world_ros.bench.ranking.ranking_report import optimism_tables
+from mtv_world_ros.bench.ranking.ranking_summary import Optimism
+from mtv_world_ros.bench.ranking.scores import area_interval
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
 
 
@@ -43,7 +42,7 @@ def optimism(make_result):
             make_result('expert-high-0.03', index, False, 0.8, rule=index < 2),
             make_result('expert-elsewhere-0.1', index, False, nan if index < 4 else 0.1),
         ]
-    flips = {name_of(r): r.policy == 'expert-elsewhere-0.1' for r in results if not r.final}
+    flips = {r.name: r.policy == 'expert-elsewhere-0.1' for r in results if not r.final}
     return Optimism(results=results, flips=flips)
 
 
@@ -140,9 +139,9 @@ def test_a_flip_is_right_where_the_end_is_nearer_to_what_really_happened(tmp_pat
     results = [make_result(p, 0, p in ('expert', 'expert-turn-1'), 0.9) for p in ends]
     for result in results[:-1]:  # the last one has no picture
         png = last_frames_png(*ends[result.policy])
-        (tmp_path / f'{name_of(result)}.png').write_bytes(png)
+        (tmp_path / f'{result.name}.png').write_bytes(png)
         shown = objects_png((ends[result.policy][0] == 255).all(-1)[:, None])
-        (tmp_path / f'{name_of(result)}.objects.png').write_bytes(shown)
+        (tmp_path / f'{result.name}.objects.png').write_bytes(shown)
     assert find_flips(results, tmp_path) == {
         'stack_blocks_two_00000_expert-high-0.03': False,
         'stack_blocks_two_00000_expert-late-0.6': True,

@@ -5,7 +5,6 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.bench.ranking.judges import JUDGES
 from mtv_world_ros.bench.ranking.ranking_report import (
     console,
     markdown,
@@ -15,6 +14,7 @@ from mtv_world_ros.bench.ranking.ranking_report import (
 )
 from mtv_world_ros.bench.ranking.ranking_summary import Summary
 from mtv_world_ros.bench.ranking.rollout_jobs import Job, Judged, Result
+from mtv_world_ros.bench.ranking.scores import JUDGES
 
 #: (policy, true outcomes, imagined probabilities) of four episodes
 POLICIES = (
@@ -53,9 +53,9 @@ def test_agreement_is_that_of_the_rates(summary):
     # rates judged .75, .4, .35 against true 1, .5, 0: by hand .2 / sqrt(.095 * .5)
     found = summary.agreement('imagined', None)
     assert found['pearson'].value == pytest.approx(0.9177, abs=1e-4)
-    assert found['mmrv'].value == 0.0 and found['mmrv'].num_policies == 3
-    low, high = found['pearson'].interval
-    assert low <= found['pearson'].noise_free <= high
+    assert found['mmrv'].value == 0.0 and found['mmrv'].count == 3
+    low, high = found['pearson_noise_free'].interval
+    assert low <= found['pearson_noise_free'].value <= high
     assert summary.agreement('seen', None)['pearson'].value == pytest.approx(1.0)
 
 
