@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -280,7 +281,7 @@ class Grasp:
         return size[0] if self.rim_m is None else self.rim_m
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Shape:
     """A kind of object.
 
@@ -313,112 +314,42 @@ class Shape:
         return (x, y, z)
 
 
-_ACROSS_Y = np.pi  # longer along y: turned by a quarter it would not fit between the fingers
+_RIM = Grasp(height=0.8, rim_m=RIM_M, opening=0.6)
+#: longer along y: turned by a quarter it would not fit between the fingers
+_LONG: dict[str, Any] = {'step': np.pi}
+_HELD_BY_ITS_RIM: dict[str, Any] = {'grasp': _RIM, 'hollow': True}
+_NEVER_MOVED: dict[str, Any] = {'grasp': None, 'hollow': True}
 
 
 def _round(diameter: float, height: float) -> Size:
     return (diameter, diameter, height)
 
 
-_RIM = Grasp(height=0.8, rim_m=RIM_M, opening=0.6)
-
 SHAPES = {
-    'block': Shape(geoms=block, smallest=(0.04, 0.04, 0.04), largest=(0.055, 0.055, 0.055)),
-    'plate': Shape(
-        geoms=plate,
-        smallest=_round(0.104, 0.02),
-        largest=_round(0.114, 0.02),
-        grasp=_RIM,
-        hollow=True,
-    ),
-    'bowl': Shape(
-        geoms=plate,
-        smallest=_round(0.07, 0.034),
-        largest=_round(0.08, 0.038),
-        grasp=_RIM,
-        hollow=True,
-    ),
-    'cup': Shape(
-        geoms=cup,
-        smallest=_round(0.046, 0.055),
-        largest=_round(0.053, 0.065),
-        grasp=Grasp(height=0.55),
-    ),
-    'bread': Shape(
-        geoms=bread,
-        smallest=(0.036, 0.052, 0.03),
-        largest=(0.042, 0.06, 0.035),
-        step=_ACROSS_Y,
-    ),
+    'block': Shape(block, (0.04, 0.04, 0.04), (0.055, 0.055, 0.055)),
+    'plate': Shape(plate, _round(0.104, 0.02), _round(0.114, 0.02), **_HELD_BY_ITS_RIM),
+    'bowl': Shape(plate, _round(0.07, 0.034), _round(0.08, 0.038), **_HELD_BY_ITS_RIM),
+    'cup': Shape(cup, _round(0.046, 0.055), _round(0.053, 0.065), grasp=Grasp(height=0.55)),
+    'bread': Shape(bread, (0.036, 0.052, 0.03), (0.042, 0.06, 0.035), **_LONG),
     'carrot': Shape(
-        geoms=carrot,
-        smallest=(0.03, 0.06, 0.03),
-        largest=(0.034, 0.068, 0.034),
-        colours=('orange',),
-        step=_ACROSS_Y,
+        carrot, (0.03, 0.06, 0.03), (0.034, 0.068, 0.034), colours=('orange',), **_LONG
     ),
     'eggplant': Shape(
-        geoms=eggplant,
-        smallest=(0.034, 0.056, 0.034),
-        largest=(0.04, 0.064, 0.04),
-        colours=('purple',),
-        step=_ACROSS_Y,
+        eggplant, (0.034, 0.056, 0.034), (0.04, 0.064, 0.04), colours=('purple',), **_LONG
     ),
-    'corn': Shape(
-        geoms=corn,
-        smallest=(0.032, 0.06, 0.032),
-        largest=(0.036, 0.066, 0.036),
-        colours=('yellow',),
-        step=_ACROSS_Y,
-    ),
-    'car': Shape(
-        geoms=car,
-        smallest=(0.034, 0.056, 0.036),
-        largest=(0.038, 0.062, 0.04),
-        step=_ACROSS_Y,
-    ),
+    'corn': Shape(corn, (0.032, 0.06, 0.032), (0.036, 0.066, 0.036), colours=('yellow',), **_LONG),
+    'car': Shape(car, (0.034, 0.056, 0.036), (0.038, 0.062, 0.04), **_LONG),
     'duck': Shape(
-        geoms=duck,
-        smallest=(0.034, 0.05, 0.046),
-        largest=(0.038, 0.056, 0.052),
-        grasp=Grasp(height=0.35),
-        step=_ACROSS_Y,
+        duck, (0.034, 0.05, 0.046), (0.038, 0.056, 0.052), grasp=Grasp(height=0.35), **_LONG
     ),
-    'bottle': Shape(
-        geoms=bottle,
-        smallest=_round(0.044, 0.1),
-        largest=_round(0.05, 0.112),
-        grasp=Grasp(height=0.6),
-    ),
-    'tray': Shape(
-        geoms=container,
-        smallest=(0.17, 0.125, 0.014),
-        largest=(0.18, 0.135, 0.016),
-        grasp=None,
-        hollow=True,
-    ),
-    'basket': Shape(
-        geoms=container,
-        smallest=(0.148, 0.12, 0.042),
-        largest=(0.154, 0.128, 0.048),
-        grasp=None,
-        hollow=True,
-    ),
-    'bin': Shape(
-        geoms=container,
-        smallest=(0.155, 0.13, 0.048),
-        largest=(0.162, 0.138, 0.054),
-        grasp=None,
-        hollow=True,
-    ),
+    'bottle': Shape(bottle, _round(0.044, 0.1), _round(0.05, 0.112), grasp=Grasp(height=0.6)),
+    'tray': Shape(container, (0.17, 0.125, 0.014), (0.18, 0.135, 0.016), **_NEVER_MOVED),
+    'basket': Shape(container, (0.148, 0.12, 0.042), (0.154, 0.128, 0.048), **_NEVER_MOVED),
+    'bin': Shape(container, (0.155, 0.13, 0.048), (0.162, 0.138, 0.054), **_NEVER_MOVED),
     # these the tasks of the benchmark never use: they are for the zero-shot sets
-    'can': Shape(geoms=can, smallest=_round(0.042, 0.05), largest=_round(0.048, 0.06)),
+    'can': Shape(can, _round(0.042, 0.05), _round(0.048, 0.06)),
     'house': Shape(
-        geoms=house,
-        smallest=(0.036, 0.046, 0.048),
-        largest=(0.042, 0.054, 0.056),
-        grasp=Grasp(height=0.4),
-        step=_ACROSS_Y,
+        house, (0.036, 0.046, 0.048), (0.042, 0.054, 0.056), grasp=Grasp(height=0.4), **_LONG
     ),
 }
 

@@ -17,7 +17,7 @@ FINGER_WIDTH_M, FINGER_THICKNESS_M = 0.015, 0.01
 _LIGHT, _MID, _DARK = '0.62 0.62 0.63 1', '0.36 0.36 0.38 1', '0.16 0.16 0.17 1'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Link:
     """One moving body of the arm: frame in its parent, joint, mass and drawn/colliding geoms."""
 
@@ -43,79 +43,28 @@ def _box(center: str, half_sizes: str, rgba: str) -> str:
     return f'type="box" pos="{center}" size="{half_sizes}" rgba="{rgba}"'
 
 
+#: kp [N m/rad], kv [N m s/rad] and largest torque [N m] of the joints
+_SHOULDER, _ELBOW, _WRIST = (40, 2.5, 28), (20, 1.0, 10), (10, 0.5, 10)
+
 #: links 1-6, wxyz quaternions as published (not normalised); the first geom carries the mass
 LINKS = (
-    Link(
-        position='0 0 0.0631',
-        quaternion='1 0 0 1',
-        joint_range=(-2.61799, 3.05433),
-        mass=0.124,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(_cylinder('0 0 -0.02', '0 0 0.03', 0.036, _DARK),),
-    ),
-    Link(
-        position='0.000025 -0.02 0.0409',
-        quaternion='1 1 1 1',
-        joint_range=(0, 3.66519),
-        mass=1.244,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(
-            _capsule('0.02 0 0', '0.24 0 0', 0.032, _LIGHT),
-            _cylinder('0 0 -0.04', '0 0 0.04', 0.036, _DARK),
-            _cylinder('0.264 0 -0.04', '0.264 0 0.04', 0.034, _DARK),
-        ),
-    ),
-    Link(
-        position='0.264 0 0',
-        quaternion='0 1 0 0',
-        joint_range=(0, 3.66519),
-        mass=0.854,
-        kp=40,
-        kv=2.5,
-        max_torque=28,
-        geoms=(
-            _capsule('-0.26 -0.06 0', '-0.02 -0.06 0', 0.034, _LIGHT),
-            _capsule('0 0 0', '-0.03 -0.06 0', 0.03, _MID),
-        ),
-    ),
-    Link(
-        position='-0.245 -0.06 0',
-        quaternion='1 0 0 0',
-        joint_range=(-1.5708, 1.5708),
-        mass=0.464,
-        kp=20,
-        kv=1.0,
-        max_torque=10,
-        geoms=(_capsule('0 0 0', '-0.074 -0.0395 0', 0.029, _MID),),
-    ),
-    Link(
-        position='-0.074 -0.0395 0.000025',
-        quaternion='1 -1 1 1',
-        joint_range=(-1.5708, 1.5708),
-        mass=0.351,
-        kp=20,
-        kv=1.0,
-        max_torque=10,
-        geoms=(_capsule('0 0 0', '0 0.0353 0.0395', 0.028, _DARK),),
-    ),
-    Link(
-        position='0 0.0353 0.0395',
-        quaternion='1 -1 0 0',
-        joint_range=(-2.0944, 2.0944),
-        mass=0.367,
-        kp=10,
-        kv=0.5,
-        max_torque=10,
-        geoms=(
-            _cylinder('0 0 0', '0 0 0.05', 0.03, _MID),
-            _box('0 0 0.06', '0.05 0.02 0.014', _DARK),
-        ),
-    ),
-)
+    Link('0 0 0.0631', '1 0 0 1', (-2.61799, 3.05433), 0.124, *_SHOULDER,
+         geoms=(_cylinder('0 0 -0.02', '0 0 0.03', 0.036, _DARK),)),
+    Link('0.000025 -0.02 0.0409', '1 1 1 1', (0, 3.66519), 1.244, *_SHOULDER,
+         geoms=(_capsule('0.02 0 0', '0.24 0 0', 0.032, _LIGHT),
+                _cylinder('0 0 -0.04', '0 0 0.04', 0.036, _DARK),
+                _cylinder('0.264 0 -0.04', '0.264 0 0.04', 0.034, _DARK))),
+    Link('0.264 0 0', '0 1 0 0', (0, 3.66519), 0.854, *_SHOULDER,
+         geoms=(_capsule('-0.26 -0.06 0', '-0.02 -0.06 0', 0.034, _LIGHT),
+                _capsule('0 0 0', '-0.03 -0.06 0', 0.03, _MID))),
+    Link('-0.245 -0.06 0', '1 0 0 0', (-1.5708, 1.5708), 0.464, *_ELBOW,
+         geoms=(_capsule('0 0 0', '-0.074 -0.0395 0', 0.029, _MID),)),
+    Link('-0.074 -0.0395 0.000025', '1 -1 1 1', (-1.5708, 1.5708), 0.351, *_ELBOW,
+         geoms=(_capsule('0 0 0', '0 0.0353 0.0395', 0.028, _DARK),)),
+    Link('0 0.0353 0.0395', '1 -1 0 0', (-2.0944, 2.0944), 0.367, *_WRIST,
+         geoms=(_cylinder('0 0 0', '0 0 0.05', 0.03, _MID),
+                _box('0 0 0.06', '0.05 0.02 0.014', _DARK))),
+)  # fmt: skip
 FINGER_MASS, FINGER_KP, FINGER_KV, FINGER_FORCE = 0.118, 100.0, 10.0, 20.0
 _FINGER_RANGE = (-0.00205, 0.037524)
 _FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0605)}
