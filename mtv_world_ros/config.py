@@ -56,10 +56,22 @@ def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidato
 
 #: a YAML list
 ListOf = Annotated[tuple[Item, ...], Strict(False)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+#: [s]; more than a day is a mistake of the unit
+Seconds = Annotated[float, Field(gt=0, le=86_400)]
+#: a duration that may be none [s]
+Wait = Annotated[float, Field(ge=0, le=86_400)]
+#: [m]; what is larger stands in no room
+Length = Annotated[float, Field(gt=0, le=100)]
+#: by which something is larger or stronger than usual
+Factor = Annotated[float, Field(gt=0, le=1000)]
+#: of statistics and of what robots count in: encoder ticks, degrees, percent
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+#: a part of a rotation
+Quaternion = Annotated[float, Field(ge=-1000, le=1000)]
 Count = Annotated[int, Field(ge=1)]
-Pair = Annotated[tuple[float, float], Strict(False), expected('a list of 2 numbers')]
+Pair = Annotated[
+    tuple[Number, Number], Strict(False), expected('a list of 2 numbers of at most 1e6 either way')
+]
 #: [m]; what is further away is a mistake of the unit, or worse
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import ToolTargets
 
@@ -78,8 +78,8 @@ class BagMapping(Schema):
     task: str = ''
     outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
     objects: ListOf[str] = ()
-    chunk_s: Positive = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Positive = Field(
+    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
+    limit_tolerance: Length = Field(
         default=0.05, description='positions further outside the limits fail [rad or m]'
     )
     jpeg_quality: int = Field(default=95, ge=1, le=100)

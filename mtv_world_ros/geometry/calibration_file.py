@@ -10,7 +10,17 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict
 import yaml
 
-from mtv_world_ros.config import expected, ListOf, Metres, read_yaml, Schema, validated, wrong
+from mtv_world_ros.config import (
+    expected,
+    ListOf,
+    Metres,
+    Number,
+    Quaternion,
+    read_yaml,
+    Schema,
+    validated,
+    wrong,
+)
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.files import write_whole
@@ -65,11 +75,11 @@ class _View(Schema):
     height: _Pixels
     K: Annotated[Any, AfterValidator(_intrinsics)]
     distortion_model: str = 'none'
-    distortion: ListOf[float] = ()
+    distortion: ListOf[Number] = ()
     mount_link: str
     T_mount_camera: Annotated[Any, AfterValidator(_rigid)] = None
     position: ListOf[Metres] = ()
-    quaternion_xyzw: ListOf[float] = ()
+    quaternion_xyzw: ListOf[Quaternion] = ()
 
     def camera(self, view: str) -> CameraModel:
         """Returns the camera.

@@ -14,7 +14,7 @@ from safetensors import safe_open, SafetensorError
 from torch import nn, Tensor
 
 from mtv_world_ros.bounded_input import check_finite, parse_json, read_json
-from mtv_world_ros.config import Count, Schema, validated
+from mtv_world_ros.config import Count, Number, Schema, validated
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
 from mtv_world_ros.model.wan_keys import transformer_keys
@@ -77,9 +77,9 @@ class LoraSettings(Schema):
     """
 
     r: Count
-    lora_alpha: float | None = None
+    lora_alpha: Number | None = None
     rank_pattern: dict[str, Count] = Field(default_factory=dict)
-    alpha_pattern: dict[str, float] = Field(default_factory=dict)
+    alpha_pattern: dict[str, Number] = Field(default_factory=dict)
     use_rslora: bool = False
 
     def scale(self, module: str, rank: int) -> float:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from mtv_world_ros.bounded_input import limits
-from mtv_world_ros.config import Count, Positive, Schema
+from mtv_world_ros.config import Count, Schema, Seconds
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import ServerMapping
@@ -41,8 +41,8 @@ class LeRobotConfig(ServerMapping):
 
     kind: Literal['lerobot'] = 'lerobot'
     server: str = Field(description='e.g. `localhost:8080`')
-    timeout_s: Positive = Field(default=60.0, description='longest wait for an answer [s]')
-    setup_timeout_s: Positive = Field(
+    timeout_s: Seconds = Field(default=60.0, description='longest wait for an answer [s]')
+    setup_timeout_s: Seconds = Field(
         default=600.0, description='longest wait until the server has loaded the policy [s]'
     )
     tls: bool = Field(

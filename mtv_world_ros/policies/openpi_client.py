@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from mtv_world_ros.bounded_input import limits
-from mtv_world_ros.config import Positive
+from mtv_world_ros.config import Seconds
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, masked, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
@@ -39,7 +39,7 @@ class OpenPiConfig(ServerMapping):
     api_key_variable: str = Field(
         default='', description='environment variable with the API key; empty = none is needed'
     )
-    timeout_s: Positive = Field(
+    timeout_s: Seconds = Field(
         default=60.0, description='longest wait for the connection, and for an answer [s]'
     )
     prompt: Annotated[Key | None, BeforeValidator(lambda value: value or None)] = Field(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from mtv_world_ros.config import read_yaml, Schema, validated
+from mtv_world_ros.config import read_yaml, Schema, validated, Wait
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
@@ -24,7 +24,7 @@ class ScriptedPolicySettings(Schema):
     variant: str = Field(
         default='expert', description='e.g. `expert` or, with faults, `expert-noise-0.02`'
     )
-    hold_s: float = Field(
+    hold_s: Wait = Field(
         default=0.6, description='from the end of its plan to the end of the episode [s]'
     )
 
@@ -33,8 +33,8 @@ class RecordedPolicySettings(Schema):
     """What was commanded in the episode that an imagined one begins from."""
 
     kind: Literal['recorded'] = 'recorded'
-    hold_s: float = Field(
-        default=0.6, ge=0, description='from the last command to the end of the episode [s]'
+    hold_s: Wait = Field(
+        default=0.6, description='from the last command to the end of the episode [s]'
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, LimitError
-from mtv_world_ros.config import expected, ListOf, Positive, Schema
+from mtv_world_ros.config import expected, ListOf, Schema
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.geometry.robot.joint_columns import (
@@ -98,8 +98,10 @@ class ActionOutput(JointTable):
 
     key: Key = Field(default=('actions',), description='where the actions (T, C) are')
     names: ListOf[str] = Field(default=(), description='of its columns; empty = they have none')
-    rate_hz: Positive = Field(
-        description='actions a second; action k is where the joints are (k + 1) / rate_hz later'
+    rate_hz: float = Field(
+        gt=0,
+        le=10_000,
+        description='actions a second; action k is where the joints are (k + 1) / rate_hz later',
     )
     relative: bool = Field(default=False, description='positions count from the observed ones')
     clip: bool = Field(

@@ -51,7 +51,7 @@ _SHIFT = 4
 #: pieces that end further than this many image sizes away are not drawn
 _FARTHEST = 4.0
 
-_Length = Annotated[float, Field(gt=0), expected('positive and finite')]
+_Length = Annotated[float, Field(gt=0, le=1000), expected('positive and at most 1000')]
 
 
 class TrajectoryVideoConfig(Schema):

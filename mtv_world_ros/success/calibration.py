@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import json
-from math import exp, isfinite, nan
+from math import exp, isfinite, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, model_validator, WrapValidator
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.config import ListOf, Model, Positive, Schema
+from mtv_world_ros.config import ListOf, Model, Number, Schema, Seconds
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.files import write_whole
@@ -23,8 +23,13 @@ HORIZON = 'horizon.json'
 #: that never moves needs no grasp, which is no sign of success.
 DOUBTS = frozenset({'grasp', 'carry'})
 
-#: NaN = not known
-_Known = Annotated[float, Field(allow_inf_nan=True)]
+
+def _or_nan(value: Any, validate: Any) -> float:
+    return value if isinstance(value, float) and isnan(value) else validate(value)
+
+
+#: of Jaccard indices; NaN = not known
+_Known = Annotated[float, Field(ge=-1, le=1), WrapValidator(_or_nan)]
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
@@ -51,10 +56,10 @@ class Weights(Schema):
     """
 
     features: ListOf[str]
-    means: ListOf[float]
-    scales: ListOf[float]
-    weights: ListOf[float]
-    bias: float
+    means: ListOf[Number]
+    scales: ListOf[Number]
+    weights: ListOf[Number]
+    bias: Number
 
     @model_validator(mode='after')
     def _are_equally_many(self) -> Self:
@@ -101,7 +106,7 @@ class Calibration(Weights):
     tasks: ListOf[str]
     num_episodes: int
     num_seeds: int = 1
-    l2: float = 1.0
+    l2: Number = 1.0
     scores: Mapping[str, Mapping[str, Any]] = {}
     made: Mapping[str, str] = {}
     fitted_to: FittedTo | None = None
@@ -165,7 +170,7 @@ class HorizonCurve(Schema):
         made: command, date, machine.
     """
 
-    period_s: Positive
+    period_s: Seconds
     values: ListOf[_Known]
     lower: ListOf[_Known]
     segmenter: str

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from mtv_world_ros.config import ListOf, Schema
+from mtv_world_ros.config import ListOf, Metres, Number, Schema
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.robot.model import RobotModel
 
@@ -34,8 +34,8 @@ class CameraRange(Schema):
     """
 
     mount_link: str
-    low: ListOf[float]
-    high: ListOf[float]
+    low: ListOf[Number]
+    high: ListOf[Number]
 
     @model_validator(mode='after')
     def _are_whole(self) -> Self:
@@ -72,7 +72,7 @@ class Setting(Schema):
 
     foresight: str = ''
     robot: str
-    tools: ListOf[ListOf[float]]
+    tools: ListOf[ListOf[Metres]]
 
     @classmethod
     def of(cls, robot: RobotModel, foresight: str = '') -> Setting:

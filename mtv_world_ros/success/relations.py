@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
+from pydantic import BeforeValidator, Field, InstanceOf, Strict
 
-from mtv_world_ros.config import expected, Schema, wrong
+from mtv_world_ros.config import expected, Schema
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.situation import Situation
@@ -61,17 +61,11 @@ def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.norm((np.asarray(a) - np.asarray(b))[..., :2], axis=-1)
 
 
-def _share(value: float) -> float:
-    if not 0 < value <= 1:
-        raise wrong('(0, 1]', '; it must be in')
-    return value
-
-
 #: stands between a wrong value and what is valid
 EXPECTED = '; expected'
 _Positive = Annotated[float, Field(gt=0, lt=1e3)]
 _Signed = Annotated[float, Field(gt=-1e3, lt=1e3)]
-_Share = Annotated[float, AfterValidator(_share)]
+_Share = Annotated[float, Field(gt=0, le=1), expected('(0, 1]', '; it must be in')]
 _Angle = Annotated[_Positive, expected('a positive angle in radians', EXPECTED)]
 Length = Annotated[_Positive, expected('1 positive length(s) in metres', EXPECTED)]
 _Lengths2 = Annotated[

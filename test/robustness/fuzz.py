@@ -37,6 +37,10 @@ MOST_BYTES = 2 * 2**30
 MOST_SILENT_S = 150 * MOST_S
 #: rows are kept this often [s]
 SAVE_S = 5.0
+#: in place of a case: not even what is whole was read
+NOT_STARTED = 'start'
+#: how processes are made
+START = 'spawn'
 
 
 class Outcome(NamedTuple):
@@ -81,9 +85,8 @@ def make_case(kind: Kind, samples: list[Any], seed: int, case: int) -> Any:
 
 
 def warm_up(kind: Kind, samples: list[Any], folder: Path) -> None:
-    """Lets the reader import what it needs, which is not its time."""
-    with suppress(MtvWorldError):
-        kind.read(samples[0], folder)
+    """Lets the reader import what it needs, which is not its time; what is whole must be read."""
+    kind.read(samples[0], folder)
     with suppress(Exception):
         kind.read(make_case(kind, samples, 0, 0), folder)
 
@@ -91,10 +94,14 @@ def warm_up(kind: Kind, samples: list[Any], folder: Path) -> None:
 def _run(name: str, seed: int, cases: Iterable[int], results: Any) -> None:
     """Tries the cases of a kind; puts (case, outcome) into the queue, at last None."""
     kind = KINDS[name]
-    samples = kind.samples()
     silence()
     with tempfile.TemporaryDirectory() as folder:
-        warm_up(kind, samples, Path(folder))
+        try:
+            samples = kind.samples()
+            warm_up(kind, samples, Path(folder))
+        except BaseException:
+            results.put((NOT_STARTED, Outcome(traceback.format_exc(), 0.0, 0.0)))
+            return
         base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         used = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES, used + MOST_BYTES))
@@ -132,7 +139,8 @@ def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: N
         cases: numbers.
         save: called now and then.
     """
-    spawn = multiprocessing.get_context('spawn')
+    row['failures'].pop(NOT_STARTED, None)
+    spawn = multiprocessing.get_context(START)
     while cases:
         results = spawn.Queue()
         words = (row['kind'], row['seed'], cases, results)
@@ -143,16 +151,18 @@ def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: N
         process.join()
         if last is None:
             break
-        row['failures'][str(last)] = 'the process hung or died'
+        row['failures'].setdefault(str(last), 'the process hung or died')
+        if last == NOT_STARTED:
+            break  # nor would it be for the next case
         row['tried'] += 1
-        cases = range(last + 1, cases.stop)
+        cases = range(int(last) + 1, cases.stop)
 
 
 def _collect(
     row: dict[str, Any], process: Any, results: Any, save: Callable[[], None]
-) -> int | None:
+) -> int | str | None:
     """Adds outcomes to the row; the case with which the process died or hung, or None."""
-    current = row['tried']
+    current: int | str = NOT_STARTED
     saved = begin = time.monotonic()
     silent_s = 0.0
     while True:
@@ -176,8 +186,8 @@ def _collect(
             save()
 
 
-def _add(row: dict[str, Any], case: int, outcome: Outcome) -> None:
-    row['tried'] += 1
+def _add(row: dict[str, Any], case: int | str, outcome: Outcome) -> None:
+    row['tried'] += case != NOT_STARTED
     row['worst_s'] = max(row['worst_s'], outcome.seconds)
     row['worst_mb'] = max(row['worst_mb'], outcome.megabytes)
     if outcome.name in ('rejected', 'survived'):

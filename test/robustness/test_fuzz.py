@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import resource
 
 from accidents import ACCIDENTS
 from file_kinds import Kind, KINDS
 import fuzz
 import pytest
+
+from mtv_world_ros.errors import MtvWorldError
 
 SEED = 20261122
 COUNT = 40
@@ -48,3 +51,26 @@ def test_an_error_that_is_not_ours_and_a_slow_case_are_failures(tmp_path) -> Non
     assert 'KeyError' in fuzz.attempt(kind, b'x', tmp_path)[0]
     slow = Kind(lambda: [b'x'], lambda data, folder: sum(range(10**6)), most_s=0.0)
     assert 'took' in fuzz.attempt(slow, b'x', tmp_path)[0]
+
+
+def _die(data, folder):
+    os._exit(3)
+
+
+def _refuse(data, folder):
+    raise MtvWorldError('not this one')
+
+
+@pytest.mark.parametrize(
+    ('read', 'says'), [(_refuse, 'not this one'), (_die, 'the process hung or died')]
+)
+def test_a_kind_whose_whole_sample_is_not_read_fails_at_once(read, says, monkeypatch) -> None:
+    kind = Kind(lambda: [b'x'], read)
+    monkeypatch.setitem(fuzz.KINDS, 'broken', kind)
+    # children that are forked know the kind
+    monkeypatch.setattr(fuzz, 'START', 'fork')
+    row = fuzz.new_row('broken', SEED)
+    fuzz.fuzz(row, range(50))
+    assert row['tried'] == 0
+    (text,) = row['failures'].values()
+    assert says in text

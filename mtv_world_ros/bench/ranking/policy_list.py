@@ -16,7 +16,7 @@ from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import tasks_named
-from mtv_world_ros.config import expected, ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import ConfigError, MtvWorldError, PolicyError, PolicyServerError
 from mtv_world_ros.files import bundled
@@ -57,7 +57,7 @@ class PolicyEntry(Schema):
         default=(),
         description='program and arguments that start the server; `{port}` is a free port',
     )
-    start_timeout_s: Positive = Field(
+    start_timeout_s: Seconds = Field(
         default=120.0, description='longest wait until the server listens [s]'
     )
     tasks: ListOf[str] = Field(

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from mtv_world_ros.bench.world.actuator import Actuator
 from mtv_world_ros.bench.world.workcell import Workcell
-from mtv_world_ros.config import Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Factor, read_yaml, Schema, validated, Wait
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.files import share_path
@@ -25,24 +25,22 @@ _PAD_PRIORITY = 1
 #: draws which way each joint's zero is off; of an episode's pictures and cameras its seed does
 _ZERO_SEED, _SPAWN_KEY = 17, 8
 
-_NotNegative = Annotated[float, Field(ge=0)]
+_Degrees = Annotated[float, Field(ge=0, le=180)]
 
 
 class Physics(Schema):
     """One entry of `config/physics.yaml`: how the truth differs from the nominal one."""
 
     text: str = Field(description='what is different, in words')
-    table_friction: Positive = Field(default=1.0, description='factor, of all but finger pads')
-    grip_friction: Positive = Field(default=1.0, description='factor, of finger pads')
-    object_mass: Positive = Field(default=1.0, description='factor')
-    gripper_force: Positive = Field(
-        default=1.0, description="factor, of grippers' gains and limits"
-    )
-    contact_time: Annotated[float, Field(ge=1)] = Field(
+    table_friction: Factor = Field(default=1.0, description='factor, of all but finger pads')
+    grip_friction: Factor = Field(default=1.0, description='factor, of finger pads')
+    object_mass: Factor = Field(default=1.0, description='factor')
+    gripper_force: Factor = Field(default=1.0, description="factor, of grippers' gains and limits")
+    contact_time: Annotated[float, Field(ge=1, le=1000)] = Field(
         default=1.0, description='factor of the time constant of contacts'
     )
-    delay_s: _NotNegative = Field(default=0.0, description='commands reach the joints so late [s]')
-    joint_zero_deg: _NotNegative = Field(
+    delay_s: Wait = Field(default=0.0, description='commands reach the joints so late [s]')
+    joint_zero_deg: _Degrees = Field(
         default=0.0,
         description='each turning joint but grippers is off by this, either way [degrees]',
     )
@@ -50,13 +48,15 @@ class Physics(Schema):
         default=0.0, description='height of the table [m]'
     )
     object_size: Annotated[float, Field(ge=0.7, le=1.2)] = Field(default=1.0, description='factor')
-    camera_m: _NotNegative = Field(
-        default=0.0, description='told place of each camera is off by [m]'
+    camera_m: float = Field(
+        default=0.0, ge=0, le=100, description='told place of each camera is off by [m]'
     )
-    camera_deg: _NotNegative = Field(default=0.0, description='told direction is off by [degrees]')
-    blur_px: _NotNegative = Field(default=0.0, description='standard deviation of the blur [px]')
-    noise: _NotNegative = Field(
-        default=0.0, description='standard deviation of the noise [grey levels]'
+    camera_deg: _Degrees = Field(default=0.0, description='told direction is off by [degrees]')
+    blur_px: float = Field(
+        default=0.0, ge=0, le=1000, description='standard deviation of the blur [px]'
+    )
+    noise: float = Field(
+        default=0.0, ge=0, le=255, description='standard deviation of the noise [grey levels]'
     )
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = Field(
         default=None, description='pictures are compressed; none = they are not'

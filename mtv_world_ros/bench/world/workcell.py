@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
 from mtv_world_ros.bench.world.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
-from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.model import RobotModel
 
-Number = int | float
+Number = Annotated[int | float, Field(ge=-1000, le=1000)]
 Vector = ListOf[Number]
 
 
@@ -53,18 +54,18 @@ class CameraEntry(Schema):
 class PlacementEntry(Schema):
     """See `PlacementConfig`."""
 
-    clearance: Positive
-    reach: Positive
-    reach_above: Positive
-    max_x: Positive
+    clearance: Length
+    reach: Length
+    reach_above: Length
+    max_x: Length
 
 
 class WorkcellFile(Schema):
     """A workcell file; its name is the robot's."""
 
     arms: Mapping[str, ArmEntry]
-    finger_width_m: Positive
-    finger_thickness_m: Positive
+    finger_width_m: Length
+    finger_thickness_m: Length
     placement: PlacementEntry
     cameras: ListOf[CameraEntry]
 

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 import yaml
 
 from mtv_world_ros.bounded_input import read_text
-from mtv_world_ros.config import ListOf, Metres, read_yaml, Schema, validated
+from mtv_world_ros.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
@@ -35,7 +35,7 @@ class PoseEntry(Schema):
     """A pose, by default the identity."""
 
     position: ListOf[Metres] = Field(default=(0, 0, 0), description='x, y, z [m]')
-    quaternion_xyzw: ListOf[float] = (0, 0, 0, 1)
+    quaternion_xyzw: ListOf[Quaternion] = (0, 0, 0, 1)
 
     @model_validator(mode='after')
     def _is_a_pose(self) -> Self:

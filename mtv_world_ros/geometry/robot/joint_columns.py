@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, PrivateAttr, ValidationInfo
 
-from mtv_world_ros.config import expected, Pair, Schema
+from mtv_world_ros.config import expected, Number, Pair, Schema
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.robot.model import RobotModel
@@ -42,13 +42,13 @@ class ColumnEntry(Schema):
 
     column: Annotated[int | str | None, expected('a name or a number')] = None
     unit: Unit | None = Field(default=None, description="null = that of the joints' table")
-    sign: float = Field(default=1, description='1 or -1')
-    offset: float = Field(default=0.0, description='added last [rad or m]')
-    closed: float | None = Field(default=None, description="a gripper's value in the dataset")
-    open: float | None = Field(default=None, description="a gripper's value in the dataset")
+    sign: float = Field(default=1, ge=-1, le=1, description='1 or -1')
+    offset: Number = Field(default=0.0, description='added last [rad or m]')
+    closed: Number | None = Field(default=None, description="a gripper's value in the dataset")
+    open: Number | None = Field(default=None, description="a gripper's value in the dataset")
     from_: Pair | None = Field(default=None, alias='from', description='values in the dataset')
     to: Pair | None = Field(default=None, description='what `from` means [rad or m]')
-    constant: float | None = Field(default=None, description='instead of a column [rad or m]')
+    constant: Number | None = Field(default=None, description='instead of a column [rad or m]')
 
     @model_validator(mode='after')
     def _keys_go_together(self) -> Self:

@@ -16,7 +16,7 @@ from pydantic import (
     ValidationInfo,
 )
 
-from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
 from mtv_world_ros.data_types import FloatArray
@@ -44,6 +44,7 @@ class ActionStream(Stream):
     delay_frames: float = Field(
         default=1.0,
         ge=0,
+        le=1000,
         description='an action is reached this many frames after the one it stands beside',
     )
     differences: ListOf[str] = Field(
@@ -138,8 +139,8 @@ class DatasetMapping(Schema):
         default='', description='feature that is true in a frame of an episode that succeeds'
     )
     objects: ListOf[str] = Field(default=(), description='names of the objects')
-    chunk_s: Positive = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Positive = Field(
+    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
+    limit_tolerance: Length = Field(
         default=0.05, description='positions further outside the limits fail [rad or m]'
     )
     jpeg_quality: int = Field(default=90, ge=1, le=100)

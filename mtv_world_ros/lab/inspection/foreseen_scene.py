@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Length, ListOf, Metres, read_yaml, Schema, validated, Wait
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory
 from mtv_world_ros.errors import TrajectoryError
 from mtv_world_ros.files import write_whole
@@ -27,6 +27,7 @@ from mtv_world_ros.foresight.solid_foresight import (
 )
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.robot.file import Position
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.geometry.solids import is_vessel, Solid
 
@@ -43,9 +44,9 @@ class SolidEntry(Schema):
     """An object: a box, or an upright cylinder."""
 
     name: str
-    centre: ListOf[float] = Field(description='x, y, z in the base frame [m]')
-    size: ListOf[Positive] = Field(description='along its own x, y, z [m]')
-    yaw: float = Field(default=0.0, description='[rad]')
+    centre: ListOf[Metres] = Field(description='x, y, z in the base frame [m]')
+    size: ListOf[Length] = Field(description='along its own x, y, z [m]')
+    yaw: float = Field(default=0.0, ge=-10, le=10, description='[rad]')
     round: bool = False
 
     def solid(self) -> Solid:
@@ -64,8 +65,8 @@ class SceneFile(Schema):
 
     objects: ListOf[SolidEntry]
     joints: ListOf[str] | None = Field(default=None, description="null = the robot's order")
-    times: ListOf[float] = Field(description='of the positions, increasing; the first is 0 [s]')
-    positions: ListOf[ListOf[float]] = Field(description='a row a time [rad or m]')
+    times: ListOf[Wait] = Field(description='of the positions, increasing; the first is 0 [s]')
+    positions: ListOf[ListOf[Position]] = Field(description='a row a time [rad or m]')
 
 
 def load_scene(

@@ -12,12 +12,13 @@ from pydantic import AfterValidator, Field, model_validator
 from mtv_world_ros.config import (
     Count,
     expected,
+    Factor,
     ListOf,
-    Positive,
     read_yaml,
     Schema,
     Share,
     validated,
+    Wait,
 )
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data_types import WorldModelSpec
@@ -27,6 +28,9 @@ from mtv_world_ros.model.actions import check_control, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CheckpointCard, HistorySettings
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 
+#: in a loss
+Weight = Annotated[float, Field(ge=0, le=1000)]
+
 
 class VideoConfig(Schema):
     """What the model sees and predicts."""
@@ -34,7 +38,7 @@ class VideoConfig(Schema):
     section: ClassVar = 'video'
 
     views: ListOf[str] = ('low', 'high')
-    fps: Positive = Field(default=5.0, description='frames a second')
+    fps: float = Field(default=5.0, gt=0, le=1000, description='frames a second')
     num_frames: Count = Field(default=16, description='T, predicted frames of a chunk')
     width: Count = Field(default=96, description='[px]')
     height: Count = Field(default=72, description='[px]')
@@ -46,7 +50,7 @@ class VideoConfig(Schema):
     object_mask: bool = Field(
         default=True, description="the trajectory video carries the objects' masks"
     )
-    clip_stride_s: float = Field(
+    clip_stride_s: Wait = Field(
         default=0.0,
         description='time between starts of training clips [s]; 0 = one from every frame',
     )
@@ -57,8 +61,8 @@ class ObjectiveConfig(Schema):
 
     section: ClassVar = 'objective'
 
-    sigma_shift: float = Field(default=5.0, description='draws noise levels towards high noise')
-    full_noise_share: float = Field(
+    sigma_shift: Factor = Field(default=5.0, description='draws noise levels towards high noise')
+    full_noise_share: Share = Field(
         default=0.25, description='share of samples at noise level 1, where sampling starts'
     )
     sigma_weighting: Literal['uniform', 'middle'] = Field(
@@ -66,13 +70,13 @@ class ObjectiveConfig(Schema):
         description="weight of a sample by its noise level; `middle` is DiffSynth-Studio's",
     )
     huber_delta: Annotated[
-        float | None, Field(gt=0), expected('positive, or null for the squared error')
+        float | None, Field(gt=0, le=1000), expected('positive, or null for the squared error')
     ] = Field(default=0.1, description='in units of the latents; null = squared error, as Wan')
-    change_weight: float = Field(
+    change_weight: Weight = Field(
         default=4.0, description='extra weight of pixels that differ from the start frame'
     )
-    object_weight: float = Field(default=6.0, description='extra weight of pixels on objects')
-    moved_weight: float = Field(
+    object_weight: Weight = Field(default=6.0, description='extra weight of pixels on objects')
+    moved_weight: Weight = Field(
         default=10.0, description='extra weight of pixels where objects came or went'
     )
 
@@ -85,14 +89,14 @@ class AugmentConfig(Schema):
     start_noise: Share = Field(
         default=0.5, description='probability of a start frame that is blurred and noisy'
     )
-    start_noise_std: float = Field(
+    start_noise_std: Share = Field(
         default=0.04,
         description='largest standard deviation of that noise, as a share of full range',
     )
     colour_permutation: Share = Field(
         default=0.3, description='probability of exchanged colour channels'
     )
-    failure_share: float | None = Field(
+    failure_share: Share | None = Field(
         default=None,
         description='share of clips drawn from failed episodes alone, on top of those that come '
         'by chance: they are few, and a model that rarely sees a miss imagines grasps instead',
@@ -129,7 +133,7 @@ class AugmentConfig(Schema):
 class HistoryConfig(HistorySettings):
     """How clips are shown what came before them; see `clips/past.py`."""
 
-    max_noise: Annotated[float, Field(lt=1)] = Field(
+    max_noise: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.3,
         description='noise levels are drawn from 0 to this; serving uses `noise_level`',
     )
@@ -158,7 +162,10 @@ class SamplingConfig(Schema):
 
     num_inference_steps: Count = Field(default=4, description='denoising steps')
     guidance_scale: float = Field(
-        default=1.0, description='of models with text; 1 = no guidance, and half the work'
+        default=1.0,
+        ge=-1000,
+        le=1000,
+        description='of models with text; 1 = no guidance, and half the work',
     )
     negative_prompt: str = Field(default='', description='text that guidance leads away from')
 
@@ -168,16 +175,18 @@ class OptimizerConfig(Schema):
 
     section: ClassVar = 'optimizer'
 
-    learning_rate: float = Field(default=6e-4, description='after the warm-up')
-    weight_decay: float = 0.01
+    learning_rate: float = Field(default=6e-4, ge=0, le=100, description='after the warm-up')
+    weight_decay: Weight = 0.01
     warmup_steps: int = Field(
         default=200, description='of the learning rate; at most a fifth of the steps'
     )
-    decay_share: float = Field(
+    decay_share: Share = Field(
         default=0.35, description='share of the steps in which the rate decays'
     )
-    max_grad_norm: float = Field(default=1.0, description='longer gradients are scaled down to it')
-    ema_decay: float = Field(default=0.999, description='of the averaged weights, the checkpoint')
+    max_grad_norm: float = Field(
+        default=1.0, gt=0, le=1e6, description='longer gradients are scaled down to it'
+    )
+    ema_decay: Share = Field(default=0.999, description='of the averaged weights, the checkpoint')
     batch_size: int = Field(
         default=4, description='clips of a step, over all processes and accumulated parts'
     )
@@ -190,7 +199,10 @@ class OptimizerConfig(Schema):
     )
     steps: int = Field(default=5000, description='of the whole training')
     epochs: Annotated[float | None, expected('positive, or null')] = Field(
-        default=None, gt=0, description='instead of `steps`: a multiple of the number of clips'
+        default=None,
+        gt=0,
+        le=1e6,
+        description='instead of `steps`: a multiple of the number of clips',
     )
 
     @property
@@ -216,7 +228,7 @@ class LoraSettings(Schema):
     rank: Annotated[int, expected('positive, or 0 for none')] = Field(
         default=0, ge=0, description='0 = all weights are trained'
     )
-    alpha: float = 32.0
+    alpha: Factor = 32.0
 
 
 class TrainingConfig(Schema):
@@ -292,7 +304,7 @@ class TrainingRun(Schema):
     )
     save_every: Count = Field(default=250, description='steps between saved states')
     save_minutes: float = Field(
-        default=10.0, ge=0, description='longest time between saved states [min]'
+        default=10.0, ge=0, le=1e5, description='longest time between saved states [min]'
     )
     cache: Path | None = Field(
         default=None,
@@ -309,6 +321,7 @@ class TrainingRun(Schema):
     peak_tflops: float | None = Field(
         default=None,
         ge=0,
+        le=1e6,
         description="peak rate of a process's device [10^12 operations/s], for the utilisation in "
         'the log; 0 = measure it, None = log no utilisation',
     )

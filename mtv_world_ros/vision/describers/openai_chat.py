@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from mtv_world_ros.bounded_input import parse_json
-from mtv_world_ros.config import expected, Positive, Schema
+from mtv_world_ros.config import expected, Schema, Seconds
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, masked
 from mtv_world_ros.vision.describers.vlm import ANSWER_SCHEMA, ChatAnswer, excerpt
@@ -35,7 +35,7 @@ _REFUSED_FORMAT = (400, 422)
 _MAX_ANSWER_BYTES = 4_000_000
 
 
-_Seconds = Annotated[Positive, expected('a positive number')]
+_Seconds = Annotated[Seconds, expected('a positive number of at most 86400')]
 
 
 class OpenAIConfig(Schema):

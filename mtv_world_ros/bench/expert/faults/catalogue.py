@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mtv_world_ros.bench.expert.faults.drawn import drawn_names, drawn_values, is_drawn
-from mtv_world_ros.config import ListOf, read_yaml, Schema, validated
+from mtv_world_ros.config import ListOf, Number, read_yaml, Schema, validated
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.files import share_path
 
@@ -41,11 +41,11 @@ class FaultSize(Schema):
         ranked: in the rankings of the kind's split.
     """
 
-    typical: float
-    largest: float
+    typical: Number
+    largest: Number
     unit: str = ''
-    none: float = 0.0
-    ranked: ListOf[float] = ()
+    none: Number = 0.0
+    ranked: ListOf[Number] = ()
 
 
 class FaultKind(Schema):

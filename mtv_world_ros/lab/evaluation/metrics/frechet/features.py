@@ -8,6 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, EpisodeError
 
@@ -122,12 +123,14 @@ def _transformers_model(folder: Path) -> Any:
             "pip install 'mtv_world_ros[describe]', or name an I3D state dict file"
         ) from error
     try:
-        return VideoMAEModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        model = VideoMAEModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
     except (OSError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"fvd_weights '{folder}' cannot be loaded as a VideoMAE ({error}); it needs "
             'config.json and model.safetensors'
         ) from error
+    check_weights(model, folder)
+    return model
 
 
 def _loaded(network: torch.nn.Module, path: Path, device: str, option: str) -> torch.nn.Module:
@@ -140,6 +143,7 @@ def _loaded(network: torch.nn.Module, path: Path, device: str, option: str) -> t
             f"{option} '{path}' is not a {type(network).__name__}: it lacks {missing[:3]} and has "
             f'unknown {list(unexpected)[:3]}'
         )
+    check_weights(network, path)
     return network.to(device).eval()
 
 
@@ -161,9 +165,13 @@ def _check_file(path: Path, option: str) -> None:
 
 def _state_dict(path: Path, option: str) -> dict[str, Any]:
     if path.suffix == '.safetensors':
+        from safetensors import SafetensorError
         from safetensors.torch import load_file
 
-        return load_file(path)
+        try:
+            return load_file(path)
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"{option} '{path}' cannot be loaded: {error}") from error
     import torch
 
     try:

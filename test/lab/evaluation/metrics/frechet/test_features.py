@@ -8,6 +8,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from safetensors.torch import save_file
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, EpisodeError
@@ -129,3 +130,23 @@ def test_pickles_and_torchscript_are_refused(tmp_path):
     torch.jit.trace(module, torch.zeros(1, 2)).save(tmp_path / 'script.pt')
     with pytest.raises(CheckpointError, match='TorchScript'):
         clip_features(tmp_path / 'script.pt')
+
+
+@pytest.mark.parametrize('suffix', ['.pth', '.safetensors'])
+def test_weights_that_are_no_numbers_are_refused(inception_file, tmp_path, suffix):
+    state = torch.load(inception_file, weights_only=True)
+    name = next(name for name, tensor in state.items() if tensor.ndim > 1)
+    state[name].reshape(-1)[0] = float('nan')
+    file = tmp_path / f'weights{suffix}'
+    if suffix == '.pth':
+        torch.save(state, file)
+    else:
+        save_file(state, file)
+    with pytest.raises(CheckpointError, match=f"tensor '{name}'.* holds 1 of"):
+        frame_features(file)
+
+
+def test_a_damaged_safetensors_file_is_refused_in_words(tmp_path):
+    (tmp_path / 'weights.safetensors').write_bytes(b'\xff' * 40)
+    with pytest.raises(CheckpointError, match="fid_weights '.*weights.safetensors' cannot be"):
+        frame_features(tmp_path / 'weights.safetensors')
