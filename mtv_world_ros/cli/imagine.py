@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from math import sqrt
 from pathlib import Path
 from statistics import NormalDist
@@ -20,8 +21,10 @@ from mtv_world_ros.cli.shared_options import (
     add_serving,
     add_source,
     add_task,
+    add_watch,
     check_model,
     pipeline_of,
+    watch_arguments,
 )
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_free
@@ -120,6 +123,10 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--max-seconds', type=float, default=3600.0, help='of an episode [s]')
     parser.add_argument('--instruction', default='', help="default: the recorded episode's")
     parser.add_argument('--out', type=Path, default=Path('out/imagine'))
+    parser.add_argument(
+        '--no-video', dest='video', action='store_false', help='no comparison.mp4 of each episode'
+    )
+    add_watch(parser, 'every episode')
     add_overwrite(parser)
     add_checkpoint(parser)
     add_model_options(parser)
@@ -134,6 +141,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
 
     check_model(arguments.device, arguments.checkpoint)
+    watch = watch_arguments(arguments)
     for folder in arguments.episodes:
         if not folder.exists():
             raise EpisodeError(f"there is no episode '{folder}'")
@@ -152,6 +160,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
         max_seconds=arguments.max_seconds,
         instruction=arguments.instruction,
         seed=arguments.seed,
+        watch=watch and (*watch, '--by-episode'),
         checkpoint=arguments.checkpoint,
         robot=arguments.robot or '',
         device=arguments.device,
@@ -160,12 +169,15 @@ def _imagine(arguments: argparse.Namespace) -> int:
         segmenter=arguments.segmenter,
         describer=str(arguments.describer.absolute()) if arguments.describer else '',
     )
-    results = imagine_episodes(options, arguments.out, overwrite=arguments.overwrite)
+    results = imagine_episodes(
+        options, arguments.out, overwrite=arguments.overwrite, tell=partial(print, flush=True)
+    )
     from mtv_world_ros.viewing.sheets import write_pictures
 
     for result in results:
         if int(str(result['num_chunks'])) and Path(str(result['bag'])).is_dir():
-            write_pictures([Path(str(result['bag']))], Path(str(result['bag'])))
+            bag = Path(str(result['bag']))
+            write_pictures([bag], bag, has_video=arguments.video)
     print('\n'.join(episode_table(results)))
     print(f'look at them: mtv-world view {arguments.out}')
     failed = [result for result in results if result['how'] not in GOOD_ENDS]

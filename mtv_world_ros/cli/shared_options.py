@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
 import os
@@ -151,6 +152,68 @@ def add_overwrite(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--overwrite', action='store_true', help='replace what an earlier run wrote'
     )
+
+
+def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
+    """Adds `--watch`.
+
+    Args:
+        parser: of the command.
+        what: is shown while it runs.
+    """
+    parser.add_argument(
+        '--watch',
+        type=Watch.parse,
+        nargs='?',
+        const=Watch(),
+        metavar='PORT|FILE.rrd',
+        help=f'show {what} in the Rerun viewer while it runs: in a browser (default: port '
+        f'{Watch().port}; the data take the one above it), or as a file for mtv-world view',
+    )
+
+
+def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+    """Returns the viewer's arguments for `--watch`; None = nobody watches.
+
+    Raises:
+        ConfigError: the viewer is not installed, its port is taken, or its file exists.
+    """
+    watch: Watch | None = arguments.watch
+    if watch is None:
+        return None
+    from mtv_world_ros.files import check_free
+    from mtv_world_ros.viewing.rerun_log import check_installed, check_ports
+
+    check_installed()
+    if watch.file is None:
+        check_ports(watch.port)
+        return '--port', str(watch.port)
+    check_free(watch.file, arguments.overwrite, '--watch FILE.rrd')
+    return '--save', str(watch.file)
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Where a live view goes.
+
+    Attributes:
+        port: of the page for browsers.
+        file: is written instead; None = no file.
+    """
+
+    port: int = 9090
+    file: Path | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Watch:
+        """Returns the value of `--watch`."""
+        if text.endswith('.rrd'):
+            return cls(file=Path(text))
+        if not text.isdecimal() or not 1024 <= int(text) < 65535:
+            raise argparse.ArgumentTypeError(
+                f"'{text}' is neither a port from 1024 to 65534 nor a file that ends in .rrd"
+            )
+        return cls(port=int(text))
 
 
 def add_dtype(parser: argparse.ArgumentParser) -> None:

@@ -116,7 +116,7 @@ def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
     if not found:
         raise EpisodeError(
             f'{", ".join(map(str, arguments.paths))}: no frames were kept; run it into another '
-            "--out: 'mtv-world rank' without --no-clips"
+            "--out: 'mtv-world rank' without --no-video"
         )
     return found
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import time
@@ -34,6 +35,8 @@ from mtv_world_ros.processes import (
 
 #: what an episode starts from stays valid for as long as the policy thinks [s]
 _NO_AGE = 3600.0
+#: the address of its page, or its file
+_VIEWER_IS_ON = re.compile(r'^((?:open|written:) .+)\n', re.M)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +52,7 @@ class ImagineOptions:
         max_seconds: an episode takes at most, on the wall [s].
         instruction: empty = the recorded episode's.
         seed: episode k uses seed + 1000 k.
+        watch: arguments of a viewer that runs beside it; None = there is none.
         checkpoint, robot, device, num_threads, num_inference_steps, segmenter, describer: of the
             world model.
     """
@@ -61,6 +65,7 @@ class ImagineOptions:
     max_seconds: float = 3600.0
     instruction: str = ''
     seed: int = 0
+    watch: tuple[str, ...] | None = None
     checkpoint: str = 'bundled'
     robot: str = ''
     device: str = 'cpu'
@@ -71,7 +76,11 @@ class ImagineOptions:
 
 
 def imagine_episodes(
-    options: ImagineOptions, out: Path, *, overwrite: bool = False
+    options: ImagineOptions,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> list[dict[str, object]]:
     """Runs the episodes; `out` gets a bag for each, `episodes.json` and `logs/`.
 
@@ -79,6 +88,7 @@ def imagine_episodes(
         options: policy, episodes and settings of the nodes.
         out: folder of the results.
         overwrite: remove the episodes of an earlier run from it.
+        tell: is called with what the viewer says of where it is to be seen.
 
     Returns:
         What `episodes.json` says, one entry for each episode that was begun.
@@ -90,20 +100,11 @@ def imagine_episodes(
     """
     views = read_card(checkpoint_path(options.checkpoint)).spec.views
     # a wrong name is an error here, before anything is removed
-    robot = checkpoint_robot(options.checkpoint, options.robot or None)
-    policy = policy_settings(options.policy, robot)
-    if isinstance(policy, RecordedPolicySettings) and not options.episodes:
-        raise ConfigError(
-            f"policy '{options.policy}' repeats what was commanded in a recorded episode: give "
-            '--episodes'
-        )
-    if isinstance(policy, ScriptedPolicySettings) and options.start_s > 0:
-        raise ConfigError(
-            f"policy '{options.policy}' plans for the scene as it is in the recording's first "
-            f'frame, --start is {options.start_s:g} s: leave --start out, or take --policy '
-            'recorded or one that looks at the pictures'
-        )
+    _check_policy(options)
+    watch = options.watch
+    viewer = {} if watch is None else {'viewer': module_command('live_viewer', *watch)}
     commands = {
+        **viewer,
         'world_model': _world_model_command(options, views),
         'policy': _policy_command(options, views),
         'runner': _runner_command(options, views, out),
@@ -120,6 +121,8 @@ def imagine_episodes(
     try:
         for name, command in commands.items():
             started[name] = start_process(name, command, logs, environment)
+            if name == 'viewer':
+                tell(_viewer_said(started[name], logs))
         with tqdm(total=_count(options), unit='ep', disable=None) as bar:
             _wait(started, logs, bar)
     finally:
@@ -134,6 +137,34 @@ def imagine_episodes(
         raise EpisodeError(
             f"what the episode runner wrote cannot be read: {error} (logs are in '{logs}')"
         ) from error
+
+
+def _check_policy(options: ImagineOptions) -> None:
+    robot = checkpoint_robot(options.checkpoint, options.robot or None)
+    policy = policy_settings(options.policy, robot)
+    if isinstance(policy, RecordedPolicySettings) and not options.episodes:
+        raise ConfigError(
+            f"policy '{options.policy}' repeats what was commanded in a recorded episode: give "
+            '--episodes'
+        )
+    if isinstance(policy, ScriptedPolicySettings) and options.start_s > 0:
+        raise ConfigError(
+            f"policy '{options.policy}' plans for the scene as it is in the recording's first "
+            f'frame, --start is {options.start_s:g} s: leave --start out, or take --policy '
+            'recorded or one that looks at the pictures'
+        )
+
+
+def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
+    """What the viewer says as soon as it can be looked at; an error where it ends before."""
+    log, still = logs / 'viewer.log', StandStill()
+    while not (found := _VIEWER_IS_ON.search(log.read_text(errors='replace'))):
+        if viewer.poll() is not None:
+            raise EpisodeError(how_it_ended('viewer', viewer, logs))
+        if said := still.said({'viewer': viewer}):
+            raise EpisodeError(f"{said} (logs are in '{logs}')")
+        time.sleep(0.1)
+    return found[1]
 
 
 def _count(options: ImagineOptions) -> int:
@@ -214,4 +245,5 @@ def _runner_command(options: ImagineOptions, views: Sequence[str], out: Path) ->
         arguments += ['--episodes', *(str(path) for path in options.episodes)]
     else:
         arguments += ['--live']
+    arguments += ['--viewers', str(int(options.watch is not None))]
     return module_command('episodes.episode_runner', *arguments)

@@ -21,6 +21,8 @@ from mtv_world_ros.files import write_whole
 KINDS = ('real', 'trajectory', 'imagined')
 _BACKGROUND, _INK, _FAINT = (255, 255, 255), (25, 25, 25), (120, 120, 120)
 _GAP, _HEAD, _MARGIN = 4, 26, 116
+#: qualities of x264 that are tried until a video is small enough
+_CRFS = (24, 30, 36, 42)
 _FONT, _SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 
 
@@ -150,7 +152,9 @@ def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
     return heading
 
 
-def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> None:
+def write_video(
+    path: Path, frames: ByteArray, fps: float, *, crf: int = 20, max_bytes: int | None = None
+) -> None:
     """Writes (T, H, W, 3) uint8 RGB frames of even size as H.264 in MP4.
 
     Args:
@@ -158,8 +162,28 @@ def write_video(path: Path, frames: ByteArray, fps: float, *, crf: int = 20) -> 
         frames: (T, H, W, 3) uint8 RGB.
         fps: frames a second.
         crf: quality, 0 best to 51 worst.
+        max_bytes: the quality is lowered until the file takes no more, down to a limit.
     """
-    write_whole(path, encode_video(frames, fps, crf=crf))
+    data = encode_video(frames, fps, crf=crf)
+    if max_bytes is not None and len(data) > max_bytes:
+        data = encode_small_video(frames, fps, max_bytes)
+    write_whole(path, data)
+
+
+def encode_small_video(frames: ByteArray, fps: float, max_bytes: int) -> bytes:
+    """Returns the first MP4 of falling quality that takes no more than `max_bytes`, or the last.
+
+    Args:
+        frames: (T, H, W, 3) uint8 RGB of even size.
+        fps: frames a second.
+        max_bytes: wanted size.
+    """
+    data = b''
+    for crf in _CRFS:
+        data = encode_video(frames, fps, crf=crf)
+        if len(data) <= max_bytes:
+            break
+    return data
 
 
 def _tile_size(size: tuple[int, ...], tile_width: int) -> tuple[int, int]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,24 +23,27 @@ _COLOURS = ((230, 60, 60), (60, 140, 240), (60, 190, 90), (240, 180, 40), (180, 
 _TIMELINE = 'time'
 
 
+def check_installed() -> None:
+    """Raises a `ConfigError` where the Rerun SDK is not installed."""
+    if find_spec('rerun') is None:
+        raise ConfigError("the viewer is not installed: pip install 'mtv_world_ros[view]'")
+
+
 def recording(name: str) -> Any:
     """Returns a new Rerun recording.
 
     Raises:
         ConfigError: the Rerun SDK is not installed.
     """
-    try:
-        import rerun
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            "the viewer is not installed: pip install 'mtv_world_ros[view]'"
-        ) from error
+    check_installed()
+    import rerun
+
     return rerun.RecordingStream(APPLICATION, recording_id=name)
 
 
 def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
     """Logs a bag or a scored rollout."""
-    root = _escaped(root)
+    root = escaped(root)
     if isinstance(shown, Streams):
         log_streams(stream, shown, root)
     else:
@@ -100,11 +104,11 @@ def log_rollout(stream: Any, scored: ScoredRollout, root: str) -> None:
             _log_view(stream, rollout, v, index, f'{root}/{view}')
             for o, name in enumerate(rollout.objects):
                 value = float(rollout.j[v, o, index])
-                stream.log(f'{root}/J/{view}/{_escaped(name)}', rerun.Scalars(value))
+                stream.log(f'{root}/J/{view}/{escaped(name)}', rerun.Scalars(value))
 
 
-def _escaped(path: str) -> str:
-    """The path of entities in Rerun's notation, where spaces and signs need a backslash."""
+def escaped(path: str) -> str:
+    """Returns an entity's path in Rerun's notation: spaces and signs have a backslash."""
     import rerun
 
     parts = (rerun.escape_entity_path_part(part) if part else '' for part in path.split('/'))
@@ -119,7 +123,7 @@ def _style_curves(stream: Any, rollout: StoredRollout, root: str) -> None:
         for v, view in enumerate(rollout.views):
             colour = [round(part * 0.6**v) for part in _COLOURS[o % len(_COLOURS)]]
             lines = rerun.SeriesLines(colors=[colour], names=f'{name}, {view}')
-            stream.log(f'{root}/J/{view}/{_escaped(name)}', lines, static=True)
+            stream.log(f'{root}/J/{view}/{escaped(name)}', lines, static=True)
 
 
 def _mark_points(stream: Any, path: str) -> None:
@@ -160,21 +164,23 @@ def _outlines(labels: ByteArray) -> Any:
     return rerun.LineStrips2D(strips, colors=colours, radii=-1.0)
 
 
-def layout(roots: dict[str, Streams | ScoredRollout]) -> Any:
+def layout(roots: Mapping[str, Streams | ScoredRollout], table: str = '', active: int = 0) -> Any:
     """Returns the blueprint: a tab per root; a row per view, its kinds side by side; curves.
 
     Args:
         roots: logged streams and rollouts, by path of their entities.
+        table: path of a text that is a tab of its own, the first one; empty = none.
+        active: number of the tab that is shown.
     """
     import rerun.blueprint as rrb
 
-    return rrb.Blueprint(
-        rrb.Tabs(*(_tab(root, shown, rrb) for root, shown in roots.items())), collapse_panels=True
-    )
+    tabs = [rrb.TextDocumentView(origin=escaped(table), name=table.strip('/'))] if table else []
+    tabs += [_tab(root, shown, rrb) for root, shown in roots.items()]
+    return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=active), collapse_panels=True)
 
 
 def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
-    kinds, name, root = KINDS, root.strip('/') or 'recording', _escaped(root)
+    kinds, name, root = KINDS, root.strip('/') or 'recording', escaped(root)
     if isinstance(shown, Streams):
         kinds, views = shown.kinds, shown.views
         below = [rrb.TimeSeriesView(origin=f'{root}/joints', name='joints')]
@@ -254,11 +260,16 @@ def serve(stream: Any, blueprint: Any, port: int) -> str:
     """
     import rerun
 
-    for number in (port, port + 1):
-        _check_port(number)
+    check_ports(port)
     data = stream.serve_grpc(grpc_port=port + 1, default_blueprint=blueprint)
     rerun.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
     return f'http://localhost:{port}/?url={data}'
+
+
+def check_ports(port: int) -> None:
+    """Raises a `ConfigError` where the page's port or the one above it is taken."""
+    for number in (port, port + 1):
+        _check_port(number)
 
 
 def _check_port(port: int) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from mtv_world_ros.rendering.video import (
 )
 from mtv_world_ros.viewing.streams import read_streams, Streams
 
+#: bounds of a video: frames, and bytes down to a limit of quality
+MAX_VIDEO_FRAMES, MAX_VIDEO_BYTES = 600, 4_000_000
 SHEET, VIDEO = 'contact_sheet.png', 'comparison.mp4'
 #: where a kind of frame is not there
 _BLANK = 225
@@ -26,13 +30,19 @@ _BLANK = 225
 _REACH = 0.6
 
 
-def write_pictures(bags: Sequence[Path], out: Path, title: str = '') -> list[Path]:
+def write_pictures(
+    bags: Sequence[Path], out: Path, title: str = '', *, has_video: bool = True
+) -> list[Path]:
     """Writes `contact_sheet.png` and `comparison.mp4` of predictions; returns their paths.
+
+    A long video shows every second, third, ... frame, `MAX_VIDEO_FRAMES` at most, in its own
+    time; its quality is lowered until it takes `MAX_VIDEO_BYTES`, down to a limit.
 
     Args:
         bags: predictions, and the episode that they are of, if it is at hand.
         out: folder of the pictures.
         title: heading; empty = the first instruction.
+        has_video: write the video as well.
 
     Raises:
         EpisodeError: nothing was imagined.
@@ -46,9 +56,23 @@ def write_pictures(bags: Sequence[Path], out: Path, title: str = '') -> list[Pat
     notes = [f'success estimates: {estimates}'] if estimates else []
     heading = title or (told[0] if told else '')
     write_png(out / SHEET, contact_sheet(comparison, title=heading, notes=notes))
+    if not has_video:
+        return [out / SHEET]
     period = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 0.2
-    write_video(out / VIDEO, side_by_side(comparison), 1 / period)
+    stride = ceil(len(comparison.times) / MAX_VIDEO_FRAMES)
+    frames = side_by_side(every(comparison, stride))
+    write_video(out / VIDEO, frames, 1 / (period * stride), max_bytes=MAX_VIDEO_BYTES)
     return [out / SHEET, out / VIDEO]
+
+
+def every(comparison: Comparison, stride: int) -> Comparison:
+    """Returns every `stride`-th frame, the first among them."""
+    return replace(
+        comparison,
+        times=comparison.times[::stride],
+        **{kind: comparison.frames(kind)[:, ::stride] for kind in KINDS},
+        captions=tuple(row[::stride] for row in comparison.captions),
+    )
 
 
 def compared(streams: Streams) -> Comparison:

@@ -1,6 +1,8 @@
 """`mtv-world imagine` says whether the policy succeeded, and why an episode failed."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -17,11 +19,20 @@ def run(out, policy, *more):
 
 
 def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
-    """The first command of docs/policies.md; its chunks more than a grasp and a place."""
-    assert run(tmp_path, 'expert', '--max-chunks', '3') == 0
+    """The first command of docs/policies.md, twice, while somebody watches."""
+    pytest.importorskip('rerun')
+    live, watch = tmp_path / 'live.rrd', ('--watch', str(tmp_path / 'live.rrd'), '--count', '2')
+    assert run(tmp_path, 'expert', '--max-chunks', '5', *watch) == 0
     said = capsys.readouterr().out
-    assert 'success rate: 1 of 1 = 1.00' in said and f'mtv-world view {tmp_path}' in said
-    (episode,) = json.loads((tmp_path / 'episodes.json').read_text())
+    assert said.startswith(f'written: {live}\n')
+    assert 'success rate: 2 of 2 = 1.00' in said and f'mtv-world view {tmp_path}' in said
+    command = [sys.executable, '-m', 'rerun', 'rrd', 'print', str(live)]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for number in (0, 1):  # a tab each
+        for path in ('low/real', 'high/imagined', 'low/trajectory', 'success', 'words'):
+            assert f'/episode_{number}/{path} ' in shown
+    assert '/episode_2' not in shown
+    episode, _ = json.loads((tmp_path / 'episodes.json').read_text())
     assert episode['verdict'] == 'success' and episode['success'] >= 0.75
     assert episode['success_low'] <= episode['success'] <= episode['success_high']
     assert 'foreseen motions succeed' in episode['reasons']

@@ -6,6 +6,7 @@ from pathlib import Path
 import socket
 import urllib.request
 
+import av
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.rendering.images import encode_jpeg
+from mtv_world_ros.viewing import sheets
 from mtv_world_ros.viewing.streams import read_streams
 
 EPISODE = share_path('resource', 'demo_episode')
@@ -71,6 +73,24 @@ def test_an_episode_and_its_predictions_are_of_one_time(tmp_path: Path) -> None:
     assert [value for _, value in streams.success] == [0.75]
     assert any(text.startswith('instruction: ') for _, text in streams.words)
     assert {kind for kind, *_ in streams.joints} == {'real'}
+
+
+def test_a_long_video_is_shorter_in_frames_and_bytes_not_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_predictions(tmp_path / 'predictions')
+    monkeypatch.setattr(sheets, 'MAX_VIDEO_FRAMES', 2)
+    sheet, video = sheets.write_pictures([bag], tmp_path)
+    with av.open(str(video)) as container:
+        stamps = [float(frame.time) for frame in container.decode(video=0)]
+    assert stamps == [0.0, pytest.approx(0.4)]  # of 0, .2 and .4 s
+    large = video.stat().st_size
+    monkeypatch.setattr(sheets, 'MAX_VIDEO_BYTES', large - 1)
+    sheets.write_pictures([bag], tmp_path)
+    assert video.stat().st_size < large
+    video.unlink()
+    assert sheets.write_pictures([bag], tmp_path, has_video=False) == [sheet]
+    assert sheet.is_file() and not video.exists()
 
 
 def test_bags_of_different_times_are_refused(tmp_path: Path) -> None:

@@ -20,14 +20,17 @@ from mtv_world_ros.cli.shared_options import (
     add_overwrite,
     add_segmenter,
     add_serving,
+    add_watch,
     check_model,
     pipeline_choices,
     provenance,
     threads_of_workers,
+    watch_arguments,
 )
 from mtv_world_ros.errors import ConfigError, PolicyError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.bench.ranking.live_ranking import LiveRanking
     from mtv_world_ros.bench.ranking.policy_list import ListedPolicy
     from mtv_world_ros.bench.ranking.rollout_jobs import Job
     from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint
@@ -104,11 +107,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         'answers in a row; default: only the policy and --max-chunks end it',
     )
     parser.add_argument(
+        '--no-video',
         '--no-clips',
         dest='clips',
         action='store_false',
         help='keep the last frames of each rollout alone, without a video to play: faster',
     )
+    add_watch(parser, 'rates so far and every rollout that has ended')
     add_physics(parser)
     add_overwrite(parser)
     add_checkpoint(parser)
@@ -123,6 +128,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _rank(arguments: argparse.Namespace) -> int:
     names, truth = _names(arguments), physics_text(arguments.physics)
     check_model(arguments.device, *names)
+    watched = watch_arguments(arguments)
+    if watched and not arguments.clips:
+        raise ConfigError('--watch shows what --no-video leaves out; give one of them')
     listed = _listed(arguments)
     jobs = _jobs(arguments, listed)
     from mtv_world_ros.bench.ranking.flips import flip_sheet
@@ -147,6 +155,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     if listed:
         policies = ListedPolicies(listed, (arguments.out / 'logs').absolute())
         config = replace(config, make_policy=policies)
+    viewer = _viewer(arguments)
     found, failed = run_jobs(
         jobs,
         checkpoints,
@@ -154,6 +163,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         ray_address=arguments.ray,
         overwrite=arguments.overwrite,
+        **({'watch': viewer.add} if viewer else {}),
     )
     # the benchmark of faults is about policies whose names say their faults
     optimism = {
@@ -189,6 +199,19 @@ def _rank(arguments: argparse.Namespace) -> int:
     for job, reason in failed.items():
         sys.stderr.write(f'mtv-world: {job.name} has no result: {reason}\n')
     return int(bool(failed))
+
+
+def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
+    """The viewer that `--watch` asks for; says where it is to be seen."""
+    if arguments.watch is None:
+        return None
+    from mtv_world_ros.bench.ranking.live_ranking import LiveRanking
+    from mtv_world_ros.viewing import rerun_log
+
+    stream = rerun_log.recording('ranking')
+    watch = arguments.watch
+    print(rerun_log.open_viewer(stream, None, watch.port, watch.file, False), flush=True)
+    return LiveRanking(stream, arguments.out, watch.file)
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:

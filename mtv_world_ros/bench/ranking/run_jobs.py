@@ -46,6 +46,7 @@ def run_jobs(
     ray_address: str | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
+    watch: Callable[[Sequence[Result]], object] = lambda _: None,
 ) -> tuple[list[list[Result]], dict[Job, str]]:
     """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
 
@@ -61,6 +62,8 @@ def run_jobs(
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
         overwrite: replace results of other settings.
         show_progress: draw a progress bar, on a terminal.
+        watch: is called with the first checkpoint's results, those of an earlier run at first,
+            then each as it comes.
 
     Raises:
         ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
@@ -71,6 +74,8 @@ def run_jobs(
     wanted = {job: tuple(k for k, s in enumerate(stores) if job not in s.found) for job in jobs}
     left = [WantedJob(job, numbers) for job, numbers in wanted.items() if numbers]
     failed: dict[Job, str] = {}
+    if stores and stores[0].found:
+        watch(list(stores[0].found.values()))
     make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
     outcomes = _scored(left, make, workers, ray_address)
     bar = tqdm(outcomes, total=len(left), unit='rollout', disable=None if show_progress else True)
@@ -80,6 +85,8 @@ def run_jobs(
             continue
         for number, result in outcome.items():
             stores[int(number)].add(done.job, result)
+            if int(number) == 0:
+                watch([stores[0].found[done.job]])
     if jobs and not all(store.found for store in stores):
         job, reason = next(iter(failed.items()))
         raise MtvWorldError(f'no rollout has a result; the first, {job.name}: {reason}')

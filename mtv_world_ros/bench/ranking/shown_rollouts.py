@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mtv_world_ros.bench.ranking.both_worlds import FRAMES
@@ -31,6 +31,16 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
     """
     chosen = [r for r in worst_first(read_results(folder)) if _path(folder, r).is_file()]
     yield from (_ranked(folder, result) for result in chosen[:count])
+
+
+def last_rollouts(folder: Path, results: Sequence[Result], count: int) -> Iterator[ScoredRollout]:
+    """Yields the last `count` of the results whose frames were kept, in their order.
+
+    Raises:
+        EpisodeError: frames cannot be read.
+    """
+    kept = [result for result in results if _path(folder, result).is_file()]
+    yield from (_ranked(folder, result) for result in kept[-count:])
 
 
 def _path(folder: Path, result: Result) -> Path:

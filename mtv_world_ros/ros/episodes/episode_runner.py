@@ -206,17 +206,23 @@ class EpisodeRunner(Node):
             self._peers.forget(options.world_model)
             self._wait_for(lambda: self._are_recorded(predicted), 'connections to the recorder')
             least = 3
-        outputs = self._outputs.values()
         self._wait_for(
-            lambda: min(o.get_subscription_count() for o in outputs) >= least,
-            f'{least} subscribers of {shown}',
+            lambda: all(
+                output.get_subscription_count() >= least + options.viewers * _is_viewed(name)
+                for name, output in self._outputs.items()
+            ),
+            f'{least} subscribers of {shown}, and {options.viewers} viewers',
         )
 
     def _are_recorded(self, topics: Sequence[str]) -> bool:
         is_heard = bool(self._peers.state(self._options.world_model))
         # the policy sees these too
         shared = [t for t in topics if t.endswith(('/image_raw', '/joint_states'))]
-        lonely = self._peers.unconnected(topics) + self._peers.unconnected(shared, least=2)
+        lonely = self._peers.unconnected(topics)
+        for topic in shared:
+            # viewers take JPEG images
+            viewers = 0 if topic.endswith('/image_raw') else self._options.viewers
+            lonely += self._peers.unconnected([topic], least=2 + viewers)
         return is_heard and not lonely
 
     # plumbing
@@ -249,6 +255,10 @@ class EpisodeRunner(Node):
                 self._live.refresh()
 
 
+def _is_viewed(topic: str) -> bool:
+    return not topic.endswith('/camera_info')
+
+
 def _estimate(seen: Mapping[str, str]) -> dict[str, Any]:
     """What the world model says of the episode's end: numbers that are null where it abstains."""
     numbers = {key: float(seen.get(key, 'nan')) for key in ESTIMATE[:3]}
@@ -273,6 +283,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add('--max-seconds', type=float, default=3600.0, help='of an episode, on the wall [s]')
     add('--instruction', default='', help="default: the recorded episode's")
     add('--no-record', action='store_true', help='no bags')
+    add('--viewers', type=int, default=0, help='wait until this number of viewers is connected')
     add('--world-model', default='/world_model', help='name of the node')
     add('--policy-node', default='/policy', help='name of the node')
     add('--wait-timeout', type=float, default=120.0, help='wait for nodes this long [s]')

@@ -9,7 +9,12 @@ import numpy as np
 
 from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import BoolArray, ByteArray
-from mtv_world_ros.rendering.video import Comparison, contact_sheet, encode_video, side_by_side
+from mtv_world_ros.rendering.video import (
+    Comparison,
+    contact_sheet,
+    encode_small_video,
+    side_by_side,
+)
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: of objects, one after the other: bright ones that few real things have
@@ -25,8 +30,6 @@ OUTLINES = (
 _TRUE, _SHADOW = (255, 255, 255), (0, 0, 0)
 #: widths up to which small frames are enlarged [px]
 _VIDEO_TILE, _SHEET_TILE = 320, 200
-#: qualities of x264 that are tried until a video is small enough
-_CRFS = (24, 30, 36, 42)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,13 +70,8 @@ def make_clip(
     """
     shown = outlined(rollout, tile_width)
     frames = side_by_side(shown, tile_width=shown.real.shape[3])
-    video = b''
-    for crf in _CRFS:
-        video = encode_video(frames, rollout.fps, crf=crf)
-        if len(video) <= max_bytes:
-            break
     return RolloutClip(
-        video=video,
+        video=encode_small_video(frames, rollout.fps, max_bytes),
         num_frames=len(frames),
         width=frames.shape[2],
         height=frames.shape[1],
