@@ -18,6 +18,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Adds the commands."""
     _add_recover(commands)
     _add_import_bag(commands)
+    _add_import_videos(commands)
     _add_import_dataset(commands)
     _add_export_dataset(commands)
 
@@ -169,6 +170,52 @@ def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path
         print(f'guessed: {note}')
     print(f'look at it with: mtv-world robot {file}')
     return file
+
+
+def _add_import_videos(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        'import-videos',
+        help='convert video files with tables of joints or tool poses into episodes',
+        epilog='config/datasets/videos.yaml describes the mapping file. Frame k belongs to row k. '
+        'Call it again to continue: finished episodes are kept. Exit status: 1 if one failed.',
+    )
+    parser.add_argument('folder', type=Path, help='of the files that the mapping names')
+    parser.add_argument(
+        '--mapping', type=Path, required=True, help='which file is which view, which column what'
+    )
+    parser.add_argument(
+        '--calibration', type=Path, help='of the cameras; default: marked as not known'
+    )
+    parser.add_argument('--out', type=Path, required=True)
+    _add_objects(parser)
+    parser.set_defaults(handler=_import_videos)
+
+
+def _import_videos(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.geometry.robot.file import ROBOT_YAML
+    from mtv_world_ros.lab.importing.bags import summary_line
+    from mtv_world_ros.lab.importing.videos import import_videos, load_video_mapping
+
+    summary = import_videos(
+        arguments.folder,
+        arguments.out,
+        load_video_mapping(arguments.mapping),
+        calibration=arguments.calibration,
+        stage=_object_stage(arguments),
+        progress=lambda recordings: tqdm(recordings, unit='ep', disable=None),
+    )
+    for one in summary.made:
+        print(summary_line(arguments.out / one.name, objects=bool(arguments.segmenter)))
+    for one, lines in summary.warnings.items():
+        for line in lines:
+            print(f'{one.name}: {line}', file=sys.stderr)
+    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
+    for one, reason in summary.failed.items():
+        print(f'{one.name}: {reason}', file=sys.stderr)
+    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    return 1 if summary.failed else 0
 
 
 def _add_import_dataset(commands: argparse._SubParsersAction) -> None:

@@ -192,7 +192,9 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     found, pictures = inspect_folder(
         tqdm(paths, unit='ep', disable=None),
         inspector,
-        lambda path: read_for_checks(path, arguments.views, source, inspector.robot),
+        lambda path: read_for_checks(
+            path, arguments.views, source, inspector.robot, inspector.robot.base_link
+        ),
     )
     out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
     picture = folder_picture(pictures)
@@ -210,7 +212,8 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
 
     file, source = robot_file(arguments, path)
     inspector = load_inspector(file)
-    episode = read_for_checks(path, arguments.views, source, inspector.robot)
+    robot = inspector.robot
+    episode = read_for_checks(path, arguments.views, source, robot, robot.base_link)
     inspection = inspector.inspect(episode)
     out = arguments.out or Path('out/doctor') / name
     _write_inspection(inspector, episode, inspection, out)
@@ -278,13 +281,31 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         'episodes', type=Path, nargs='+', metavar='EPISODE', help='recordings, or folders of them'
     )
-    parser.add_argument('--view', required=True)
+    parser.add_argument(
+        '--view',
+        dest='views',
+        type=names,
+        required=True,
+        help='name; or several, comma-separated, that stand still',
+    )
+    parser.add_argument(
+        '--same-focal',
+        action='store_true',
+        help='the views are of the same make of camera: one focal length is estimated for all',
+    )
     parser.add_argument(
         '--points',
         type=Path,
         metavar='FILE',
         help='where the tool point is seen, to start from: '
         '{VIEW: {EPISODE: [[seconds, x, y], ...]}} in YAML [s, px], four points or more',
+    )
+    parser.add_argument(
+        '--click',
+        type=Path,
+        metavar='PAGE',
+        help='only write an HTML page on which to click these points; it saves the file for '
+        '--points',
     )
     parser.add_argument(
         '--focal',
@@ -335,7 +356,7 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
 
     if is_shared(arguments):
         return calibrate_shared(arguments)
-    arguments.episode = arguments.episodes[0]
+    arguments.episode, arguments.view = arguments.episodes[0], arguments.views[0]
     return _calibrate_one(arguments)
 
 

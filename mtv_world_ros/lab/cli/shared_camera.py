@@ -11,7 +11,7 @@ from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
-    from mtv_world_ros.data_types import CameraModel
+    from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot.model import RobotModel
     from mtv_world_ros.geometry.robot.shape import LinkShape
     from mtv_world_ros.lab.inspection.shared_camera import SharedEstimate
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 def is_shared(arguments: argparse.Namespace) -> bool:
     """Whether several recordings are asked about, or what one recording's search has not."""
     asked = arguments.points or arguments.focal == 'estimate' or arguments.apply
+    asked = asked or arguments.click or len(arguments.views) > 1
     return bool(asked) or len(recordings(arguments.episodes)) > 1
 
 
@@ -46,40 +47,72 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
     """Runs the command on all recordings."""
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.geometry.robot.shape import load_shape
-    from mtv_world_ros.lab.inspection.shared_camera import estimate_shared, load_points
+    from mtv_world_ros.lab.inspection.shared_camera import load_points
 
     if arguments.mount_link or arguments.between:
         raise ConfigError('--mount-link and --between are for one recording')
-    points = load_points(arguments.points, arguments.view) if arguments.points else None
+    views = arguments.views
+    points = arguments.points and {view: load_points(arguments.points, view) for view in views}
     episodes, file = _read_all(arguments)
     robot = load_robot(file)
+    if arguments.click:
+        return _write_page(arguments, episodes, robot)
     shape = load_shape(robot)
     if not shape.is_known:
         raise ConfigError(
             f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
             'the meshes of its URDF'
         )
-    view = arguments.view
-    unknown = {episode.info.path: episode.unknown.get(view, '') for episode in episodes}
-    has_guess = arguments.guess and not any(unknown.values()) and points is None
-    if arguments.guess and any(unknown.values()) and points is None:
-        print('the pose is not known: searched from all sides; --points gives a start')
-    known = arguments.focal == 'known' or (
-        arguments.focal is None and not any('intrinsics' in what for what in unknown.values())
+    groups = [views] if arguments.same_focal else [[view] for view in views]
+    for group in groups:
+        _estimate(arguments, group, points, episodes, robot, shape.parts)
+    return 0
+
+
+def _write_page(
+    arguments: argparse.Namespace, episodes: Sequence[Episode], robot: RobotModel
+) -> int:
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.lab.inspection.points_page import points_page
+
+    write_whole(arguments.click, points_page(episodes, arguments.views, robot))
+    print(
+        f'page: {arguments.click}\nopen it in a browser, click, save, and give what it saves as '
+        '--points'
     )
-    estimate = estimate_shared(
+    return 0
+
+
+def _estimate(
+    arguments: argparse.Namespace,
+    views: Sequence[str],
+    points: dict[str, dict[str, list[FloatArray]]] | None,
+    episodes: Sequence[Episode],
+    robot: RobotModel,
+    parts: Sequence[LinkShape],
+) -> None:
+    """Estimates views that share their focal length, prints and writes them."""
+    from mtv_world_ros.lab.inspection.shared_camera import estimate_shared
+
+    unknown = [episode.unknown.get(view, '') for episode in episodes for view in views]
+    if arguments.guess and any(unknown) and points is None:
+        print('a pose is not known: searched from all sides; --points gives a start')
+    known = arguments.focal == 'known' or (
+        arguments.focal is None and not any('intrinsics' in what for what in unknown)
+    )
+    found = estimate_shared(
         episodes,
-        view,
+        views,
         robot,
-        shape.parts,
-        guess=has_guess,
+        parts,
+        guess=arguments.guess and not any(unknown) and points is None,
         points=points,
         focal_known=known,
         seed=arguments.seed,
     )
-    print(describe(estimate, episodes, focal_known=known))
-    _write(arguments, estimate, episodes, robot, shape.parts)
-    return 0
+    for estimate in found:
+        print(describe(estimate, episodes, focal_known=known))
+        _write(arguments, estimate, episodes, robot, parts)
 
 
 def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
@@ -90,7 +123,7 @@ def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
     file, source = robot_file(arguments, paths[0])
     robot = load_robot(file)
     episodes = [
-        read_for_checks(path, [arguments.view], source, robot, robot.base_link) for path in paths
+        read_for_checks(path, arguments.views, source, robot, robot.base_link) for path in paths
     ]
     return episodes, file
 
@@ -100,7 +133,9 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
     view, width = estimate.cameras[0].view, estimate.cameras[0].width
     how = 'as given' if focal_known or estimate.kept_guess else 'estimated'
     count = len(set(estimate.places.place.tolist()))
-    focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how})'
+    K = estimate.cameras[0].K
+    focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how}'
+    focal += ')' if focal_known else f', fy is {K[1, 1] / K[0, 0]:.3f} fx)'
     lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
     if estimate.kept_guess:
         lines.append("the guess fits better by the doctor's measure and is kept")
@@ -132,12 +167,13 @@ def _write(
     from mtv_world_ros.lab.inspection.inspect import overlay_picture
     from mtv_world_ros.rendering.images import write_png
 
-    view = arguments.view
+    view = estimate.cameras[0].view
     out = arguments.out or Path('out/camera') / f'{view}.yaml'
     numbers = estimate.places.place.tolist()
     several = len(set(numbers)) > 1
+    stem = f'{out.stem}_{view}' if len(arguments.views) > 1 and arguments.out else out.stem
     for place in dict.fromkeys(numbers):
-        file = out.with_stem(f'{out.stem}_{place}') if several else out
+        file = out.with_stem(f'{stem}_{place}' if several else stem)
         known = load_calibration(file) if file.is_file() else {}
         if view in known and arguments.out is not None:
             raise ConfigError(f"'{file}' has view '{view}' already; name another --out")

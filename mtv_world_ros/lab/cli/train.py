@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 import math
 from pathlib import Path
+import re
 import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
@@ -248,7 +249,8 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
         if not equals:
             raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
         try:
-            overrides[key] = parse_yaml(value)
+            is_number = re.fullmatch(r'[+-]?\d+(\.\d*)?[eE][+-]?\d+', value)
+            overrides[key] = float(value) if is_number else parse_yaml(value)  # 4e-4 is a text
         except yaml.YAMLError:
             raise ConfigError(f"--set '{item}': {value!r} is not a YAML value") from None
     return overrides

@@ -234,6 +234,35 @@ def convert_bag(
         robot=robot,
         unknown_mount=robot.base_link,
     )
+    return write_imported(episode, bag.name, out, mapping, robot, key, stage)
+
+
+def write_imported(
+    episode: Episode,
+    source: str,
+    out: Path,
+    mapping: BagMapping,
+    robot: RobotModel,
+    key: str = '',
+    stage: ObjectStage = AS_RECORDED,
+) -> tuple[str, ...]:
+    """Writes what was read of a recording as an episode of this package.
+
+    Args:
+        episode: with cameras.
+        source: name of the recording.
+        out: folder of the episode.
+        mapping: what is said of it, and how commands are checked.
+        robot: the robot.
+        key: of mapping, robot and calibration.
+        stage: names the objects and finds their masks.
+
+    Returns:
+        What was odd and how it was handled.
+
+    Raises:
+        MtvWorldError: it cannot be converted; nothing is left behind.
+    """
     for camera in episode.cameras.values():  # names a mount_link that is not there
         camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
     stamps, positions = _measured(episode, robot, mapping)
@@ -261,7 +290,7 @@ def convert_bag(
         robot=robot.name,
         cameras=[episode.cameras[v] for v in episode.views if v not in episode.unknown],
         objects=names,
-        metadata=_metadata(episode, bag, key),
+        metadata=_metadata(episode, source, key),
         jpeg_quality=mapping.jpeg_quality,
     ) as writer:
         writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
@@ -364,9 +393,9 @@ def _told(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[in
     return list(episode.instructions)
 
 
-def _metadata(episode: Episode, bag: Path, key: str) -> dict[str, str]:
+def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
     """Where the episode is from, and who made its masks."""
-    values = {'source': bag.name, MAPPING_KEY: key}
+    values = {'source': source, MAPPING_KEY: key}
     values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
     by = episode.info.metadata.get(MASKS_BY, '')
     return {**values, MASKS_BY: by} if episode.masks and by else values

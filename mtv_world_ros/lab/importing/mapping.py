@@ -96,7 +96,8 @@ class ActionStream(Stream):
         return positions, tuple(filter(None, odd))
 
 
-def _load_robot(name: str, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
+def load_mapped_robot(name: str, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
+    """Loads the robot that a mapping names; its file is put into the context."""
     is_path = Path(name).suffix in ('.yaml', '.yml')
     file = info.context['folder'] / name if is_path else bundled('robots', name, 'robot')
     info.context.update(robot_file=file, robot=load_robot(file))
@@ -118,7 +119,7 @@ class DatasetMapping(Schema):
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
-    robot: Annotated[RobotModel, BeforeValidator(_load_robot)] = Field(
+    robot: Annotated[RobotModel, BeforeValidator(load_mapped_robot)] = Field(
         description="name of a bundled robot, or a robot's YAML"
     )
     views: Annotated[dict[str, CameraSource], AfterValidator(_named)] = Field(

@@ -90,6 +90,8 @@ def inspect_folder(
             if inspector.stands_still(episode, view):
                 backgrounds.setdefault(view, {})[path.name] = background(episode.images[view])
             camera = episode.cameras[view]
+            if 'intrinsics' in episode.unknown.get(view, ''):
+                continue
             focal.setdefault(view, {})[path.name] = float(camera.K[0, 0]) / camera.width
     places = {view: find_places(list(found.values())) for view, found in backgrounds.items()}
     members = {view: list(found) for view, found in backgrounds.items()}

@@ -44,14 +44,21 @@ _OWN_STD = np.array([3.0] * 3 + [2.0] * 3)
 _POINT_STD = 0.006
 #: weight of these against the mean squared errors of a recording's pixels
 _STIFFNESS = 0.003
-#: a zoom's unit, and its standard deviation where the focal length is known or a mere guess
+#: a zoom's unit, and its standard deviation where the focal length is known or a mere guess;
+#: the same of fy against fx: images that were resized to another aspect have pixels that are not
+#: square
 _ZOOM_UNIT, _ZOOM_KNOWN, _ZOOM_GUESSED = 0.02, 0.003, 0.35
 
 
-def zoomed(camera: CameraModel, factor: float) -> CameraModel:
-    """Returns the camera with another focal length."""
+_STRETCH_KNOWN, _STRETCH_GUESSED = 0.001, 0.1
+#: steps of the logarithms of fx and fy, (2, 2) in rows
+_ZOOM_STEPS = _ZOOM_UNIT * np.array([[1.0, 1.0], [0.0, 1.0]])
+
+
+def zoomed(camera: CameraModel, factor: float | FloatArray) -> CameraModel:
+    """Returns the camera with other focal lengths; `factor` is one, or (2,) of fx and fy."""
     K = camera.K.copy()
-    K[:2, :2] *= factor
+    K[:2, :2] *= np.broadcast_to(factor, 2)[:, None]
     return replace(camera, K=K)
 
 
@@ -76,12 +83,12 @@ class JointState:
 
     Attributes:
         poses: (4, 4) T_base_camera [m] by place.
-        zoom: focal length against that of the camera given.
+        zoom: (2,) fx and fy against those of the camera given.
         own_steps: (6,) by place, in `UNITS`: how far its pose has gone its own way.
     """
 
     poses: Mapping[int, FloatArray]
-    zoom: float = 1.0
+    zoom: FloatArray = field(default_factory=lambda: np.ones(2))
     own_steps: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def own(self, place: int) -> FloatArray:
@@ -91,7 +98,7 @@ class JointState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Step:
-    """Normal equations of a place: six of its pose, and the zoom."""
+    """Normal equations of a place: six of its pose, and two of the zoom."""
 
     normal: FloatArray
     gradient: FloatArray
@@ -101,9 +108,11 @@ class JointCamera:
     """Estimates poses by place, and one focal length.
 
     Args:
-        recordings: one of each recording.
-        places: number of the place of each.
+        recordings: one of each recording and view.
+        places: number of the place of each; views have places of their own.
         intrinsics_known: whether the focal length is that of a calibration.
+        views: number of the view of each; None = all are of one. Views share the focal length
+            (against that of each one's camera) and nothing else.
     """
 
     def __init__(
@@ -112,9 +121,15 @@ class JointCamera:
         places: Sequence[int],
         *,
         intrinsics_known: bool,
+        views: Sequence[int] | None = None,
     ) -> None:
         self._recordings, self._places = list(recordings), list(places)
-        self._zoom_std = _ZOOM_KNOWN if intrinsics_known else _ZOOM_GUESSED
+        self._view_of = dict(zip(self._places, views or [0] * len(places), strict=True))
+        self._zoom_std = (
+            np.array([_ZOOM_KNOWN, _STRETCH_KNOWN])
+            if intrinsics_known
+            else np.array([_ZOOM_GUESSED, _STRETCH_GUESSED])
+        )
         self._centre = np.mean([one.centre for one in recordings], axis=0)
         self._points: Sequence[SeenPoint] = ()
         self._seen: dict[tuple[int, int, float, Reading], Changes] = {}
@@ -154,41 +169,68 @@ class JointCamera:
             best = self._respread(places.near(_NEAR)[0], best, places)
         return self.refined(best, _STAGES[1:], 9)
 
-    def from_points(
-        self, places: CameraPlaces, points: Sequence[SeenPoint], seed: int = 0
+    def together(
+        self, state: JointState, points: Sequence[SeenPoint] = (), *, from_guess: bool = False
     ) -> JointState:
-        """The state at which tool points are seen where somebody saw them."""
+        """The state near one that was found view by view.
+
+        Args:
+            state: with the poses of all places.
+            points: seen tool points, of any of the recordings.
+            from_guess: whether the state is a mere guess.
+        """
+        self._points = points
+        near = self.refined(state, _STAGES[:1], 14) if from_guess else state
+        return self.refined(near, _STAGES[1:], 14)
+
+    def from_points(
+        self,
+        places: CameraPlaces,
+        points: Sequence[SeenPoint],
+        seed: int = 0,
+        zoom: FloatArray | None = None,
+    ) -> JointState:
+        """The state at which tool points are seen where somebody saw them.
+
+        Args:
+            places: of the recordings.
+            points: of any of the recordings.
+            seed: of the cameras that are tried.
+            zoom: (2,), held there; None = it is estimated.
+        """
         camera = self._recordings[0].camera
-        focal = float(camera.K[0, 0])
+        focal = camera.K[[0, 1], [0, 1]]
         first = points[0].recording
         turns = np.stack([self._turn(first, p.recording, places, focal) for p in points])
         X = np.stack([point.position for point in points])
         seen = np.stack([point.pixel for point in points])
         generator = np.random.default_rng(seed)
-        std = min(self._zoom_std, 0.3)
+        held = np.array([_ZOOM_KNOWN, _STRETCH_KNOWN])
+        std = np.minimum(self._zoom_std, 0.3) if zoom is None else held
+        middle = np.zeros(2) if zoom is None else _parted(zoom)
 
         def errors(p: FloatArray) -> FloatArray:
             local = (X - p[3:6]) @ cv2.Rodrigues(p[:3])[0]
             local = np.einsum('nij,nj->ni', turns, local)
             depth = np.maximum(local[:, 2:], 0.05)
-            pixels = local[:, :2] / depth * camera.K[[0, 1], [0, 1]] * np.exp(p[6])
+            pixels = local[:, :2] / depth * camera.K[[0, 1], [0, 1]] * _joined(p[6:])
             apart = (pixels + camera.K[:2, 2] - seen) / (0.012 * camera.width)
-            return np.concatenate([apart.ravel(), p[6:] / std])
+            return np.concatenate([apart.ravel(), (p[6:] - middle) / std])
 
         best = None
         reach = float(np.linalg.norm(X - X.mean(axis=0), axis=1).max()) + 0.2
         for _ in range(_NUM_POINT_STARTS):
             T = random_camera(X.mean(axis=0), generator.uniform(0.3, 2.5), reach, generator)
-            start = np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3], [0.0]])
+            start = np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3], middle])
             found = least_squares(errors, start, loss='soft_l1', max_nfev=60)
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = cv2.Rodrigues(best.x[:3])[0], best.x[3:6]
-        return self._spread(first, T, float(np.exp(best.x[6])), places)
+        return self._spread(first, T, _joined(best.x[6:]), places)
 
-    def _turn(self, a: int, b: int, places: CameraPlaces, focal: float) -> FloatArray:
+    def _turn(self, a: int, b: int, places: CameraPlaces, focal: FloatArray) -> FloatArray:
         """(3, 3) that takes rays of recording a to those of b; by a third one where none match."""
         if places.place[a] == places.place[b]:
             return np.eye(3)
@@ -199,13 +241,16 @@ class JointCamera:
                 R = np.eye(3)
                 for x, y in steps:
                     pairs = places.matches[min(x, y), max(x, y)]
-                    R = turn_between(pairs if x < y else pairs[:, ::-1], focal / width) @ R
+                    square = pairs * np.array([1.0, focal[0] / focal[1]])
+                    R = turn_between(square if x < y else square[:, ::-1], focal[0] / width) @ R
                 return R
         return np.eye(3)
 
-    def _spread(self, number: int, T: FloatArray, zoom: float, places: CameraPlaces) -> JointState:
+    def _spread(
+        self, number: int, T: FloatArray, zoom: FloatArray, places: CameraPlaces
+    ) -> JointState:
         """The state with a recording's pose, the others turned as their backgrounds say."""
-        focal = float(self._recordings[0].camera.K[0, 0]) * zoom
+        focal = self._recordings[0].camera.K[[0, 1], [0, 1]] * zoom
         poses = {}
         for other, place in enumerate(self._places):
             if place not in poses:
@@ -225,7 +270,7 @@ class JointCamera:
             self._seen[key] = self._recordings[number].changes(*stage, reading)
         return self._seen[key]
 
-    def search(self, members: Sequence[int], seed: int = 0) -> list[tuple[FloatArray, float]]:
+    def search(self, members: Sequence[int], seed: int = 0) -> list[tuple[FloatArray, FloatArray]]:
         """Poses and zooms from cameras all around that fit some recordings best, best first.
 
         Args:
@@ -242,7 +287,7 @@ class JointCamera:
         camera = changes[0][READINGS[0]].camera
         tried = []
         for _ in range(_NUM_TRIED):
-            zoom = 1.0 if self._zoom_std < 0.1 else float(np.exp(generator.normal(0, 0.3)))
+            zoom = 1.0 if self._zoom_std[0] < 0.1 else float(np.exp(generator.normal(0, 0.3)))
             narrowest = min(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]) / zoom
             away = reach / narrowest * generator.uniform(0.5, 3.5)
             T = random_camera(self._centre, away, reach, generator)
@@ -250,9 +295,9 @@ class JointCamera:
                 max(one.rough_fits(T, _zoomed(each[READINGS[0]], zoom), cells))
                 for one, each, cells in zip(chosen, changes, rough, strict=True)
             ]
-            tried.append((float(np.mean(fits)), len(tried), T, zoom))
+            tried.append((float(np.mean(fits)), len(tried), T, np.full(2, zoom)))
         tried.sort(reverse=True)
-        best: list[tuple[FloatArray, float]] = []
+        best: list[tuple[FloatArray, FloatArray]] = []
         for _, _, T, zoom in tried:
             if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
                 best.append((T, zoom))
@@ -314,14 +359,14 @@ class JointCamera:
         return state
 
     def _errors(
-        self, number: int, T: FloatArray, zoom: float, changes: Mapping[int, Changes]
+        self, number: int, T: FloatArray, zoom: FloatArray, changes: Mapping[int, Changes]
     ) -> NDArray[np.floating]:
         one = self._recordings[number]
         return one.errors(T, _zoomed(changes[number], zoom)).ravel()
 
     def _cost(self, state: JointState, changes: Mapping[int, Changes]) -> float:
         pulls = [(state.own(place) / _OWN_STD) ** 2 for place in state.poses]
-        prior = (np.log(state.zoom) / self._zoom_std) ** 2 + float(np.sum(pulls))
+        prior = float(((_parted(state.zoom) / self._zoom_std) ** 2).sum() + np.sum(pulls))
         for point in self._points:
             apart = self._point_error(
                 point, state.poses[self._places[point.recording]], state.zoom
@@ -334,9 +379,9 @@ class JointCamera:
             total += float(np.log1p((errors / _OUTLIER) ** 2).mean())
         return total
 
-    def _point_error(self, point: SeenPoint, T: FloatArray, zoom: float) -> FloatArray:
+    def _point_error(self, point: SeenPoint, T: FloatArray, zoom: FloatArray) -> FloatArray:
         """(2,) how far a point is drawn from where it was seen [standard deviations]."""
-        camera = self._recordings[0].camera
+        camera = self._recordings[point.recording].camera
         local = T[:3, :3].T @ (point.position - T[:3, 3])
         pixel = zoom * camera.K[[0, 1], [0, 1]] * local[:2] / max(float(local[2]), 0.05)
         return (pixel + camera.K[:2, 2] - point.pixel) / (_POINT_STD * camera.width)
@@ -354,9 +399,12 @@ class JointCamera:
                  - self._point_error(point, moved(T, -row, self._centre), zoom)) / 2
                 for row in np.diag(UNITS)
             ]  # fmt: skip
-            wide = self._point_error(point, T, zoom * np.exp(_ZOOM_UNIT))
-            narrow = self._point_error(point, T, zoom * np.exp(-_ZOOM_UNIT))
-            table = np.stack([*slopes, (wide - narrow) / 2])
+            slopes += [
+                (self._point_error(point, T, zoom * np.exp(step))
+                 - self._point_error(point, T, zoom * np.exp(-step))) / 2
+                for step in _ZOOM_STEPS
+            ]  # fmt: skip
+            table = np.stack(slopes)
             weight = _STIFFNESS / (1 + float((now**2).sum()) / 2)
             step = found[place]
             found[place] = _Step(
@@ -376,9 +424,11 @@ class JointCamera:
                  - self._errors(number, moved(T, -row, self._centre), zoom, changes)) / 2
                 for row in np.diag(UNITS)
             ]  # fmt: skip
-            wide, narrow = zoom * np.exp(_ZOOM_UNIT), zoom * np.exp(-_ZOOM_UNIT)
-            slopes.append((self._errors(number, T, wide, changes)
-                           - self._errors(number, T, narrow, changes)) / 2)  # fmt: skip
+            slopes += [
+                (self._errors(number, T, zoom * np.exp(step), changes)
+                 - self._errors(number, T, zoom * np.exp(-step), changes)) / 2
+                for step in _ZOOM_STEPS
+            ]  # fmt: skip
             table = np.stack(slopes)
             weighted = table / (1 + (now / _OUTLIER) ** 2) / now.size
             step = _Step(
@@ -393,33 +443,54 @@ class JointCamera:
         return found
 
     def _moved(self, state: JointState, steps: Mapping[int, _Step], damping: float) -> JointState:
-        """The state after a damped step of what all share (pose, zoom) and of each place's own.
+        """The state after a damped step of what is shared and of each place's own.
 
-        A place's own six numbers are eliminated first (Schur complement).
+        All share the zoom, the places of a view a pose. A place's own six numbers are eliminated
+        first (Schur complement).
         """
-        shared, slope = np.zeros((7, 7)), np.zeros(7)
-        shared[6, 6] = _STIFFNESS * (_ZOOM_UNIT / self._zoom_std) ** 2
-        slope[6] = shared[6, 6] * np.log(state.zoom) / _ZOOM_UNIT
+        size = 6 * (1 + max(self._view_of.values())) + 2
+        shared, slope = np.zeros((size, size)), np.zeros(size)
+        stiff = _STIFFNESS * (_ZOOM_UNIT / self._zoom_std) ** 2
+        shared[-2:, -2:] = np.diag(stiff)
+        slope[-2:] = stiff * _parted(state.zoom) / _ZOOM_UNIT
         solved = {}
         for place, step in steps.items():
             normal = step.normal + damping * np.diag(np.diag(step.normal))
             own = normal[:6, :6] + np.diag(_STIFFNESS / _OWN_STD**2)
             pull = step.gradient[:6] + _STIFFNESS / _OWN_STD**2 * state.own(place)
             gain = np.linalg.solve(own, np.column_stack([normal[:6], pull]))
-            shared += normal - normal[:, :6] @ gain[:, :7]
-            slope += step.gradient - normal[:, :6] @ gain[:, 7]
+            at = self._shared_rows(place, size)
+            shared[np.ix_(at, at)] += normal - normal[:, :6] @ gain[:, :8]
+            slope[at] += step.gradient - normal[:, :6] @ gain[:, 8]
             solved[place] = gain
-        step_of_all = -np.linalg.solve(shared + 1e-12 * np.eye(7), slope)
+        step_of_all = -np.linalg.solve(shared + 1e-12 * np.eye(size), slope)
         step_of_all *= min(1.0, 4.0 / max(float(np.abs(step_of_all).max()), 1e-9))
         poses, own_steps = dict(state.poses), dict(state.own_steps)
         for place, gain in solved.items():
-            own_step = (-gain[:, :7] @ step_of_all - gain[:, 7]).clip(-4, 4)
-            change = step_of_all[:6] + own_step
+            of_view = step_of_all[self._shared_rows(place, size)]
+            own_step = (-gain[:, :8] @ of_view - gain[:, 8]).clip(-4, 4)
+            change = of_view[:6] + own_step
             poses[place] = moved(poses[place], change * UNITS, self._centre)
             own_steps[place] = state.own(place) + own_step
-        zoom = state.zoom * float(np.exp(step_of_all[6] * _ZOOM_UNIT))
+        zoom = state.zoom * np.exp(step_of_all[-2:] @ _ZOOM_STEPS)
         return JointState(poses=poses, zoom=zoom, own_steps=own_steps)
 
+    def _shared_rows(self, place: int, size: int) -> list[int]:
+        """Rows of what a place shares: its view's pose, and the zoom."""
+        first = 6 * self._view_of[place]
+        return [*range(first, first + 6), size - 2, size - 1]
 
-def _zoomed(changes: Changes, factor: float) -> Changes:
+
+def _parted(zoom: FloatArray) -> FloatArray:
+    """(2,) logarithms of fx, and of fy against it."""
+    logs = np.log(zoom)
+    return np.array([logs[0], logs[1] - logs[0]])
+
+
+def _joined(parts: FloatArray) -> FloatArray:
+    """(2,) zoom; the inverse of `_parted`."""
+    return np.exp(np.array([parts[0], parts[0] + parts[1]]))
+
+
+def _zoomed(changes: Changes, factor: float | FloatArray) -> Changes:
     return replace(changes, camera=zoomed(changes.camera, factor))

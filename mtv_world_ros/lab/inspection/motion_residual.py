@@ -5,7 +5,7 @@ P pairs of frames, J joints, H W pixels of the shrunk images, R the search radiu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -71,7 +71,8 @@ class MotionResidual:
         match_here: the same where the robot is drawn.
         contrast: by how many standard deviations that stands out from other shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
-        lag_gain: how much better they fit there than without a delay, as a share.
+        lag_gain: how much better they fit there than without a delay, as a share, in that half
+            of the recording in which it is less; below zero where a half fits worse.
         best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
         reason: why it could not be measured; empty where it was.
@@ -126,9 +127,9 @@ def measure_residual(
     some = pairs[::3]
     seen = _seen_motion(track, some, coarse)
 
-    def match(drawn_by: CameraModel, lag_s: float = 0.0) -> float:
-        stamps_ns = track.stamps_ns[some].ravel() - round(lag_s * 1e9)
-        return _top(_surface(seen, joints.at(stamps_ns), drawn_by, robot, shapes))
+    def match(drawn_by: CameraModel, lag_s: float = 0.0, part: slice = slice(None)) -> float:
+        stamps_ns = track.stamps_ns[some[part]].ravel() - round(lag_s * 1e9)
+        return _top(_surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes))
 
     positions = joints.at(track.stamps_ns[pairs].ravel())
     now = _surface(_seen_motion(track, pairs, small), positions, small, robot, shapes)
@@ -139,18 +140,30 @@ def measure_residual(
     changes = {name: match(changed) for name, changed in _changes(coarse, search).items()}
     gain = float(now.max()) - match(coarse)
     best = max(changes, key=changes.__getitem__, default='')
-    lags = {lag_s: match(coarse, lag_s) for lag_s in search.lags_s}
-    lag_s = max(lags, key=lags.__getitem__)
+    lag_s, lag_gain = _delay(search.lags_s, match, len(some), coarse)
     return MotionResidual(
         shift_px=(float(shift[0]), float(shift[1])),
         match=float(now.max()),
         match_here=float(now[len(now) // 2, len(now) // 2]),
         contrast=float((now.max() - now.mean()) / spread) if spread > 0 else 0.0,
         lag_s=lag_s,
-        lag_gain=lags[lag_s] / max(lags.get(0.0, lags[lag_s]), 1e-6) - 1,
+        lag_gain=lag_gain,
         best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
     )
+
+
+def _delay(
+    lags_s: Sequence[float], match: Callable[..., float], count: int, camera: CameraModel
+) -> tuple[float, float]:
+    """The delay at which both halves of the recording together fit best, and its least gain."""
+    halves = [slice(0, count // 2), slice(count // 2, count)]
+    fits = {lag_s: [match(camera, lag_s, part) for part in halves] for lag_s in lags_s}
+    fits = {lag_s: [fit for fit in row if np.isfinite(fit)] for lag_s, row in fits.items()}
+    lag_s = max(fits, key=lambda each: float(np.sum(fits[each])))
+    still = fits.get(0.0, fits[lag_s])
+    gains = [there / max(here, 1e-6) - 1 for there, here in zip(fits[lag_s], still, strict=False)]
+    return lag_s, min(gains, default=0.0)
 
 
 def _changes(camera: CameraModel, search: ResidualSearch) -> dict[str, CameraModel]:

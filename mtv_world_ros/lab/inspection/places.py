@@ -53,6 +53,14 @@ def background(track: Track) -> ByteArray:
     return np.median(frames, axis=0).astype(np.uint8)
 
 
+def keeps_place(track: Track) -> bool:
+    """Whether a camera stands still, by the backgrounds of both halves of its recording."""
+    half = len(track.stamps_ns) // 2
+    parts = (slice(0, half), slice(half, None))
+    halves = [Track(track.stamps_ns[part], track.frames[part]) for part in parts]
+    return half > 1 and find_places([background(part) for part in halves]).place.max() == 0
+
+
 def find_places(backgrounds: Sequence[ByteArray]) -> CameraPlaces:
     """Groups recordings whose backgrounds lie at the same pixels.
 

@@ -1,4 +1,4 @@
-"""One view of several recordings: its poses and focal length, judged beside a guess."""
+"""Views of several recordings: their poses and focal length, judged beside a guess."""
 
 from __future__ import annotations
 
@@ -78,34 +78,80 @@ class SharedEstimate:
         return ''
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _View:
+    """A view in several recordings, before it is estimated."""
+
+    name: str
+    cameras: list[CameraModel]
+    recordings: list[FixedCamera]
+    places: CameraPlaces
+    points: list[SeenPoint]
+    joint: JointCamera
+
+    @property
+    def numbers(self) -> list[int]:
+        """Place of each recording."""
+        return [int(n) for n in self.places.place]
+
+    @property
+    def given(self) -> JointState:
+        """The poses of the recordings."""
+        rows = reversed(list(zip(self.numbers, self.cameras, strict=True)))
+        return JointState(poses={place: camera.T_mount_camera for place, camera in rows})
+
+
 def estimate_shared(
     episodes: Sequence[Episode],
-    view: str,
+    views: Sequence[str],
     robot: RobotModel,
     shapes: Sequence[LinkShape],
     *,
     guess: bool,
-    points: Mapping[str, Sequence[Any]] | None = None,
+    points: Mapping[str, Mapping[str, Sequence[Any]]] | None = None,
     focal_known: bool = True,
     seed: int = 0,
-) -> SharedEstimate:
-    """Estimates one fixed camera from several recordings.
+) -> tuple[SharedEstimate, ...]:
+    """Estimates fixed cameras of one make, each from several recordings.
 
     Args:
-        episodes: with cameras of the view, whose intrinsics and, with `guess`, pose are starts.
-        view: the view.
+        episodes: with cameras of the views, whose intrinsics and, with `guess`, poses are starts.
+        views: V views that share their focal length.
         robot: of the recordings.
         shapes: of its links.
         guess: start from the poses of the recordings.
-        points: seen tool points by the name of the episode: (time [s], x, y [px]).
+        points: seen tool points by view and by the name of the episode: (time [s], x, y [px]).
         focal_known: whether the focal length is right as it is.
         seed: of the search.
+
+    Returns:
+        One of each view.
 
     Raises:
         CalibrationError: a camera is on the arm, or the arm stands still.
         ConfigError: a point is of no episode or of no frame.
     """
     tracks = [_joints(episode, robot) for episode in episodes]
+    each = [
+        _view(episodes, view, robot, shapes, tracks, (points or {}).get(view, {}), focal_known)
+        for view in views
+    ]
+    states = _together(each, guess, focal_known, seed)
+    return tuple(
+        _judged(view, state, episodes, robot, shapes, tracks, guess=guess)
+        for view, state in zip(each, states, strict=True)
+    )
+
+
+def _view(
+    episodes: Sequence[Episode],
+    view: str,
+    robot: RobotModel,
+    shapes: Sequence[LinkShape],
+    tracks: Sequence[JointTrack],
+    points: Mapping[str, Sequence[Any]],
+    focal_known: bool,
+) -> _View:
     cameras = [_on_base(episode.cameras[view], robot) for episode in episodes]
     focal = float(np.median([camera.K[0, 0] for camera in cameras]))
     cameras = [zoomed(camera, focal / camera.K[0, 0]) for camera in cameras]
@@ -118,34 +164,99 @@ def estimate_shared(
     ]  # fmt: skip
     places = find_places([background(episode.images[view]) for episode in episodes])
     numbers = [int(n) for n in places.place]
-    joint = JointCamera(recordings, numbers, intrinsics_known=focal_known)
-    given = JointState(
-        poses={p: c.T_mount_camera for p, c in reversed(list(zip(numbers, cameras, strict=True)))}
+    return _View(
+        name=view,
+        cameras=cameras,
+        recordings=recordings,
+        places=places,
+        points=_seen_points(points, episodes, tracks, robot),
+        joint=JointCamera(recordings, numbers, intrinsics_known=focal_known),
     )
-    seen = _seen_points(points or {}, episodes, tracks, robot)
-    state = joint.estimate(places, given if guess else None, seen, seed)
+
+
+def _together(
+    each: Sequence[_View], guess: bool, focal_known: bool, seed: int
+) -> list[JointState]:
+    """The state of each view, with one zoom."""
+    if len(each) == 1:
+        view = each[0]
+        start = view.given if guess else None
+        return [view.joint.estimate(view.places, start, view.points, seed)]
+    starts = [_start(view, guess, seed) for view in each]
+    zoom = np.exp(np.mean([np.log(state.zoom) for state in starts], axis=0))
+    starts = [
+        view.joint.from_points(view.places, view.points, seed, zoom)
+        if view.points and not guess
+        else replace(state, zoom=zoom)
+        for view, state in zip(each, starts, strict=True)
+    ]
+    firsts = np.cumsum([0, *(1 + max(view.numbers) for view in each)])
+    recordings = [one for view in each for one in view.recordings]
+    numbers = [int(first) + n for view, first in zip(each, firsts, strict=False)
+               for n in view.numbers]  # fmt: skip
+    of_view = [number for number, view in enumerate(each) for _ in view.numbers]
+    joint = JointCamera(recordings, numbers, intrinsics_known=focal_known, views=of_view)
+    rows = np.cumsum([0, *(len(view.numbers) for view in each)])
+    points = [
+        replace(point, recording=point.recording + int(row))
+        for view, row in zip(each, rows, strict=False)
+        for point in view.points
+    ]
+    poses = {
+        int(first) + place: T
+        for state, first in zip(starts, firsts, strict=False)
+        for place, T in state.poses.items()
+    }
+    found = joint.together(JointState(poses=poses, zoom=zoom), points)
+    return [
+        JointState(poses={n: found.poses[int(first) + n] for n in view.numbers}, zoom=found.zoom)
+        for view, first in zip(each, firsts, strict=False)
+    ]
+
+
+def _start(view: _View, guess: bool, seed: int) -> JointState:
+    """A view's own state, from which all go on together."""
+    if guess:
+        return view.given
+    if view.points:
+        return view.joint.from_points(view.places, view.points, seed)
+    return view.joint.estimate(view.places, None, (), seed)
+
+
+def _judged(
+    view: _View,
+    state: JointState,
+    episodes: Sequence[Episode],
+    robot: RobotModel,
+    shapes: Sequence[LinkShape],
+    tracks: Sequence[JointTrack],
+    *,
+    guess: bool,
+) -> SharedEstimate:
+    """The better of guess and result by the doctor's measure."""
 
     def measured(found: Sequence[CameraModel]) -> tuple[MotionResidual, ...]:
         rows = zip(episodes, found, tracks, strict=True)
         return tuple(
-            measure_residual(episode.images[view], camera, robot, shapes, joints, _MEASURE)
+            measure_residual(episode.images[view.name], camera, robot, shapes, joints, _MEASURE)
             for episode, camera, joints in rows
         )
 
     ends = [
         replace(zoomed(camera, state.zoom), T_mount_camera=state.poses[place])
-        for camera, place in zip(cameras, numbers, strict=True)
+        for camera, place in zip(view.cameras, view.numbers, strict=True)
     ]
-    measures, before = measured(ends), measured(cameras) if guess else ()
+    measures, before = measured(ends), measured(view.cameras) if guess else ()
     kept = bool(before) and _mean_match(before) > _mean_match(measures)
+    focal = float(view.cameras[0].K[0, 0])
     return SharedEstimate(
-        cameras=tuple(cameras if kept else ends),
-        places=places,
+        cameras=tuple(view.cameras if kept else ends),
+        places=view.places,
         measures=before if kept else measures,
         guess_measures=before,
         kept_guess=kept,
-        focal_px=focal if kept else focal * state.zoom,
-        fits=joint.fits(given if kept else state),
+        focal_px=focal if kept else focal * float(state.zoom[0]),
+        fits=view.joint.fits(view.given if kept else state),
     )
 
 

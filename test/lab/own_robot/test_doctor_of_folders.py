@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from crane import FPS, load, make_cameras, make_positions, render, START_NS
+from crane import FPS, load, make_cameras, make_positions, render, START_NS, write_robot
 import numpy as np
 import pytest
 
@@ -12,6 +12,7 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.inspection.folder import folder_text, inspect_folder
 from mtv_world_ros.lab.inspection.inspect import Inspector
@@ -44,6 +45,15 @@ def write(path, robot, camera, positions, frames, *, states=None, every=1, spare
                 writer.write_image(camera.view, stamp, np.ascontiguousarray(frames[k]))
 
 
+def load_longer(folder):
+    """The robot with longer arms, as another URDF would have them."""
+    file = write_robot(folder)
+    urdf = file.with_suffix('.urdf')
+    text = urdf.read_text().replace('xyz="0 0 0.36"', 'xyz="0 0 0.5"')
+    urdf.write_text(text.replace('xyz="0 0 0.3"', 'xyz="0 0 0.42"'))
+    return load_robot(file)
+
+
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """Robot and a folder: two good episodes, and one of each kind of bad ones."""
@@ -65,6 +75,16 @@ def folder(tmp_path_factory):
     bad('longer', spare=round(4 * FPS))
     bad('mirrored', frames[:, :, ::-1])
     bad('slow', every=FPS)
+    noise = np.random.default_rng(0).normal(0, 4, frames.shape)
+    empty = np.median(frames, axis=0) + noise  # the arm is elsewhere
+    bad('unseen', np.clip(empty, 0, 255).astype(np.uint8))
+    swapped = positions.copy()
+    swapped[:, 5] = 0.04 - positions[:, 5]
+    bad('swapped', states=swapped)
+    other = make_cameras()['window']
+    bad('mixed', render(robot, other, positions))
+    longer = load_longer(place / 'longer_arm')
+    bad('urdf', render(longer, camera, positions))
     turn = np.eye(4)
     turn[:3, :3] = [[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]]
     moved = replace(camera, T_mount_camera=camera.T_mount_camera @ turn)
@@ -90,6 +110,10 @@ def inspected(folder):
         ('longer', 'suspicious', 'after the last frame'),
         ('mirrored', 'broken', 'mirror'),
         ('slow', 'suspicious', '1 frames a second'),
+        ('unseen', 'broken', 'does not move like the drawn robot'),
+        ('swapped', 'suspicious', 'open and closed swapped'),
+        ('mixed', 'broken', 'shares no background with any other episode'),
+        ('urdf', 'suspicious', 'check K, T_mount_camera and the tool offset'),
     ],
 )
 def test_what_is_wrong_is_named_in_its_own_row(inspected, name, verdict, said):

@@ -14,17 +14,22 @@ import subprocess
 import sys
 
 from bags import record
-from crane import FPS, load, make_cameras, make_positions
+from crane import FPS, load, make_cameras, make_positions, render, tool_pixels
+import numpy as np
 import pytest
 from test_import_bag import MAPPING
 from test_own_checkpoint import TINY
 import yaml
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.rendering.video import encode_video
 
 PAGE = Path(__file__).resolve().parents[3] / 'docs' / 'your_robot.md'
 #: names on the page, and those of the test's robot
 NAMES = {'my_robot': 'crane', 'first_bag': 'wave', 'front,side': 'door,palm'}
+VIDEO_NAMES = {'my_robot': 'crane', 'front,side': 'door,window'}
 #: keep the commands small
 SMALL = {
     'train': ['--threads', '1', *(word for item in TINY for word in ('--set', item))],
@@ -58,10 +63,15 @@ class Nod:
 STATUS = {'doctor': 3}
 
 
-def lines() -> list[list[str]]:
+#: the part of the page that is about videos and tables
+VIDEOS = '## From videos and tables'
+
+
+def lines(*, of_videos: bool = False) -> list[list[str]]:
     """Words of the page's `mtv-world` lines, one after the other."""
-    text = PAGE.read_text()
-    for name, own in NAMES.items():
+    before, _, after = PAGE.read_text().partition(VIDEOS)
+    text = after if of_videos else before
+    for name, own in (VIDEO_NAMES if of_videos else NAMES).items():
         text = text.replace(name, own)
     blocks = [part.split('```')[0] for part in text.split('```bash\n')[1:]]
     return [shlex.split(line) for block in blocks for line in block.splitlines() if line]
@@ -137,6 +147,63 @@ def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
         done.append(command)
     assert done == ['robot', 'import-bag', 'doctor', 'train', 'evaluate', 'replay']
     assert (at_the_desk / 'out' / 'mine' / 'metrics.json').is_file()
+
+
+@pytest.fixture(scope='module')
+def lab(tmp_path_factory):
+    """Folder with a URDF, videos and tables of two recordings, and the one file to write."""
+    folder = tmp_path_factory.mktemp('lab')
+    robot, cameras = load(folder), make_cameras()
+    del cameras['palm']
+    clicked = {view: {} for view in cameras}
+    for name, seed in (('one', 0), ('two', 1)):
+        positions = make_positions(6.0, seed=seed)
+        (folder / 'raw' / name).mkdir(parents=True)
+        np.savetxt(folder / 'raw' / name / 'joints.csv', positions, delimiter=',',
+                   header=','.join(robot.joint_names), comments='')  # fmt: skip
+        for view, camera in cameras.items():
+            frames = render(robot, camera, positions)
+            (folder / 'raw' / name / f'{view}.mp4').write_bytes(encode_video(frames, FPS))
+            seen = tool_pixels(robot, camera, positions)
+            clicked[view][name] = [[k / FPS, *seen[k].round().tolist()] for k in (3, 21, 45)]
+    shutil.move(folder / 'crane' / 'crane.urdf', folder / 'crane.urdf')
+    (folder / 'crane' / 'crane.yaml').unlink()
+    said = {
+        'robot': 'crane.yaml',
+        'rows': '{name}/joints.csv',
+        'views': {view: f'{{name}}/{view}.mp4' for view in cameras},
+        'fps': FPS,
+        'state': {'feature': '', 'joints': None},
+        'instruction': 'wave',
+    }
+    (folder / 'my_lab.yaml').write_text(yaml.safe_dump(said))
+    (folder / 'points.yaml').write_text(yaml.safe_dump(clicked))
+    return folder, cameras
+
+
+def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys):
+    """With at most eight commands, and cameras of which nothing was known."""
+    folder, cameras = lab
+    monkeypatch.chdir(folder)
+    told = lines(of_videos=True)
+    assert len(told) <= 8
+    for words in told:
+        more = ['--set', 'optimizer.steps=2', '--threads', '1'] if words[1] == 'train' else []
+        more = SMALL['evaluate'][:-1] if words[1] == 'evaluate' else more
+        status = main([*words[1:], *more])
+        said = capsys.readouterr()
+        assert status == 0, f'{words}: {said.out}{said.err}'
+    assert 'data:image/webp' in (folder / 'out' / 'lab' / 'report.html').read_text()
+    robot = load_robot(folder / 'data' / 'lab' / 'robot' / 'robot.yaml')
+    for name, seed in (('one', 0), ('two', 1)):
+        found = read_episode(folder / 'data' / 'lab' / name, robot=robot).cameras
+        for view, camera in cameras.items():
+            positions = make_positions(6.0, seed=seed)
+            apart = tool_pixels(robot, camera, positions) - tool_pixels(
+                robot, found[view], positions
+            )
+            assert np.median(np.linalg.norm(apart, axis=1)) < 4.0  # of 320
+            assert abs(found[view].K[0, 0] / camera.K[0, 0] - 1) < 0.07
 
 
 @pytest.mark.skipif(find_spec('rclpy') is None, reason='rclpy is not installed')

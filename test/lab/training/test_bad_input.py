@@ -23,6 +23,7 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.resume import DiskError
 from mtv_world_ros.lab.training.trainer import Trainer
@@ -140,3 +141,11 @@ def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
         for step in range(3, 6):  # one batch was prepared before
             workers.batch(step)
     workers.close()
+
+
+def test_numbers_with_an_exponent_are_numbers():
+    """YAML 1.1 takes 4e-4 for a text."""
+    assert set_overrides(['optimizer.learning_rate=4e-4', 'video.robot=1e5a']) == {
+        'optimizer.learning_rate': 0.0004,
+        'video.robot': '1e5a',
+    }

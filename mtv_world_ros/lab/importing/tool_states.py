@@ -1,0 +1,103 @@
+"""Measured poses of an arm's tool, and the joints for them by inverse kinematics.
+
+T rows, J joints, n joints of an arm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mtv_world_ros.data.tool_targets import ToolTargets
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import EpisodeError, TrajectoryError
+from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
+
+#: postures that the first pose is solved from, and rows that may be out of reach
+_NUM_STARTS, _MOST_LOST = 24, 0.2
+
+
+def joints_of_poses(
+    positions: FloatArray,
+    robot: RobotModel,
+    arm: str,
+    poses: ToolTargets,
+    wanted: FloatArray,
+    seed: int = 0,
+) -> str:
+    """Writes an arm's joints for measured poses of its tool into `positions` (T, J).
+
+    Of the solutions of the first pose, the one nearest to the middle of the limits is taken;
+    each later one is the nearest to the one before. An arm of more than six joints has more
+    freedom than a pose tells: its elbow is where the least motion brings it, not where it was.
+
+    Args:
+        positions: to be changed.
+        robot: the robot.
+        arm: whose tool it is.
+        poses: frame and link of the poses.
+        wanted: (T, 4, 4) poses.
+        seed: of the postures that the first pose is solved from.
+
+    Returns:
+        What is left of the poses, in words.
+
+    Raises:
+        EpisodeError: poses are differences, or too many are out of reach.
+    """
+    if poses.difference:
+        raise EpisodeError(f"arm '{arm}': measured poses are no differences; 'difference' is set")
+    tool = poses.check(arm, robot)
+    solver = ArmSolver(robot, tool)
+    T_base_frame = robot.link_poses(poses.frame or robot.base_link, positions)
+    goals = T_base_frame @ wanted
+    row, lost = _first(solver, robot, goals[0], seed), 0
+    if row is None:
+        raise EpisodeError(f"arm '{arm}': its first pose is out of reach: {_HINT}")
+    for k, goal in enumerate(goals):
+        try:
+            row = solver.solve(goal, row)
+        except TrajectoryError:
+            lost += 1
+        positions[k, solver.indices] = row
+    if lost > _MOST_LOST * len(goals):
+        raise EpisodeError(f"arm '{arm}': {lost} of {len(goals)} poses are out of reach: {_HINT}")
+    mm, degrees = _left(positions, robot, tool, goals)
+    free = ''
+    if len(solver.indices) > 6:
+        free = '; its elbow is a guess: a pose does not tell it'
+    return (
+        f"arm '{arm}': joints by inverse kinematics, {lost} of {len(goals)} poses out of reach, "
+        f'{np.median(mm):.2f} mm and {np.median(degrees):.2f} degrees left in the median, '
+        f'{mm.max():.1f} mm and {degrees.max():.1f} degrees at most{free}'
+    )
+
+
+_HINT = 'are frame, link, unit and rotation_is right?'
+
+
+def _first(solver: ArmSolver, robot: RobotModel, goal: FloatArray, seed: int) -> FloatArray | None:
+    """The solution nearest to the middle of the limits; None where there is none."""
+    lower = np.maximum(robot.lower[solver.indices], -np.pi)
+    upper = np.minimum(robot.upper[solver.indices], np.pi)
+    middle, generator = (lower + upper) / 2, np.random.default_rng(seed)
+    starts = [middle, *generator.uniform(lower, upper, (_NUM_STARTS, len(middle)))]
+    solutions = []
+    for start in starts:
+        try:
+            found = solver.solve(goal, start)
+        except TrajectoryError:
+            continue
+        solutions.append(found)
+    return min(solutions, key=lambda row: float(np.abs(row - middle).sum()), default=None)
+
+
+def _left(
+    positions: FloatArray, robot: RobotModel, tool: Tool, goals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(T,) distances of the solved poses from the measured ones [mm, degrees]."""
+    reached = robot.link_poses(tool.link, positions) @ tool.T_link_tool
+    apart = np.linalg.inv(reached) @ goals
+    cosine = (np.trace(apart[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    mm = 1000 * np.linalg.norm(apart[:, :3, 3], axis=1)
+    return mm, np.degrees(np.arccos(np.clip(cosine, -1, 1)))

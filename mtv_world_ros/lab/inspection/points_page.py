@@ -1,0 +1,78 @@
+"""A page of frames on which somebody clicks where the tool point is seen."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.documents import render
+from mtv_world_ros.lab.inspection.clocks import JointTrack
+
+#: frames of each recording and view
+_NUM_FRAMES = 4
+
+
+def points_page(episodes: Sequence[Episode], views: Sequence[str], robot: RobotModel) -> str:
+    """Returns the page, in HTML.
+
+    Of each recording it has the frames in which the tool is farthest from where it was in the
+    others.
+
+    Args:
+        episodes: with joint states.
+        views: whose frames are shown.
+        robot: of the recordings.
+
+    Raises:
+        EpisodeError: a recording has no frame within its joint states.
+    """
+    shown = {
+        view: [frame for episode in episodes for frame in _frames(episode, view, robot)]
+        for view in views
+    }
+    title = f'Where is the tool point? {", ".join(views)}'
+    return render('points.html.j2', title=title, views=shown)
+
+
+def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, object]]:
+    track, name = episode.images[view], episode.info.path.name
+    if episode.joint_states is None:
+        raise EpisodeError(f"'{episode.info.path}' has no joint_states")
+    joints = JointTrack(episode.joint_states, robot)
+    covered = np.flatnonzero(joints.covers(track.stamps_ns))
+    if not len(covered):
+        raise EpisodeError(f"'{episode.info.path}', view '{view}': no frame has joint states")
+    places = robot.tool_poses(joints.at(track.stamps_ns[covered]))[0, :, :3, 3]
+    found = []
+    for row in sorted(_far_apart(places)):
+        index = int(covered[row])
+        seconds = float(track.stamps_ns[index] - joints.stamps_ns[0]) * 1e-9
+        frame = np.asarray(track.frames[index])
+        done, data = cv2.imencode('.jpg', frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+        assert done
+        found.append(
+            {
+                'episode': name,
+                'seconds': round(seconds, 3),
+                'width': frame.shape[1],
+                'jpeg': base64.b64encode(data.tobytes()).decode(),
+            }
+        )
+    return found
+
+
+def _far_apart(places: FloatArray) -> list[int]:
+    """Rows whose places (T, 3) are far from each other, the first among them."""
+    chosen = [0]
+    away = np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < min(_NUM_FRAMES, len(places)) and away.max() > 0.02:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return chosen
