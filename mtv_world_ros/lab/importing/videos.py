@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
-from mtv_world_ros.config import ListOf, Positive, read_yaml, Schema, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode import check_outcome, Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
@@ -45,14 +45,16 @@ class VideoMapping(Schema):
     rows: str = Field(description='JSON or CSV file of each recording, e.g. `joints/{name}.json`')
     views: dict[str, str] = Field(description='video file by view, e.g. `videos/{name}/0.mp4`')
     state: ActionStream = Field(description='measured joints, or poses of tools, of each row')
-    fps: float | None = Field(default=None, gt=0, description='rows a second, without `time`')
+    fps: float | None = Field(
+        default=None, gt=0, le=1000, description='rows a second, without `time`'
+    )
     time: str = Field(default='', description='column or key of the time of each row [s]')
     instruction: str = Field(default='', description='text, or `key: NAME` of the JSON file')
     task: str = ''
     outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
     objects: ListOf[str] = ()
-    chunk_s: Positive = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Positive = Field(
+    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
+    limit_tolerance: Length = Field(
         default=0.05, description='positions further outside the joint limits fail [rad or m]'
     )
     jpeg_quality: int = Field(default=95, ge=1, le=100)
