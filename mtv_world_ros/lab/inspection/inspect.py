@@ -59,7 +59,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 _MOVES = (
     'calibration not checked against the images: the camera moves by itself, with the poses of /tf'
 )
-_UNKNOWN = 'its {0} are not known: mtv-world calibrate-camera FOLDER --view {1}'
+_UNKNOWN = '{0} not known: mtv-world calibrate-camera FOLDER --view {1}'
 Checked = tuple[dict[str, str], list[Finding]]
 #: share of the frames in which at least one tool should be in the image
 _LEAST_IN_IMAGE = 0.5

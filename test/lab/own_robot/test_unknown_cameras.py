@@ -48,6 +48,11 @@ def test_unknown_poses_and_intrinsics_are_imported_and_marked(bag, tmp_path, cap
     blind = read_episode(episode, unknown_mount='plinth')
     assert blind.unknown == {'door': 'pose', 'palm': 'pose and intrinsics'}
     assert blind.cameras['door'].K[0, 0] == 300  # of the CameraInfo, which was kept
+    report = ['--out', str(tmp_path / 'report')]
+    robot = str(tmp_path / 'blind' / 'robot' / 'robot.yaml')
+    assert main(['doctor', str(episode), '--robot', robot, *report]) == 3  # not checked, not ok
+    printed = capsys.readouterr().out
+    assert 'pose not known: mtv-world calibrate-camera FOLDER --view door' in printed
 
 
 def test_a_mapping_may_have_more_views_than_are_asked_for(bag, tmp_path, capsys):
