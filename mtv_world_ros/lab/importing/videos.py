@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Private
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
 from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
-from mtv_world_ros.data.bag_mapping import BagMapping
+from mtv_world_ros.data.bag_mapping import BagMapping, ViewTopics
 from mtv_world_ros.data.episode import check_outcome, Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
 from mtv_world_ros.data_types import ByteArray, FloatArray
@@ -69,7 +69,7 @@ class VideoMapping(Schema):
         """What is said of the episodes that are written."""
         names = ('task', 'outcome', 'objects', 'chunk_s', 'limit_tolerance', 'jpeg_quality')
         given = {name: getattr(self, name) for name in names}
-        return BagMapping(**given, views={view: view for view in self.views})
+        return BagMapping(**given, views={view: ViewTopics(image=view) for view in self.views})
 
 
 def load_video_mapping(path: Path) -> VideoMapping:

@@ -57,7 +57,10 @@ def keeps_place(track: Track) -> bool:
     """Whether a camera stands still, by the backgrounds of both halves of its recording."""
     half = len(track.stamps_ns) // 2
     parts = (slice(0, half), slice(half, None))
-    halves = [Track(track.stamps_ns[part], track.frames[part]) for part in parts]
+    halves = [
+        Track(track.stamps_ns[part], track.frames[part])  # type: ignore[arg-type]
+        for part in parts
+    ]
     return half > 1 and find_places([background(part) for part in halves]).place.max() == 0
 
 
