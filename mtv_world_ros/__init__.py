@@ -18,12 +18,13 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+    from mtv_world_ros.imagined_episode import ImaginedEpisode
+    from mtv_world_ros.pipeline import Pipeline
     from mtv_world_ros.replay.judge import judge
 
 __all__ = ['ImaginedEpisode', 'judge', 'load_pipeline', 'Pipeline', 'read_episode']
 _PLACES = {
-    'ImaginedEpisode': 'pipeline',
+    'ImaginedEpisode': 'imagined_episode',
     'judge': 'replay.judge',
     'load_pipeline': 'assembly',
     'Pipeline': 'pipeline',

@@ -10,9 +10,9 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.imagined_episode import SEED_STEP
 from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.pipeline import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
 
 SPEC = WorldModelSpec(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -49,3 +50,34 @@ class ChunkPlan:
         count = round((self.times[-1] - self.times[0]) / step_s) * each
         times = self.times[0] + step_s / each * np.arange(count + 1)
         return resample(self.trajectory, self.current, times)
+
+
+def plan_chunks(
+    trajectory: JointTrajectory, current: FloatArray, stamp_ns: int, *, num_frames: int, fps: float
+) -> list[ChunkPlan]:
+    """Returns a trajectory on a model's clock, cut into its chunks.
+
+    Args:
+        trajectory: in the robot's joint order.
+        current: (J,) where the robot stands [rad or m].
+        stamp_ns: of the observation that it starts from [ns].
+        num_frames: of a whole chunk.
+        fps: frames a second.
+    """
+    total = max(1, ceil(float(trajectory.times[-1]) * fps - 1e-6))
+    num_chunks = ceil(total / num_frames)
+    times = np.arange(num_chunks * num_frames + 1) / fps
+    positions = resample(trajectory, current, times)
+    return [
+        ChunkPlan(
+            times=times[first : first + num_frames + 1],
+            positions=positions[first : first + num_frames + 1],
+            num_frames=min(num_frames, total - first),
+            stamp_ns=stamp_ns,
+            chunk=chunk,
+            num_chunks=num_chunks,
+            trajectory=trajectory,
+            current=current,
+        )
+        for chunk, first in enumerate(range(0, total, num_frames))
+    ]

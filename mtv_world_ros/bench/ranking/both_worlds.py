@@ -14,8 +14,8 @@ from mtv_world_ros.bench.ranking.rollout_jobs import COMMANDS_PART, Course, OBJE
 from mtv_world_ros.bench.ranking.worlds import SeenChunk
 from mtv_world_ros.data.stored_rollout import rollout_bytes, StoredRollout
 from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.imagined_episode import ObservedChunk
 from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip
-from mtv_world_ros.pipeline import ObservedChunk
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.success.verdict import verdict

@@ -164,9 +164,9 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.imagined_episode import SEED_STEP
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
-    from mtv_world_ros.pipeline import SEED_STEP
 
     load = partial(
         load_pipeline,
