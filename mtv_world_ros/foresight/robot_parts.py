@@ -18,13 +18,15 @@ from scipy.spatial import ConvexHull, QhullError
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
+from mtv_world_ros.geometry.robot.mesh_pieces import convex_pieces
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import (
+    element_shapes,
+    grip_links,
     LinkShape,
     moving_links,
     rods,
     shape_origin,
-    shapes_of,
 )
 
 #: of links that state no inertia: that of water, as MuJoCo takes it [kg/m^3]
@@ -71,7 +73,8 @@ def load_parts(robot: RobotModel) -> RobotParts:
     """Returns the parts that can touch something.
 
     The URDF's collision elements; for links that have none, what is drawn of them. A mesh counts
-    as its convex hull. Rods from joint to joint where nothing is described.
+    as its convex hull, that of a gripper as convex pieces, between which there is room for what
+    it holds. Rods from joint to joint where nothing is described.
 
     Raises:
         RobotError: a mesh is missing or cannot be read.
@@ -82,9 +85,10 @@ def load_parts(robot: RobotModel) -> RobotParts:
     path, links = described
     parts: list[Part] = []
     drawn: list[str] = []
+    grips = grip_links(robot)
     for name, link in links.items():
-        own = _parts_of(link, 'collision', path)
-        if not own and (own := _parts_of(link, 'visual', path)):
+        own = _parts_of(link, 'collision', path, name in grips)
+        if not own and (own := _parts_of(link, 'visual', path, name in grips)):
             drawn.append(name)
         parts += own
     if not any(part.link in moving_links(robot) for part in parts):
@@ -169,18 +173,16 @@ def _hull(shape: LinkShape) -> Part:
     return Part(link=shape.link, kind='hull', size=(), pose=np.eye(4), points=shape.points)
 
 
-def _parts_of(link: ElementTree.Element, kind: str, urdf: Path) -> list[Part]:
-    elements = [
-        element
-        for element in link.findall(kind)
-        if (shape := element.find('geometry')) is not None and len(shape)
-    ]
+def _parts_of(link: ElementTree.Element, kind: str, urdf: Path, is_grip: bool) -> list[Part]:
+    name, cut = link.attrib['name'], convex_pieces if is_grip else None
     try:
-        found = list(shapes_of(link, kind, urdf))
+        return [
+            _part(element, shape)
+            for element in link.findall(kind)
+            for shape in element_shapes(element, name, urdf, cut)
+        ]
     except FileNotFoundError as error:
         raise RobotError(f"'{urdf}': mesh {error} is missing; contact needs it") from error
-    pairs = zip(elements, found, strict=True)
-    return [_part(element, shape) for element, shape in pairs]
 
 
 def _part(element: ElementTree.Element, shape: LinkShape) -> Part:

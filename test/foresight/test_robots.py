@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull, Delaunay
 
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
@@ -15,7 +16,7 @@ from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.robot_parts import load_parts
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.file import load_robot, save_robot
 from mtv_world_ros.geometry.solids import Solid
 
 SETTINGS = ContactSettings(
@@ -66,6 +67,54 @@ def test_a_mesh_that_is_not_closed_counts_as_its_hull_filled_with_water(tmp_path
     turn = np.linspace(0, 0.8, 51)[:, None]
     points = batch.advance(turn, 5)[0].points[0, :, 0]
     assert np.linalg.norm(points[-1] - points[0]) > 0.01
+
+
+def fork(folder):
+    """A gripper of two meshes: a U that is one hull if nobody looks, and a jaw that turns."""
+    boxes = [((0, 0, 0), (0.01, 0.04, 0.01)), ((0, 0.035, 0.04), (0.01, 0.005, 0.04)),
+             ((0, -0.035, 0.04), (0.01, 0.005, 0.04))]  # fmt: skip
+    faces = []
+    for centre, half in boxes:
+        corners = np.array(list(product((-1, 1), repeat=3))) * half + centre
+        faces += [corners[list(face)] for face in (
+            (0, 1, 3), (0, 3, 2), (0, 4, 5), (0, 5, 1), (0, 2, 6), (0, 6, 4), (7, 5, 4), (7, 4, 6),
+            (7, 3, 1), (7, 1, 5), (7, 6, 2), (7, 2, 3))]  # fmt: skip
+    rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in faces]
+    (folder / 'fork.stl').write_bytes(bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+    (folder / 'fork.urdf').write_text("""<robot name="fork"><link name="base"/>
+      <link name="hand">
+      <collision><geometry><mesh filename="fork.stl"/></geometry></collision></link>
+      <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/>
+        <axis xyz="0 0 1"/><limit lower="0" upper="1" effort="9" velocity="1"/></joint>
+      <link name="jaw">
+      <collision><geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
+      <joint name="jaw" type="revolute"><origin xyz="0.02 0 0"/><parent link="hand"/>
+        <child link="jaw"/><axis xyz="1 0 0"/>
+        <limit lower="0" upper="1" effort="9" velocity="1"/></joint></robot>""")
+    (folder / 'fork.yaml').write_text(
+        'name: fork\nurdf: fork.urdf\ntools:\n  - {arm: arm, link: hand, gripper_joint: jaw, '
+        'gripper_closed: 0.0, gripper_open: 1.0, finger_travel_m: 0.03}\n'
+    )
+    return load_robot(folder / 'fork.yaml')
+
+
+def test_there_is_room_between_the_prongs_of_a_gripper_that_is_one_mesh(tmp_path):
+    parts = [part for part in load_parts(fork(tmp_path)).parts if part.link == 'hand']
+    volume = sum(ConvexHull(part.points).volume for part in parts)
+    # prongs and the palm that joins them: the hull of all has more than twice as much
+    assert volume < 0.6 * ConvexHull(np.concatenate([part.points for part in parts])).volume
+    assert all(Delaunay(part.points).find_simplex([[0, 0, 0.06]])[0] < 0 for part in parts)
+
+
+def test_a_copy_of_a_robot_keeps_the_pieces_of_its_gripper(tmp_path):
+    robot = fork(tmp_path)
+    parts = [part for part in load_parts(robot).parts if part.link == 'hand']
+    copy = load_robot(save_robot(robot.file, tmp_path / 'copy'))
+    kept = [part for part in load_parts(copy).parts if part.link == 'hand']
+    assert len(kept) == len(parts) > 1
+    for part, again in zip(parts, kept, strict=True):
+        np.testing.assert_allclose(again.points.min(0), part.points.min(0), atol=1e-6)
+        np.testing.assert_allclose(again.points.max(0), part.points.max(0), atol=1e-6)
 
 
 def test_a_mesh_that_is_missing_is_named(tmp_path):

@@ -28,8 +28,8 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.foresight.arms import finger_travels
 from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.geometry.robot.mesh_pieces import find_mesh
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import find_mesh
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
 

@@ -18,9 +18,16 @@ from mtv_world_ros.config import ListOf, Metres, Quaternion, read_yaml, Schema, 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
+from mtv_world_ros.geometry.robot.mesh_pieces import (
+    convex_pieces,
+    edges_of,
+    find_mesh,
+    load_mesh,
+    write_convex_hull,
+)
 from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
 from mtv_world_ros.geometry.robot.parser_output import parser_errors
-from mtv_world_ros.geometry.robot.shape import find_mesh, write_convex_hull
+from mtv_world_ros.geometry.robot.shape import grip_links
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
 #: expanded URDFs may keep xacro in comments, and `$(find ...)` in what is not of the robot
@@ -167,14 +174,14 @@ def _movable(model: pin.Model, followers: set[str]) -> list[str]:
 
 
 #: names in a folder that holds a copy of a robot
-ROBOT_YAML, _URDF, _MESHES = 'robot.yaml', 'robot.urdf', 'meshes'
+ROBOT_YAML, _URDF, _MESHES, _PIECES = 'robot.yaml', 'robot.urdf', 'meshes', 'pieces'
 
 
 def save_robot(file: Path, folder: Path) -> Path:
     """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
 
-    Meshes are stored as their convex hulls, which is all that drawing a robot uses. A mesh that
-    is not there stays a name.
+    Meshes are stored as their convex hulls, which is all that drawing a robot uses; what touches
+    things in a gripper as convex pieces, made here once. A mesh that is not there stays a name.
 
     Args:
         file: robot YAML.
@@ -191,7 +198,7 @@ def save_robot(file: Path, folder: Path) -> Path:
     values['base_link'] = robot.base_link
     with whole_folder(folder) as partial:
         if values.get('urdf'):
-            tree = _with_hulls(file.parent / values['urdf'], partial)
+            tree = _with_hulls(file.parent / values['urdf'], partial, grip_links(robot))
             tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
             values['urdf'] = _URDF
         text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
@@ -199,18 +206,45 @@ def save_robot(file: Path, folder: Path) -> Path:
     return folder / ROBOT_YAML
 
 
-def _with_hulls(urdf: Path, folder: Path) -> Any:
+def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
     tree = ElementTree.parse(urdf)
     stored: dict[Path, str] = {}
+    for link in tree.iter('link'):
+        if link.get('name') in grips:
+            _split_collisions(link, urdf, folder)
     for mesh in tree.iter('mesh'):
         file = find_mesh(mesh.get('filename', ''), urdf)
-        if file is None:
+        if file is None or mesh.get('filename', '').startswith(_PIECES):
             continue
         if file not in stored:
             stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
-            write_convex_hull(file, folder / stored[file])
+            write_convex_hull(np.asarray(load_mesh(file).vertices()), folder / stored[file])
         mesh.set('filename', stored[file])
     return tree
+
+
+def _split_collisions(link: Any, urdf: Path, folder: Path) -> None:
+    """Puts convex pieces in the place of the meshes with which a link touches things."""
+    touching = link.findall('collision') or link.findall('visual')
+    for element in touching:
+        mesh = element.find('geometry/mesh')
+        file = None if mesh is None else find_mesh(mesh.get('filename', ''), urdf)
+        if mesh is None or file is None:
+            continue
+        loaded = load_mesh(file)
+        scale = np.array(mesh.get('scale', '1 1 1').split(), float)
+        pieces = convex_pieces(np.asarray(loaded.vertices()) * scale, edges_of(loaded))
+        if element.tag == 'collision':
+            link.remove(element)
+        for points in pieces:
+            name = f'{_PIECES}/{len(list(folder.glob(f"{_PIECES}/*")))}_{file.stem}.stl'
+            write_convex_hull(points, folder / name)
+            piece = ElementTree.SubElement(link, 'collision')
+            if (origin := element.find('origin')) is not None:
+                piece.append(origin)
+            ElementTree.SubElement(
+                ElementTree.SubElement(piece, 'geometry'), 'mesh', filename=name
+            )
 
 
 def _tool(entry: ToolEntry) -> Tool:

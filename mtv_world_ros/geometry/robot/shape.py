@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-import os
 from pathlib import Path
-import struct
 from typing import Any
 from xml.etree import ElementTree
 
@@ -14,24 +12,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 import pinocchio as pin
-from scipy.spatial import ConvexHull, QhullError
 
 from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.camera import camera_poses, project
+from mtv_world_ros.geometry.robot.mesh_pieces import (
+    edges_of,
+    even_directions,
+    find_mesh,
+    load_mesh,
+    outermost,
+    slices,
+)
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse
 
-#: corners of a round shape's rims, and directions in which a mesh's outermost points are kept
-_CORNERS, _DIRECTIONS = 16, 256
+#: corners of a round shape's rims
+_CORNERS = 16
 #: radius of the rods that stand for links of which nothing is known [m]
 ROD_RADIUS_M = 0.03
-#: a mesh is cut into this many slices where they hold less than a share of its hull's volume
-_SLICES, _HOLLOW, _SLICE_DIRECTIONS = 5, 0.8, 96
-#: meshes shorter than this stay whole [units of the mesh, mostly m]
-_LEAST_SLICED = 0.12
 #: parts of shapes nearer to the camera's plane are cut off [m]
 _NEAR_M = 0.04
 #: links closer together than this get no rod between them [m]
@@ -110,6 +110,20 @@ def moving_links(robot: RobotModel) -> set[str]:
     return {name for name, frame in frames.items() if frame.parentJoint != base}
 
 
+def grip_links(robot: RobotModel) -> set[str]:
+    """Returns the links that hold things: those of tools, and what gripper joints move."""
+    model = robot.pinocchio_model
+    frames = {f.name: f.parentJoint for f in model.frames if f.type == pin.FrameType.BODY}
+    grippers = {tool.gripper_joint for tool in robot.tools if tool.gripper_joint}
+    moved = grippers | {m.joint for m in robot.mimics if m.source in grippers}
+    hands = {frames[tool.link] for tool in robot.tools if tool.gripper_joint} - {0}
+    return {
+        link
+        for link, joint in frames.items()
+        if joint in hands or any(model.names[j] in moved for j in model.supports[joint])
+    }
+
+
 def rods(robot: RobotModel, why: str, missing: Sequence[str] = ()) -> RobotShape:
     """Returns rods between neighbouring joints, and from the last ones to the tools."""
     model, neutral = robot.pinocchio_model, pin.neutral(robot.pinocchio_model)
@@ -176,73 +190,57 @@ def shapes_of(
         RobotError: see `load_shape`.
     """
     for element in link.findall(kind):
-        geometry = element.find('geometry')
-        if geometry is None or len(geometry) == 0:
-            continue
-        try:
-            pieces = _pieces(geometry[0], urdf, sliced)
-        except KeyError as error:
-            name = link.attrib['name']
-            raise RobotError(
-                f"'{urdf}': a {geometry[0].tag} of link '{name}' lacks {error}"
-            ) from error
-        pose = shape_origin(element.find('origin'))
-        for points in pieces:
-            yield LinkShape(link=link.attrib['name'], points=_moved(pose, points))
+        yield from element_shapes(element, link.attrib['name'], urdf, slices if sliced else None)
 
 
-def _pieces(shape: ElementTree.Element, urdf: Path, sliced: bool) -> list[FloatArray]:
-    """Convex parts (N, 3): one of a shape, or the slices of a mesh that is far from convex."""
+def element_shapes(
+    element: ElementTree.Element,
+    link: str,
+    urdf: Path,
+    cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None = None,
+) -> Iterator[LinkShape]:
+    """Yields the convex parts of a `visual` or `collision`: none where it describes nothing.
+
+    Args:
+        element: of the URDF.
+        link: name of its link.
+        urdf: its file, beside which meshes are looked for.
+        cut: makes convex parts of a mesh's vertices and edges, e.g. `convex_pieces`; None = its
+            hull stands for it.
+
+    Raises:
+        FileNotFoundError: a mesh is not there.
+        RobotError: see `load_shape`.
+    """
+    geometry = element.find('geometry')
+    if geometry is None or len(geometry) == 0:
+        return
+    try:
+        pieces = _pieces(geometry[0], urdf, cut)
+    except KeyError as error:
+        raise RobotError(
+            f"'{urdf}': a {geometry[0].tag} of link '{link}' lacks {error}"
+        ) from error
+    pose = shape_origin(element.find('origin'))
+    for points in pieces:
+        yield LinkShape(link=link, points=_moved(pose, points))
+
+
+def _pieces(
+    shape: ElementTree.Element,
+    urdf: Path,
+    cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None,
+) -> list[FloatArray]:
+    """Convex parts (N, 3) of a shape, of a mesh as it is cut."""
     if shape.tag != 'mesh':
         return [_points(shape, urdf)]
     scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
     file = find_mesh(shape.attrib['filename'], urdf)
     if file is None:
         raise FileNotFoundError(f"'{shape.attrib['filename']}'")
-    mesh = _load_mesh(file)
-    vertices = np.asarray(mesh.vertices(), np.float64)
-    if not sliced:
-        return [outermost(vertices) * scale]
-    return [piece * scale for piece in _convex_pieces(vertices, _edges(mesh))]
-
-
-def _edges(mesh: Any) -> NDArray[np.int64]:
-    """(E, 2) vertices that edges of triangles join."""
-    faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in range(mesh.num_tris)])
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
-
-
-def _convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
-    """The hull's points, or those of slices across the longest axis where these hold far less."""
-    whole = outermost(vertices)
-    middle = vertices - vertices.mean(axis=0)
-    axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
-    along = vertices @ axis
-    cuts = np.linspace(along.min(), along.max(), _SLICES + 1)
-    slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
-    try:
-        volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
-    except (QhullError, ValueError):  # flat
-        return [whole]
-    hollow = sum(volumes[1:]) < _HOLLOW * volumes[0]
-    return slices if hollow and np.ptp(along) > _LEAST_SLICED else [whole]
-
-
-def _slice(
-    vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
-) -> FloatArray:
-    """Outermost points between two planes, with where the planes cut edges."""
-    inside = vertices[(along >= low) & (along <= high)]
-    start, end = along[edges].T
-    found = [inside]
-    for cut in (low, high):
-        crossed = (start - cut) * (end - cut) < 0
-        share = ((cut - start[crossed]) / (end - start)[crossed])[:, None]
-        a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
-        found.append(a + share * (b - a))
-    points = np.concatenate(found)
-    return outermost(points, _SLICE_DIRECTIONS)
+    mesh = load_mesh(file)
+    vertices = np.asarray(mesh.vertices(), np.float64) * scale
+    return [outermost(vertices)] if cut is None else cut(vertices, edges_of(mesh))
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
@@ -253,7 +251,7 @@ def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
     if shape.tag in ('cylinder', 'capsule'):
         return _cylinder(float(values['radius']), float(values['length']))
     if shape.tag == 'sphere':
-        return float(values['radius']) * _directions(64)
+        return float(values['radius']) * even_directions(64)
     raise RobotError(
         f"'{urdf}' has a shape '{shape.tag}'; known are box, capsule, cylinder, mesh, sphere"
     )
@@ -264,75 +262,6 @@ def _cylinder(radius: float, length: float) -> FloatArray:
     rim = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     ends = [np.column_stack([rim, np.full(_CORNERS, z)]) for z in (-length / 2, length / 2)]
     return np.concatenate(ends)
-
-
-def _directions(count: int) -> FloatArray:
-    """(count, 3) unit vectors spread evenly (a Fibonacci sphere)."""
-    n = np.arange(count) + 0.5
-    up, turn = 1 - 2 * n / count, n * np.pi * (1 + 5**0.5)
-    across = np.sqrt(1 - up**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=-1)
-
-
-def find_mesh(name: str, urdf: Path) -> Path | None:
-    """Returns where a mesh lies, or None.
-
-    `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
-    installed (`AMENT_PREFIX_PATH`).
-    """
-    plain = name.removeprefix('file://')
-    if not plain.startswith('package://'):
-        candidates = [urdf.parent / plain]
-    else:
-        package, _, inside = plain.removeprefix('package://').partition('/')
-        above = urdf.resolve().parents
-        candidates = [folder / package / inside for folder in above]
-        candidates += [folder / inside for folder in above if folder.name == package]
-        installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
-        candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
-
-
-def write_convex_hull(mesh: Path, out: Path) -> None:
-    """Writes the convex hull of a mesh's outermost points as a binary STL [units of the mesh].
-
-    Raises:
-        RobotError: the mesh cannot be read.
-    """
-    import coal
-
-    hull = coal.BVHModelOBBRSS()
-    points = outermost(_load_mesh(mesh).vertices())
-    hull.beginModel(0, len(points))
-    for point in points:
-        hull.addVertex(point)
-    hull.endModel()
-    try:
-        hull.buildConvexHull(True, 'Qt')
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"mesh '{mesh}' has no volume: {error}") from error
-    faces = [hull.convex.polygons(i) for i in range(hull.convex.num_polygons)]
-    corners = np.array(hull.convex.points())[[[face[k] for k in range(3)] for face in faces]]
-    rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in corners]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(out, bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
-
-
-def _load_mesh(path: Path) -> Any:
-    """A mesh file (STL, DAE, OBJ)."""
-    try:
-        import coal  # comes with Pinocchio, but not with every build of it
-    except ImportError as error:
-        raise FileNotFoundError(f"reader: '{path.name}' needs the module coal") from error
-    try:
-        return coal.MeshLoader().load(str(path), np.ones(3))
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
-
-
-def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
-    """The points (M, 3) of (N, 3) that are outermost in one of some directions."""
-    return points[np.unique((points @ _directions(directions).T).argmax(axis=0))]
 
 
 def shape_origin(element: ElementTree.Element | None) -> FloatArray:

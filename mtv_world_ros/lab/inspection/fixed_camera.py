@@ -20,12 +20,12 @@ from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.robot.mesh_pieces import outermost
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import (
     fill,
     LinkShape,
     moving_links,
-    outermost,
     project_points,
 )
 from mtv_world_ros.geometry.transforms import looking_along

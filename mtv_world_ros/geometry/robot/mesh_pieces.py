@@ -1,0 +1,218 @@
+"""Meshes as convex parts: hulls, slices for silhouettes, pieces for contact."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import RobotError
+from mtv_world_ros.files import write_whole
+
+#: directions in which a mesh's outermost points are kept
+_DIRECTIONS = 256
+#: a mesh is cut into slices where they hold less than this share of its hull's volume
+_HOLLOW, _SLICE_DIRECTIONS = 0.8, 96
+#: for silhouettes: so many slices of meshes that are not shorter than this [m]
+_SLICES, _LEAST_SLICED = 5, 0.12
+#: pieces of less than this share of the mesh's hull are left out
+_THINNEST = 1e-4
+#: for contact: most pieces of a mesh, what another one must gain as a share of its hull, and how
+#: many cuts are tried along an axis, by how many edges and directions of hulls
+_MOST_PIECES, _LEAST_GAIN, _CUTS, _SEGMENTS, _CUT_DIRECTIONS = 10, 0.03, 7, 1000, 32
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """Returns where a mesh lies, or None.
+
+    `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
+    installed (`AMENT_PREFIX_PATH`).
+    """
+    plain = name.removeprefix('file://')
+    if not plain.startswith('package://'):
+        candidates = [urdf.parent / plain]
+    else:
+        package, _, inside = plain.removeprefix('package://').partition('/')
+        above = urdf.resolve().parents
+        candidates = [folder / package / inside for folder in above]
+        candidates += [folder / inside for folder in above if folder.name == package]
+        installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+        candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def load_mesh(path: Path) -> Any:
+    """Reads a mesh (STL, DAE, OBJ).
+
+    Raises:
+        FileNotFoundError: nothing here reads meshes.
+        RobotError: the file cannot be read.
+    """
+    try:
+        import coal  # comes with Pinocchio, but not with every build of it
+    except ImportError as error:
+        raise FileNotFoundError(f"reader: '{path.name}' needs the module coal") from error
+    try:
+        return coal.MeshLoader().load(str(path), np.ones(3))
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
+
+
+def edges_of(mesh: Any) -> NDArray[np.int64]:
+    """Returns (E, 2) vertices that edges of triangles join."""
+    faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in range(mesh.num_tris)])
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+
+
+def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
+    """Returns the points (M, 3) of (N, 3) that are outermost in one of some directions."""
+    return points[np.unique((points @ even_directions(directions).T).argmax(axis=0))]
+
+
+def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
+    """Returns the hull's points, or those of slices across the longest axis that hold far less."""
+    whole = outermost(vertices)
+    middle = vertices - vertices.mean(axis=0)
+    axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
+    along = vertices @ axis
+    cuts = np.linspace(along.min(), along.max(), _SLICES + 1)
+    slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
+    try:
+        volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
+    except (QhullError, ValueError):  # flat
+        return [whole]
+    hollow = sum(volumes[1:]) < _HOLLOW * volumes[0]
+    return slices if hollow and np.ptp(along) > _LEAST_SLICED else [whole]
+
+
+def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
+    """Returns convex parts (N, 3) of a mesh, with the room that a hand has between its jaws.
+
+    The piece that holds most empty space is cut where its halves' hulls hold least, along one of
+    its principal axes, until no cut gains much.
+
+    Args:
+        vertices: (N, 3) of the mesh, which need not be closed [m].
+        edges: (E, 2) of its triangles.
+    """
+    if _is_convex(vertices):
+        return [outermost(vertices)]
+    whole = vertices[edges]
+    pieces = [(whole, *_best_cut(whole))]
+    least = _LEAST_GAIN * _hull_volume(whole)
+    while len(pieces) < _MOST_PIECES:
+        number = int(np.argmax([gain for _, gain, _ in pieces]))
+        _, gain, halves = pieces[number]
+        if gain <= least:
+            break
+        pieces[number : number + 1] = [(half, *_best_cut(half)) for half in halves]
+    flat = _THINNEST * _hull_volume(whole)
+    bodies = [piece for piece, _, _ in pieces if _hull_volume(piece) > flat]
+    return [outermost(segments.reshape(-1, 3)) for segments in bodies]
+
+
+def write_convex_hull(points: FloatArray, out: Path) -> None:
+    """Writes the convex hull of the outermost of points (N, 3) as a binary STL.
+
+    Raises:
+        RobotError: they have no volume.
+    """
+    import coal
+
+    hull = coal.BVHModelOBBRSS()
+    points = outermost(points)
+    hull.beginModel(0, len(points))
+    for point in points:
+        hull.addVertex(point)
+    hull.endModel()
+    try:
+        hull.buildConvexHull(True, 'Qt')
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"the mesh of '{out.name}' has no volume: {error}") from error
+    faces = [hull.convex.polygons(i) for i in range(hull.convex.num_polygons)]
+    corners = np.array(hull.convex.points())[[[face[k] for k in range(3)] for face in faces]]
+    rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in corners]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(out, bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+
+
+def _is_convex(vertices: FloatArray) -> bool:
+    """Whether all of the vertices are corners of their hull, as those of pieces made before."""
+    points = np.unique(vertices, axis=0)
+    try:
+        return len(points) < _SEGMENTS and len(ConvexHull(points).vertices) == len(points)
+    except (QhullError, ValueError):
+        return True
+
+
+def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
+    """By how much a cut makes hulls smaller [m^3], and the two parts (E, 2, 3)."""
+    whole = segments
+    segments = segments[:: max(1, len(segments) // _SEGMENTS)]  # enough to choose a cut by
+    points = segments.reshape(-1, 3)
+    volume, best = _hull_volume(segments), (0.0, np.zeros(3), 0.0)
+    if not volume:
+        return 0.0, [whole]
+    middle = points - points.mean(axis=0)
+    for axis in np.linalg.svd(middle, full_matrices=False)[2]:
+        along = points @ axis
+        for at in np.linspace(along.min(), along.max(), _CUTS + 2)[1:-1]:
+            halves = [_half(segments, axis, at), _half(segments, -axis, -at)]
+            gain = volume - sum(map(_hull_volume, halves))
+            if gain > best[0]:
+                best = gain, axis, at
+    gain, axis, at = best
+    return gain, [_half(whole, axis, at), _half(whole, -axis, -at)] if gain else [whole]
+
+
+def _half(segments: FloatArray, axis: FloatArray, at: float) -> FloatArray:
+    """What of segments (E, 2, 3) lies below a plane."""
+    along = segments @ axis
+    order = np.argsort(along, axis=1)
+    segments = np.take_along_axis(segments, order[..., None], axis=1)[along.min(axis=1) < at]
+    low, high = np.sort(along, axis=1)[along.min(axis=1) < at].T
+    share = np.where(high > at, (at - low) / np.maximum(high - low, 1e-12), 1.0)[:, None]
+    ends = segments[:, 0] + share * (segments[:, 1] - segments[:, 0])
+    return np.stack([segments[:, 0], ends], axis=1)
+
+
+def _hull_volume(segments: FloatArray) -> float:
+    """Of the convex hull [m^3]; 0 = it is flat."""
+    points = segments.reshape(-1, 3)
+    if len(points) < 4:
+        return 0.0
+    try:
+        return float(ConvexHull(outermost(points, _CUT_DIRECTIONS), qhull_options='Qt Pp').volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _slice(
+    vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
+) -> FloatArray:
+    """Outermost points between two planes, with where the planes cut edges."""
+    inside = vertices[(along >= low) & (along <= high)]
+    start, end = along[edges].T
+    found = [inside]
+    for cut in (low, high):
+        crossed = (start - cut) * (end - cut) < 0
+        share = ((cut - start[crossed]) / (end - start)[crossed])[:, None]
+        a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
+        found.append(a + share * (b - a))
+    points = np.concatenate(found)
+    return outermost(points, _SLICE_DIRECTIONS)
+
+
+def even_directions(count: int) -> FloatArray:
+    """(count, 3) unit vectors spread evenly (a Fibonacci sphere)."""
+    n = np.arange(count) + 0.5
+    up, turn = 1 - 2 * n / count, n * np.pi * (1 + 5**0.5)
+    across = np.sqrt(1 - up**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=-1)
