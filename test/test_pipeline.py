@@ -17,6 +17,7 @@ from mtv_world_ros.errors import (
     TrajectoryError,
 )
 from mtv_world_ros.files import share_path
+from mtv_world_ros.foresight import solid_foresight
 from mtv_world_ros.foresight.loading import load_foresight
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
@@ -348,7 +349,7 @@ def test_the_last_chunk_alone_is_imagined_from_what_was_seen(
 class ThreeWays:
     """Objects that go along x in the first second; how far, in each of three motions [m]."""
 
-    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
+    step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
     sizes = np.full((3, 2, 3), 0.04)
 
     reasons = ()
@@ -404,7 +405,7 @@ def test_a_plan_is_foreseen_chunk_by_chunk(
 class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
-    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
+    step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
     sizes = np.full((1, 2, 3), 0.04)
 
     def __init__(
@@ -481,6 +482,66 @@ def test_an_episode_in_which_nobody_names_an_object_is_imagined(
     assert len(chunks) == 2 and chunks[-1].masks.names == ()
 
 
+def misplaced(monkeypatch, change) -> None:
+    """Objects are found in masks as `change` has them."""
+    fit = solid_foresight.fit_solid
+
+    def found(*given):
+        solid = fit(*given)
+        return None if solid is None else replace(solid, centre=change(solid.centre))
+
+    monkeypatch.setattr(solid_foresight, 'fit_solid', found)
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        (lambda centre: np.array([0.3, 0.0, centre[2]]), 'seem to be in one place'),
+        (lambda centre: centre + [0, 0, 0.3], 'seems to float'),
+        (lambda centre: centre + [3.0, 0, 0], 'seems to lie off the table'),
+    ],
+)
+def test_objects_that_cannot_be_where_they_were_found_are_named_and_there_is_no_verdict(
+    recording: Recording, world_model: CountingWorldModel, monkeypatch, change, said: str
+) -> None:
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    pipeline = with_motion(world_model, foresight)
+    with monkeypatch.context() as context:
+        misplaced(context, change)
+        refused = imagine(pipeline, recording, 1.6)[-1].success
+    assert np.isnan(refused.probability)
+    assert said in refused.reasons[0] and f"'{recording.objects[0]}'" in refused.reasons[0]
+    assert np.isfinite(imagine(pipeline, recording, 1.6)[-1].success.probability)
+
+
+def test_objects_that_one_view_alone_shows_are_named_and_there_is_no_verdict(
+    recording: Recording, world_model: CountingWorldModel
+) -> None:
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    seen = observe(recording)
+    frames = seen.frames.copy()
+    frames[1] = 128
+    episode = with_motion(world_model, foresight).begin(
+        replace(seen, frames=frames), instruction=recording.instruction
+    )
+    (chunk,) = episode.extend(commands(recording, 1.6))
+    assert np.isnan(chunk.success.probability)
+    assert f"'{recording.objects[0]}' is seen by one view alone" in chunk.success.reasons[0]
+
+
+def test_an_engine_that_diverges_is_named_and_there_is_no_verdict(
+    recording: Recording, world_model: CountingWorldModel, monkeypatch
+) -> None:
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    monkeypatch.setattr(foresight.engine, 'run', lambda m, d, states, controls: np.full(
+        (len(states), controls.shape[1], states.shape[1]), np.nan
+    ))  # fmt: skip
+    chunks = imagine(with_motion(world_model, foresight), recording, 3.2)
+    last = chunks[-1].success
+    assert np.isnan(last.probability) and 'foreseen futures are implausible' in last.reasons[0]
+    assert any('the engine diverged' in reason for reason in last.reasons)
+
+
 def test_control_frame_zero_shows_the_observed_state(
     pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
 ) -> None:
@@ -551,7 +612,7 @@ def test_positions_outside_the_limits_are_refused(
 class SlidingObjects:
     """Moves every object 1 cm along x in each step of 0.1 s; remembers how often it was asked."""
 
-    step_s, commands_a_step, reasons, refusal = 0.1, 1, (), ''
+    step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
 
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps

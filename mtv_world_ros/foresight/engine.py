@@ -37,11 +37,13 @@ _NEAR_M = 0.015
 _STILL_ROWS = 1
 #: what no object does on a table: places [m], speeds [m/s], [rad/s]
 _FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
-#: a plan may take so many times as long as what it shows, and so long more [s]
+#: the last net, as wall time depends on what else runs: a plan may take so many times as long as
+#: what it shows, and so long more [s]
 _SLOW, _LEAST_CAP_S = 20.0, 60.0
-#: constraints (three a contact) from which a step takes so long that each is computed alone, and
-#: which are those of objects that cannot all be where they were found
-_CROWDED, _OVERLAPPING = 500, 1500
+#: constraints (three a contact) from which steps take so long that they are computed in pieces, of
+#: which work is counted; which are those of objects that cannot all be where they were found; and
+#: which a future may have in the mean over a plan
+_CROWDED, _OVERLAPPING, _MOST_TOUCHES = 300, 1500, 400
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +105,7 @@ class Engine:
     """
 
     def __init__(self, arms: Arms, threads: int = 1) -> None:
-        self.arms, self._threads = arms, max(threads, 1)
+        self.arms, self.threads = arms, max(threads, 1)
         self._scenes: dict[tuple[str, ...], tuple[Scene, list[Any]]] = {}
         mujoco.set_mju_user_warning(_log_once)
         self._rollout = Rollout(nthread=0 if threads < 2 else threads)
@@ -115,7 +117,7 @@ class Engine:
             if len(self._scenes) >= 8:
                 self._scenes.pop(next(iter(self._scenes)))
             scene = Scene.compiled(self.arms, kinds)
-            self._scenes[key] = scene, [mujoco.MjData(scene.model) for _ in range(self._threads)]
+            self._scenes[key] = scene, [mujoco.MjData(scene.model) for _ in range(self.threads)]
         return self._scenes[key]
 
     def begin(self, futures: Sequence[Future]) -> Batch:
@@ -127,7 +129,7 @@ class Engine:
     ) -> FloatArray:
         """Returns the states (K, S, N) of K models at S steps from some states (K, N) on."""
         return self._rollout.rollout(
-            models, data, states, controls, chunk_size=1 if self._threads > 1 else None
+            models, data, states, controls, chunk_size=1 if self.threads > 1 else None
         )[0]
 
 
@@ -233,32 +235,45 @@ class Batch:
     def _compute_row(
         self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
     ) -> None:
-        """Computes a row of some futures, step by step where one takes long."""
+        """Computes a row of some futures; those that are crowded in pieces, few at a time."""
         controls = np.stack([self._controls(run, int(number), row) for number in moving])
-        steps = controls.shape[1]
-        constraints = self._constraints(run.physics[moving[0]], int(moving[0]))
-        if constraints > _OVERLAPPING:
-            run.lose_all('objects overlap: more touches than things on a table can have')
-            return
-        piece = 1 if constraints > _CROWDED else steps
-        for first in range(0, steps, piece):
-            if first:
-                check()
-            kept = np.array([int(number) not in run.lost for number in moving])
-            if not kept.any():
-                return
-            states = self._engine.run(
-                [self._models[number] for number in moving[kept]],
-                self._data,
-                run.physics[moving[kept]],
-                controls[kept, first : first + piece],
-            )
-            run.take(moving[kept], states)
+        crowded = np.zeros(len(moving), np.bool_)
+        for place, number in enumerate(moving):
+            check()  # of many futures of many parts the counting takes long itself
+            crowded[place] = self._constraints(run, number) > _CROWDED
+        self._compute(run, moving[~crowded], controls[~crowded])
+        few = self._engine.threads
+        slow, told = moving[crowded], controls[crowded]
+        for first in range(0, len(slow), few):
+            self._compute_crowded(run, slow[first : first + few], told[first : first + few], check)
 
-    def _constraints(self, physics: FloatArray, number: int) -> int:
+    def _compute_crowded(
+        self, run: _Run, moving: np.ndarray, controls: FloatArray, check: Callable[[], None]
+    ) -> None:
+        """Computes a row in pieces of the same length on every machine, which the result shows.
+
+        What counts as too much is a number of constraints, not a time: so the same is lost
+        whatever else a machine does.
+        """
+        for first in range(0, controls.shape[1], SUBSTEPS):
+            check()
+            for number in moving:
+                if number not in run.lost:
+                    run.charge(int(number), self._constraints(run, number), SUBSTEPS)
+            kept = np.array([number not in run.lost for number in moving])
+            self._compute(run, moving[kept], controls[kept, first : first + SUBSTEPS])
+
+    def _compute(self, run: _Run, moving: np.ndarray, controls: FloatArray) -> None:
+        if not len(moving):
+            return
+        models = [self._models[number] for number in moving]
+        states = self._engine.run(models, self._data, run.physics[moving], controls)
+        run.take(moving, states)
+
+    def _constraints(self, run: _Run, number: int) -> int:
         """Number of constraints, of contacts most, where a future is; they make steps slow."""
         model, data = self._models[number], self._data[0]
-        mujoco.mj_setState(model, data, physics, FULL)
+        mujoco.mj_setState(model, data, run.physics[number], FULL)
         mujoco.mj_fwdPosition(model, data)
         return data.nefc
 
@@ -289,6 +304,7 @@ class _Run:
         self._scene, self._futures, self.courses, self._steps = scene, futures, courses, steps
         self.physics, self.still = state.physics.copy(), state.still.copy()
         self.lost, self.computed = dict(state.lost), 0
+        self._spent = np.zeros(len(futures), np.int64)
         self._rows = [self._read()]
 
     def first_step(self, row: int) -> int:
@@ -321,6 +337,14 @@ class _Run:
                 self.lost[number] = why
             else:
                 self.physics[number] = last
+
+    def charge(self, number: int, constraints: int, steps: int) -> None:
+        """Counts what steps of a crowded future cost; it is lost where that is too much."""
+        self._spent[number] += constraints * steps
+        if constraints > _OVERLAPPING:
+            self.lost[number] = 'objects overlap: more touches than things on a table can have'
+        elif self._spent[number] > _MOST_TOUCHES * len(self.courses[0].controls):
+            self.lost[number] = 'more touches, for longer, than can be foreseen in time'
 
     def lose_all(self, why: str) -> None:
         """Gives up the futures that still count."""

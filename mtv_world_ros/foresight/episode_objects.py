@@ -128,8 +128,16 @@ class ObjectForesight:
 
     @property
     def refusal(self) -> str:
-        """Why what is foreseen allows no verdict; empty = it does."""
-        return '' if self.found is None else self.found.tracked.refusal
+        """Why there is no verdict; empty = there may be one.
+
+        Where the episode begins, what cannot be foreseen of an object is a reason, too: pictures
+        of objects that cannot be where they were found tell nothing.
+        """
+        if self.found is None:
+            return ''
+        tracked = self.found.tracked
+        doubts = tracked.doubts if self.found.is_whole else {}
+        return tracked.refusal or '; '.join(dict.fromkeys(doubts.values()))
 
     def _shown_before(self, shown: int) -> int:
         return shown if self.found is None else self.found.shown

@@ -5,7 +5,7 @@ V views, O objects, T frames, H W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -109,6 +109,11 @@ class TrackedObjects(Protocol):
     @property
     def sizes(self) -> FloatArray:
         """(K, O, 3) their extents in each of the motions, upright [m]."""
+        ...
+
+    @property
+    def doubts(self) -> Mapping[int, str]:
+        """Number of an object -> why nothing is foreseen of it, in words."""
         ...
 
     @property

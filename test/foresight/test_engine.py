@@ -12,6 +12,7 @@ from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.foresight import engine as engine_module
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings, ContactSpread
+from mtv_world_ros.foresight.course import SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
@@ -96,8 +97,11 @@ def test_a_late_future_does_the_same_later(lift):
             )
 
 
-def test_it_stops_within_50_ms(lift):
-    batch = batch_of(lift, BLOCK, AWAY, num_motions=64)
+@pytest.mark.parametrize('is_crowded', [False, True])
+def test_it_stops_within_50_ms(lift, monkeypatch, is_crowded):
+    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    solids = cluttered(6) if is_crowded else (BLOCK, AWAY)
+    batch = batch_of(lift, *solids, num_motions=64)
     batch.advance(picking(0.2), 5)  # all is compiled
     asked = []
 
@@ -120,6 +124,49 @@ def test_objects_that_cannot_all_be_where_they_were_found_are_refused_at_once(li
     assert time.process_time() - begun < 5
     assert all(np.isnan(motion.points).all() for motion in motions)
     assert 'objects overlap' in one.reasons[-1] and one.refusal
+
+
+def cluttered(towers: int) -> list[Solid]:
+    """Towers of two blocks side by side, where the hand comes down: many touches."""
+    size, places = np.full(3, 0.04), np.arange(towers) - (towers - 1) / 2
+    return [
+        Solid(centre=np.array([0.041 * place, 0.0, height]), size=size)
+        for place in places
+        for height in (0.02, 0.06)
+    ]
+
+
+def test_crowded_futures_are_computed_in_pieces_that_depend_on_nothing_else(lift, monkeypatch):
+    commands, asked, run = picking(1.0), [], Engine.run
+
+    def counted(self, models, data, states, controls):
+        asked.append((len(models), controls.shape[1]))
+        return run(self, models, data, states, controls)
+
+    monkeypatch.setattr(Engine, 'run', counted)
+    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    found = []
+    for threads in (1, 2):
+        asked.clear()
+        motion, state = batch_of(lift, *cluttered(3), threads=threads).advance(commands, 5)
+        assert any(steps == SUBSTEPS for _, steps in asked)
+        assert all(many <= threads for many, steps in asked if steps == SUBSTEPS)
+        found.append((motion.points, state.lost))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1] == {}
+
+
+def test_crowded_futures_have_an_end_that_no_clock_decides(lift, monkeypatch):
+    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    monkeypatch.setattr(engine_module, '_MOST_TOUCHES', 20)
+    lost = []
+    for _ in range(2):
+        one = tracked(lift, *cluttered(3))
+        motions, then = one.advance(picking(1.0))
+        assert all(np.isnan(motion.points).all() for motion in motions) and then.refusal
+        assert 'more touches, for longer' in then.reasons[-1]
+        lost.append(then.state.lost)
+    assert lost[0] == lost[1]
 
 
 @pytest.mark.parametrize('threads', [1, 2])

@@ -128,6 +128,8 @@ class Reporter:
         """Counts and reports a chunk that was predicted; its estimate is out."""
         values = _chunk_values(chunk, self._settings())
         self._tally.counts['chunks'] += 1
+        if isnan(chunk.prediction.success.probability):
+            self._tally.counts['chunks_without_verdict'] += 1
         self._add_seconds(values)
         is_seen = chunk.prediction.in_view.any()
         self._publish_report('chunk', values, *(() if is_seen else (DiagnosticStatus.WARN,)))
