@@ -1,17 +1,24 @@
 """What foresees objects best, and how fast? Engines side by side, in turns, without a picture.
 
     mtv-world collect --task all --episodes 16 --faults calibrate --seed 5001 --pictures first --out data/cal
-    git worktree add ../v0.1.0 v0.1.0
-    python benchmark/foresight_engines.py data/cal --old ../v0.1.0 --repeats 120
+    python benchmark/foresight_engines.py data/cal --repeats 120
+    python benchmark/foresight_engines.py --chunks 20
 
 Every episode's plan is foreseen whole from the masks of its first frame. A row judges by the share
 of the futures in which the task is done at the end: half or more is a success; a share of .75 is a
 verdict. `MuJoCo` is this version's foresight, with its number of futures; `DART` the rigid bodies of
 version 0.1.0, with the same numbers of contact; `networks` its 13 motions of networks; `0.1.0` both,
-bodies counting twice. The latter three run in a checkout of v0.1.0 (`--old`), in turns with this one;
-without it they are left out. Seconds are those of the processor for finding and foreseeing a plan,
-medians; the ratio is of each episode to 0.1.0's, the median. What is chosen by this must not be
-measured by it: kinds of the split `test` are refused.
+bodies counting twice. The latter three run in a checkout of the tag v0.1.0, which is made in a
+temporary folder, in turns with this one; with `--no-old` they are left out. Seconds are those of the
+processor for finding and foreseeing a plan, medians; the ratio is of each episode to 0.1.0's, the
+median. What is chosen by this must not be measured by it: kinds of the split `test` are refused.
+
+`--robot` and `--contact` judge another robot's episodes with what fit-contact found, this version
+alone.
+
+With `--chunks N` both versions imagine N plans of 3.2 s of the bundled episode in turns, each whole
+with its pictures; seconds are those of the processor again, one thread each, so that other work on
+the machine does not count; in each turn the order is the other way round.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -27,9 +34,14 @@ import time
 from typing import Any
 
 import numpy as np
-from page import parse_arguments, publish, table
+from page import old_checkout, parse_arguments, publish, ROOT, table
 
-from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fingerprint
+from mtv_world_ros.assembly import (
+    checkpoint_path,
+    checkpoint_robot,
+    fingerprint,
+    robot_path,
+)
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.recorded_policies import refuse_test_kinds
 from mtv_world_ros.data_types import BoolArray, FloatArray
@@ -38,6 +50,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.loading import load_foresight
 from mtv_world_ros.foresight.solid_foresight import SolidForesight
 from mtv_world_ros.geometry.object_motion import FoundObjects
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
@@ -47,6 +60,8 @@ from mtv_world_ros.success.task import load_tasks, match_task
 
 VIEWS = ('low', 'high')
 OLD = '0.1.0: networks and DART'
+#: plans begin so many frames apart, among the first frames of the bundled episode
+_STRIDE, _FRAMES = 7, 60
 #: a share from here on is a verdict of success
 VERDICT = 0.75
 HEAD = ('judged by', 'n', 'right', 'AUROC', 'false success', 'false success from .75',
@@ -70,35 +85,116 @@ for line in sys.stdin:
         answer = dict(said=said[:3], seconds=time.process_time() - begin)
     print(json.dumps(answer), flush=True)
 """
+#: answers the number of a frame with the processor's seconds by stage of a plan that begins there
+_CHUNKS = """
+import json, sys, time
+time.perf_counter = time.process_time  # other work does not count
+from dataclasses import replace
+import numpy as np
+from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.data_types import JointTrajectory, Observation
+from mtv_world_ros.files import share_path
+futures = int(sys.argv[1])
+pipeline = load_pipeline('bundled', num_threads=1)
+if futures:
+    from mtv_world_ros.foresight.solid_foresight import SolidForesight
+    known = pipeline.object_motion
+    settings = known.settings.model_copy(update={'num_motions': futures})
+    pipeline = replace(
+        pipeline, object_motion=SolidForesight(known.robot, known.response, settings)
+    )
+recording = load_recording(
+    share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
+)
+commands = recording.commands
+print(len(recording.times), flush=True)
+for line in sys.stdin:
+    frame = int(line)
+    at = float(recording.times[frame])
+    kept = (commands.times > at + 1e-6) & (commands.times <= at + 3.2)
+    plan = JointTrajectory(
+        joint_names=commands.joint_names,
+        times=commands.times[kept] - at,
+        positions=commands.positions[kept],
+    )
+    observation = Observation(
+        cameras=recording.cameras,
+        frames=recording.frames[:, frame],
+        positions=recording.positions[frame],
+        stamp_ns=recording.stamp_ns + round(at * 1e9),
+    )
+    begun = time.process_time()
+    episode = pipeline.begin(observation, instruction=recording.instruction)
+    begun = time.process_time() - begun
+    spent = {'begin': begun}
+    for prediction in episode.extend(plan):
+        for stage, seconds in prediction.seconds.items():
+            spent[stage] = spent.get(stage, 0.0) + seconds
+    print(json.dumps(spent), flush=True)
+"""
 
 
 def more(parser: argparse.ArgumentParser) -> None:
     """Adds options."""
-    parser.add_argument('dataset', type=Path)
-    parser.add_argument('--old', type=Path, help='a checkout of v0.1.0')
+    parser.add_argument('dataset', type=Path, nargs='?', help='episodes to judge')
+    parser.add_argument('--no-old', action='store_true', help='this version alone')
+    parser.add_argument('--robot', help="YAML file or bundled name; default: the checkpoint's")
+    parser.add_argument('--contact', default='bundled', help='checkpoint, or of fit-contact')
+    parser.add_argument('--chunks', type=int, default=0, help='plans to imagine in turns')
     parser.add_argument('--futures', type=int, nargs='+', default=[16, 64])
 
 
-class Old:
-    """Version 0.1.0 in a process of its own."""
+class Worker:
+    """A version in a process of its own, which answers a line with a line.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: its checkout.
+        code: that runs there.
+        futures: argument of the code.
+    """
+
+    def __init__(self, folder: Path, code: str, futures: int = 0) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, '-c', _WORKER],
+            [sys.executable, '-c', code, str(futures)],
             cwd=folder,
             env=os.environ | {'PYTHONPATH': str(folder.resolve()), 'OMP_NUM_THREADS': '1'},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
+        self._folder = folder
         self._answer()
+
+    def ask(self, line: object) -> Any:
+        """Returns what it answers."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f'{line}\n')
+        self._process.stdin.flush()
+        return json.loads(self._answer())
+
+    def close(self) -> None:
+        """Ends it."""
+        self._process.terminate()
+        self._process.wait()
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise MtvWorldError(f"the version in '{self._folder}' does not run")
+        return line
+
+
+class Old:
+    """What version 0.1.0 says of episodes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._worker = Worker(folder, _WORKER)
 
     def ask(self, path: Path) -> dict[str, tuple[float, float]]:
         """Returns share and seconds by row of the table; empty = it cannot tell."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f'{path.resolve()}\n')
-        self._process.stdin.flush()
-        answer = json.loads(self._answer())
+        answer = self._worker.ask(path.resolve())
         if not answer.get('said'):
             return {}
         both, networks, bodies = answer['said']
@@ -109,25 +205,21 @@ class Old:
             'DART alone': (bodies, np.nan),
         }
 
-    def _answer(self) -> str:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise MtvWorldError("the checkout of '--old' does not run; is it v0.1.0?")
-        return line
-
 
 class New:
     """This version, with some numbers of futures.
 
     Args:
         futures: numbers of them.
+        contact: checkpoint, or folder of fit-contact.
+        robot: whose it is; None = the checkpoint's.
     """
 
-    def __init__(self, futures: list[int]) -> None:
-        self.robot = checkpoint_robot('bundled')
-        found = load_foresight(checkpoint_path('bundled') / OBJECT_MOTION_FOLDER, self.robot)
-        assert found is not None
+    def __init__(self, futures: list[int], contact: str, robot: str | None) -> None:
+        self.robot = checkpoint_robot(contact) if robot is None else load_robot(robot_path(robot))
+        found = load_foresight(checkpoint_path(contact) / OBJECT_MOTION_FOLDER, self.robot)
+        if found is None:
+            raise MtvWorldError(f"'{contact}' holds no numbers of contact; run fit-contact")
         self._engines = {
             f'MuJoCo, {number} futures': SolidForesight(
                 self.robot,
@@ -170,13 +262,13 @@ class New:
 Said = dict[str, tuple[float, float]]
 
 
-def answers(options: argparse.Namespace) -> Iterator[tuple[bool, Said]]:
+def answers(options: argparse.Namespace, folder: Path | None) -> Iterator[tuple[bool, Said]]:
     """Yields outcomes and what all say of them, of plans of which all can tell."""
     paths = list_episodes(options.dataset)
     refuse_test_kinds(paths, 'the choice of an engine')
     order = np.random.default_rng(options.seed).permutation(len(paths))[: options.repeats]
-    new = New(options.futures)
-    old = None if options.old is None else Old(options.old)
+    new = New(options.futures, options.contact, options.robot)
+    old = None if folder is None else Old(folder)
     for number, path in enumerate(paths[k] for k in order):
         success, said = new.ask(path)
         theirs = old.ask(path) if said and old is not None else {}
@@ -210,10 +302,9 @@ def row(
     ]  # fmt: skip
 
 
-def main() -> None:
-    """Prints a row for each engine, and writes them as a page."""
-    options = parse_arguments(__doc__, 120, more)
-    found = list(answers(options))
+def judged(options: argparse.Namespace, folder: Path | None) -> str:
+    """Returns the table of what engines say of episodes."""
+    found = list(answers(options, folder))
     real = np.array([success for success, _ in found])
     if len(set(real.tolist())) < 2:
         raise MtvWorldError(f"'{options.dataset}' needs episodes that succeed and that fail")
@@ -224,24 +315,69 @@ def main() -> None:
     rows = []
     for name in found[0][1]:
         ratio = ''
-        if options.old is not None and np.isfinite(of(name, 1)).all():
+        if folder is not None and np.isfinite(of(name, 1)).all():
             ratio = f'{np.median(of(name, 1) / of(OLD, 1)):.2f}'
         rows.append(row(name, of(name, 0), real, of(name, 1), ratio))
+    told = f'{len(real)} episodes of {options.repeats}, of which {real.sum()} really succeed.'
+    return f'{told}\n\n{table(HEAD, rows)}'
+
+
+def imagined(options: argparse.Namespace, folder: Path) -> str:
+    """Returns the table of what chunks take, old and new in turns."""
+    workers = {OLD: Worker(folder, _CHUNKS)}
+    for number in options.futures:
+        workers[f'MuJoCo, {number} futures'] = Worker(ROOT, _CHUNKS, number)
+    spent: dict[str, list[dict[str, float]]] = {name: [] for name in workers}
+    try:
+        for turn in range(-1, options.chunks):  # the first one warms up
+            frame = max(turn, 0) * _STRIDE % _FRAMES
+            for name in list(workers)[:: 1 if turn % 2 else -1]:
+                seconds = workers[name].ask(frame)
+                spent[name] += [seconds] if turn >= 0 else []
+    finally:
+        for worker in workers.values():
+            worker.close()
+
+    def of(name: str, *stages: str) -> FloatArray:
+        return np.array([sum(s[stage] for stage in stages or s) for s in spent[name]])
+
+    rows = []
+    for name in spent:
+        cells = []
+        for stages in (('object motion',), ()):
+            ratios = of(name, *stages) / of(OLD, *stages)
+            low, middle, high = np.percentile(ratios, [5, 50, 95])
+            cells += [
+                f'{np.median(of(name, *stages)):.3f}',
+                f'{middle:.2f} [{low:.2f}, {high:.2f}]',
+            ]
+        rows.append([name, *cells])
+    head = ('version', 'object motion, CPU [s]', 'of 0.1.0', 'chunk, CPU [s]', 'of 0.1.0')
     told = (
-        f'{len(real)} episodes of {options.repeats}, of which {real.sum()} really succeed. Load '
-        f'of the machine meanwhile: {os.getloadavg()[1]:.1f} on {os.cpu_count()} cores.'
+        f'{options.chunks} plans of 3.2 s in turns; medians, in brackets the 5th and 95th '
+        'percentile of the turns. A chunk: all from the observation to the estimate.'
     )
+    return f'{told}\n\n{table(head, rows)}'
+
+
+def main() -> None:
+    """Prints what was asked for, and writes it as a page."""
+    options = parse_arguments(__doc__, 120, more)
+    if options.dataset is None and not options.chunks:
+        raise MtvWorldError('nothing to do: give a folder of episodes, --chunks, or both')
+    is_alone = options.no_old or options.robot is not None
+    with old_checkout() as folder:
+        parts = []
+        if options.dataset is not None:
+            parts.append(judged(options, None if is_alone else folder))
+        if options.chunks:
+            parts.append(imagined(options, folder))
+    load = f'Load of the machine: {os.getloadavg()[1]:.1f} on {os.cpu_count()} cores.'
     publish(
         'foresight_engines',
         'What foresees objects, and how fast',
-        f'python benchmark/foresight_engines.py DIR --old DIR, {fingerprint("bundled")}',
-        '\n\n'.join(
-            [
-                (__doc__ or '').split('\n' * 2)[-1],
-                told,
-                table(HEAD, rows),
-            ]
-        ),
+        f'python benchmark/foresight_engines.py, {fingerprint("bundled")}',
+        '\n\n'.join([(__doc__ or '').split('\n' * 2, 2)[-1], *parts, load]),
         options,
         '1 thread each',
     )

@@ -10,14 +10,18 @@ page has to end with.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import date
+from io import BytesIO
 import os
 from pathlib import Path
 import platform
 import re
 import subprocess
 import sys
+import tarfile
+import tempfile
 import time
 
 import numpy as np
@@ -26,6 +30,8 @@ from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.files import content_digest
 
 ROOT = Path(__file__).resolve().parents[1]
+#: what speed is compared with
+OLD_TAG = 'v0.1.0'
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
     'camera_calibration': ('mtv_world_ros/lab/inspection',),
@@ -128,6 +134,22 @@ def in_turns(
 def ratio(above: Sequence[float], below: Sequence[float]) -> float:
     """Returns the median of the ratios of two works' times of the same turns."""
     return float(np.median([a / b for a, b in zip(above, below, strict=True)]))
+
+
+@contextmanager
+def old_checkout() -> Iterator[Path]:
+    """A temporary folder with the files of `OLD_TAG`, which this version is compared with.
+
+    Raises:
+        FileNotFoundError: the repository has no such tag.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        packed = subprocess.run(['git', 'archive', OLD_TAG], cwd=ROOT, capture_output=True)
+        if packed.returncode:
+            raise FileNotFoundError(f"there is no tag '{OLD_TAG}' here; run 'git fetch --tags'")
+        with tarfile.open(fileobj=BytesIO(packed.stdout)) as files:
+            files.extractall(folder, filter='data')
+        yield Path(folder)
 
 
 def machine_line() -> str:
