@@ -11,17 +11,19 @@ unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+# what the demo needs; an installation of everything has it, too
+DEMO_STAMP := $(if $(wildcard $(STAMP)),$(STAMP),.venv/.demo)
 
 help:  ## list the targets
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
 install: $(STAMP)  ## install everything into .venv; the second call does nothing
 
-$(STAMP): setup.py requirements/constraints.txt requirements/install.sh
-	@PYTHON="$(PYTHON)" requirements/install.sh
+$(STAMP) .venv/.demo: setup.py requirements/constraints.txt requirements/install.sh
+	@PYTHON="$(PYTHON)" requirements/install.sh $(subst .,,$(@F))
 	@touch $@
 
-demo: $(STAMP)  ## replay the bundled episode through the node; results under out/demo/
+demo: $(DEMO_STAMP)  ## replay the bundled episode through the node; results under out/demo/
 	$(BIN)/mtv-world demo --overwrite
 
 lint: style types  ## ruff, import-linter and pyright

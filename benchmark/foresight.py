@@ -35,12 +35,12 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.files import share_path
 from mtv_world_ros.ros.messages.conversions import (
+    make_header,
     to_joint_state,
     to_trajectory_message,
     values_of,
 )
 from mtv_world_ros.ros.messages.image_messages import to_image
-from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
 

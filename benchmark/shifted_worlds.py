@@ -43,9 +43,9 @@ from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell
-from mtv_world_ros.success.verdict import verdict
 
 TASKS = (
     'place_block_a2b_left', 'stack_blocks_two', 'place_cup_plate', 'collect_toy',

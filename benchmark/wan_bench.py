@@ -15,14 +15,18 @@ from torch import nn, Tensor
 
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
-from mtv_world_ros.model.conditioning import condition, Conditioning, decode_frames
-from mtv_world_ros.model.history_tokens import with_anchor, with_history
+from mtv_world_ros.model.conditioning import (
+    condition,
+    Conditioning,
+    decode_frames,
+    with_anchor,
+    with_history,
+)
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import denoise, sample_latents
-from mtv_world_ros.model.serving.prepare import prepare
-from mtv_world_ros.model.serving.serving_options import ServingOptions
-from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
+from mtv_world_ros.model.serving import prepare, ServingOptions
+from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 _IMAGE_TOKENS = 257

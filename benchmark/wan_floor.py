@@ -32,7 +32,7 @@ from wan_bench import Bench
 from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.training.dry_run import attention_operations, fill
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
-from mtv_world_ros.model.serving.serving_options import ServingOptions
+from mtv_world_ros.model.serving import ServingOptions
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.lora import add_adapter
-from mtv_world_ros.model.serving.serving_options import ServingOptions
+from mtv_world_ros.model.serving import ServingOptions
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

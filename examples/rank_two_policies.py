@@ -15,7 +15,7 @@ from pathlib import Path
 from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.files import share_path
-from mtv_world_ros.policies.recorded_policy import RecordedPolicy
+from mtv_world_ros.policies.policy import RecordedPolicy
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.imagined_episode import ImaginedEpisode
     from mtv_world_ros.pipeline import Pipeline
-    from mtv_world_ros.replay.judge import judge
+    from mtv_world_ros.replay.offline import judge
 
 __all__ = ['ImaginedEpisode', 'judge', 'load_pipeline', 'Pipeline', 'read_episode']
 _PLACES = {
     'ImaginedEpisode': 'imagined_episode',
-    'judge': 'replay.judge',
+    'judge': 'replay.offline',
     'load_pipeline': 'assembly',
     'Pipeline': 'pipeline',
     'read_episode': 'data.episode_reader',

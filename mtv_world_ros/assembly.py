@@ -18,14 +18,15 @@ from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.parallel import threads_each
 from mtv_world_ros.pipeline import Pipeline, WorldModel
-from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
-from mtv_world_ros.policies.policy_config import (
+from mtv_world_ros.policies.policy import (
+    EpisodeOrigin,
     load_policy_config,
+    Policy,
     PolicyConfig,
+    RecordedPolicy,
     RecordedPolicySettings,
     ScriptedPolicySettings,
 )
-from mtv_world_ros.policies.recorded_policy import RecordedPolicy
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     CALIBRATION,
@@ -144,7 +145,7 @@ def load_pipeline(
     from mtv_world_ros.foresight.loading import load_foresight
     from mtv_world_ros.model.checkpoint import load_checkpoint
     from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
-    from mtv_world_ros.model.serving.serving_options import ServingOptions
+    from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.model.world_model import DiffusionWorldModel
 
     options = ServingOptions.parse(serving)
@@ -390,7 +391,7 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
     if not isinstance(config, DescriberConfig):
         config = load_describer_config(Path(config))
     if config.kind == 'list':
-        from mtv_world_ros.vision.describers.object_list import load_object_list
+        from mtv_world_ros.vision.describers.describer_config import load_object_list
 
         return load_object_list(Path(config.list))
     chat = _chat(config)

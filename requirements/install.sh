@@ -1,12 +1,17 @@
 #!/usr/bin/env bash
-# Makes .venv and installs the package with everything that its demo and tests need; no root.
-# Called by `make`; running it again completes an interrupted or outdated installation.
+# Makes .venv and installs the package with everything that its commands and tests need, or with
+# the argument `demo` what its demo needs; no root. Called by `make`; running it again completes an
+# interrupted or outdated installation.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 TORCH=$(grep '^torch==' requirements/constraints.txt)
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 VENV=.venv
+case ${1-} in
+    demo) EXTRAS=ros ;;
+    *) EXTRAS=dart,train,describe,vision,evaluate,import,wan,policies,ros,view,test,lint,docs ;;
+esac
 
 say() { printf '%s\n' "$*" >&2; }
 
@@ -77,7 +82,7 @@ install_torch
 # setuptools first, so that the package builds in place instead of in an environment of its own.
 pip install --quiet -c requirements/constraints.txt setuptools
 say 'Installing the other packages'
-pip install --quiet --no-build-isolation -c requirements/constraints.txt -e '.[sim,dart,train,describe,vision,evaluate,import,wan,policies,ros,view,test,lint,docs]'
+pip install --quiet --no-build-isolation -c requirements/constraints.txt -e ".[$EXTRAS]"
 if ! "$VENV/bin/python" -c 'import rclpy' 2>/dev/null; then
     say 'rclpy is not available: its wheels exist for x86_64 Linux only. Elsewhere use a native'
     say 'ROS 2 Jazzy (docs/native_ros.md). What needs no ROS works, the rest is skipped.'

@@ -34,7 +34,7 @@ from mtv_world_ros.model.card import read_card
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import resize_frames
-from mtv_world_ros.vision.describers.scene_objects import DescribedObject
+from mtv_world_ros.vision.describers.describer import DescribedObject
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'

@@ -10,7 +10,7 @@ import numpy as np
 
 from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.success.relations import FLOOR_M
-from mtv_world_ros.vision.colour_words import PALETTE
+from mtv_world_ros.vision.segmenters.colour import PALETTE
 
 Rgb = tuple[float, float, float]
 Size = tuple[float, float, float]

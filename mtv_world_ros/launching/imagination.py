@@ -22,7 +22,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free, check_room
 from mtv_world_ros.launching.node_processes import ROOM_BYTES
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.policies.policy_config import RecordedPolicySettings, ScriptedPolicySettings
+from mtv_world_ros.policies.policy import RecordedPolicySettings, ScriptedPolicySettings
 from mtv_world_ros.processes import (
     how_it_ended,
     module_command,

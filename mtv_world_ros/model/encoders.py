@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import import_transformers
-from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 
 FOLDERS = ('text_encoder', 'tokenizer')
 #: mean and standard deviation of the colours that CLIP was trained with

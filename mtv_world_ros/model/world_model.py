@@ -16,13 +16,11 @@ from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import check_same_model
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
+    check_history,
     condition,
     condition_on_actions,
     Conditioning,
     decode_frames,
-)
-from mtv_world_ros.model.history_tokens import (
-    check_history,
     with_anchor,
     with_history,
     without_history,
@@ -31,9 +29,12 @@ from mtv_world_ros.model.lora import Adapter, Adapters
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.sampler import sample_latents
-from mtv_world_ros.model.serving.memory_check import check_memory
-from mtv_world_ros.model.serving.prepare import decoder_of, prepare
-from mtv_world_ros.model.serving.serving_options import ServingOptions
+from mtv_world_ros.model.serving import (
+    check_memory,
+    decoder_of,
+    prepare,
+    ServingOptions,
+)
 
 if TYPE_CHECKING:
     from mtv_world_ros.geometry.robot.model import RobotModel

@@ -1,13 +1,23 @@
-"""What a policy is (observation and instruction in, trajectory out), and how much is executed."""
+"""A policy that acts, and the files like those in `config/policies` that name one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from mtv_world_ros.config import read_yaml, Schema, validated, Wait
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.geometry.resample import cut_off, SAME_S
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.policies.lerobot_client import LeRobotConfig
+from mtv_world_ros.policies.openpi_client import OpenPiConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,3 +83,136 @@ def first_part(
     if trajectory.times[-1] <= seconds + SAME_S:
         return trajectory
     return cut_off(trajectory, start_positions, seconds)
+
+
+class RecordedPolicy:
+    """Answers with the commands that followed in the recording, by the time since the begin.
+
+    Args:
+        commands: times count from the moment that the episode begins from [s].
+        hold_s: from the last command, or from the begin where that is later, to the end of the
+            episode [s].
+    """
+
+    name = 'recorded'
+
+    def __init__(self, commands: JointTrajectory, hold_s: float) -> None:
+        end_s = max(float(commands.times[-1]), 0.0) + hold_s
+        self._commands = cut_off(commands, commands.positions[0], end_s)
+        self._first_ns: int | None = None
+
+    def reset(self, *, seed: int) -> None:
+        """Begins an episode."""
+        self._first_ns = None
+
+    def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
+        """Returns all commands from the observation on, or None where the episode is over.
+
+        Args:
+            observation: its stamp alone is looked at.
+            instruction: not looked at.
+        """
+        if self._first_ns is None:
+            self._first_ns = observation.stamp_ns
+        commands = self._commands
+        times = commands.times - (observation.stamp_ns - self._first_ns) / 1e9
+        rest = np.flatnonzero(times > SAME_S)
+        if not len(rest):
+            return None
+        return JointTrajectory(
+            joint_names=commands.joint_names,
+            times=times[rest],
+            positions=commands.positions[rest],
+            velocities=None if commands.velocities is None else commands.velocities[rest],
+        )
+
+
+class ScriptedPolicySettings(Schema):
+    """A policy of the simulator, which this layer does not know."""
+
+    kind: Literal['scripted'] = 'scripted'
+    variant: str = Field(
+        default='expert', description='e.g. `expert` or, with faults, `expert-noise-0.02`'
+    )
+    hold_s: Wait = Field(
+        default=0.6, description='from the end of its plan to the end of the episode [s]'
+    )
+
+
+class RecordedPolicySettings(Schema):
+    """What was commanded in the episode that an imagined one begins from."""
+
+    kind: Literal['recorded'] = 'recorded'
+    hold_s: Wait = Field(
+        default=0.6, description='from the last command to the end of the episode [s]'
+    )
+
+
+class PythonPolicyConfig(Schema):
+    """A policy in Python code of the user's."""
+
+    kind: Literal['python'] = 'python'
+    factory: str = Field(
+        description='`package.module:function`; called with the arguments it returns a `Policy`'
+    )
+    arguments: Annotated[dict[str, Any], BeforeValidator(lambda value: value or {})] = Field(
+        default={}, description='by keyword'
+    )
+
+    def make(self) -> Policy:
+        """Calls the factory.
+
+        Raises:
+            ConfigError: there is no such function, or it does not take the arguments.
+        """
+        module, _, function = self.factory.partition(':')
+        try:
+            return getattr(import_module(module), function)(**self.arguments)
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"policy factory '{self.factory}' cannot be used: {error}; it must be "
+                "'package.module:function' of something that Python finds (PYTHONPATH)"
+            ) from error
+
+
+#: of these the layers above make the policy, once they know the episode's origin
+OriginSettings = ScriptedPolicySettings | RecordedPolicySettings
+PolicyConfig = OriginSettings | PythonPolicyConfig | OpenPiConfig | LeRobotConfig
+_KINDS: dict[str, type[PolicyConfig]] = {
+    'scripted': ScriptedPolicySettings,
+    'recorded': RecordedPolicySettings,
+    'python': PythonPolicyConfig,
+    'openpi': OpenPiConfig,
+    'lerobot': LeRobotConfig,
+}
+
+
+def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
+    """Reads a file like those in `config/policies`.
+
+    Raises:
+        ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
+    """
+    return policy_config(read_yaml(path, 'policy file', 'policy'), robot, str(path))
+
+
+def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
+    """Returns the policy that the values of such a file describe.
+
+    Args:
+        values: of the file.
+        robot: whose joints it moves.
+        where: beginning of error texts, e.g. the file.
+
+    Raises:
+        ConfigError: a key is unknown or missing, a value is wrong.
+    """
+    if not isinstance(values, Mapping) or 'kind' not in values:
+        raise ConfigError(f"{where}: expected a key 'kind': {', '.join(_KINDS)}")
+    kind = values['kind']
+    if kind not in _KINDS:
+        raise ConfigError(
+            f"{where}: kind '{kind}' is none{nearest(str(kind), _KINDS)}; valid are "
+            f'{", ".join(_KINDS)}'
+        )
+    return validated(_KINDS[kind], values, where, context={'robot': robot})

@@ -13,8 +13,8 @@ from tqdm import tqdm
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import DEFAULT
-from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
+from mtv_world_ros.data.recording import DEFAULT, frame_indices, Recording
+from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.observed_episode import ObservedEpisode
@@ -288,3 +288,27 @@ def instruction_at(episode: Episode, stamp_ns: int) -> str:
     """Returns the instruction that held at a moment, or the episode's."""
     before = [text for stamp, text in episode.instructions if stamp <= stamp_ns]
     return before[-1] if before else episode.info.instruction
+
+
+def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
+    """Returns the success estimate at the end of a recorded episode.
+
+    Args:
+        pipeline: finds the objects and judges; see `load_pipeline`.
+        recording: V views on the model's clock, e.g. of `load_recording(path, pipeline.spec,
+            pipeline.robot)`.
+
+    Raises:
+        EpisodeError: the recording is shorter than a frame of the model, or has a gap.
+        ObservationError: its views are not the model's.
+    """
+    spec = pipeline.spec
+    seconds = float(recording.times[-1] - recording.times[0])
+    rows = frame_indices(recording, 0, spec, num_frames=int(seconds * spec.fps + 1e-3))
+    if rows is None or len(rows) < 2:
+        raise EpisodeError(
+            f"'{recording.path}' cannot be judged: it lasts {seconds:.2f} s, has a gap or fewer "
+            f'than two frames at {spec.fps:g} Hz; record images without a break'
+        )
+    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+    return episode.observe(recording.frames[:, rows[1:]], recording.positions[rows]).success

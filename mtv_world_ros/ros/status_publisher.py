@@ -16,8 +16,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Header
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.ros.messages.conversions import to_diagnostics, to_status
-from mtv_world_ros.ros.messages.stamps import make_header
+from mtv_world_ros.ros.messages.conversions import make_header, to_diagnostics, to_status
 
 #: a fault shows as a warning for this long [s]
 _WARN_S = 5.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import exp, isfinite, nan
+from math import exp, isfinite, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,27 @@ from mtv_world_ros.success.situation import grippers_open
 from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+#: an estimate from here on is called a success. A false success costs more than a false failure,
+#: so that more than an even chance is required
+SUCCESS_FROM = 0.75
+#: an estimate below this is called a failure; between the two, the verdict is open
+FAILURE_BELOW = 0.5
+
+
+def verdict(probability: float) -> float:
+    """Returns 1 = a success, 0 = a failure, NaN = open, or the estimator abstained (NaN)."""
+    if probability >= SUCCESS_FROM:
+        return 1.0
+    return 0.0 if probability < FAILURE_BELOW else nan
+
+
+def verdict_word(probability: float) -> str:
+    """Returns `success`, `failure`, `open`, or `abstains` where the probability is NaN."""
+    if isnan(probability):
+        return 'abstains'
+    return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability), 'open')
+
 
 __all__ = ['Judged', 'SuccessEstimator', 'load_tasks']
 

@@ -16,7 +16,7 @@ import yaml
 
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.policies.policy_config import load_policy_config
+from mtv_world_ros.policies.policy import load_policy_config
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
 

@@ -207,7 +207,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.lab.cli.train import set_overrides
     from mtv_world_ros.lab.training.training_config import load_training_config
     from mtv_world_ros.model.actions import check_control
-    from mtv_world_ros.model.serving.serving_options import ServingOptions
+    from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
 
     def each(names: str | Sequence[str]) -> list[str]:

@@ -16,8 +16,7 @@ from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.policies.policy_config import load_policy_config
+from mtv_world_ros.policies.policy import EpisodeOrigin, load_policy_config
 
 SERVER = Path(__file__).with_name('lerobot_server.py')
 ROBOT = load_robot(robot_path('yam_bimanual'))

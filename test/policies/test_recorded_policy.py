@@ -12,8 +12,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
-from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.policies.recorded_policy import RecordedPolicy
+from mtv_world_ros.policies.policy import EpisodeOrigin, RecordedPolicy
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 COMMANDS = JointTrajectory(

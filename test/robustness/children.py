@@ -180,7 +180,7 @@ def episode_recorder(folder: Path, one: Signal) -> None:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
-    from mtv_world_ros.ros.episodes.recorder_process import RecorderProcess
+    from mtv_world_ros.ros.episodes.episode_runner import RecorderProcess
     from mtv_world_ros.ros.peers import Peers
 
     node = rclpy.create_node('attacker')

@@ -306,7 +306,7 @@ def _yam() -> Any:
 
 
 def _read_policy(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.policies.policy_config import load_policy_config
+    from mtv_world_ros.policies.policy import load_policy_config
 
     return load_policy_config(_file(folder / 'policy.yaml', data), _yam())
 
@@ -349,7 +349,7 @@ def _object_lists() -> list[bytes]:
 
 
 def _read_objects(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.vision.describers.object_list import load_object_list
+    from mtv_world_ros.vision.describers.describer_config import load_object_list
 
     return load_object_list(_file(folder / 'objects.yaml', data))
 

@@ -215,7 +215,7 @@ def send(key: str, message: Any) -> None:
     from mtv_world_ros.bounded_input import check_limit
     from mtv_world_ros.ros.messages.rejection import bounded, Reason
     from mtv_world_ros.ros.sensing.observations import ObservationBuffer
-    from mtv_world_ros.ros.world_model.requests import RequestMaker
+    from mtv_world_ros.ros.world_model.rollouts import RequestMaker
 
     robot, cameras, settings = _fixed()
     if key == 'instruction':

@@ -27,9 +27,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E
 from mtv_world_ros.data_types import CameraModel  # noqa: E402
 from mtv_world_ros.files import share_path  # noqa: E402
 from mtv_world_ros.geometry.calibration_file import save_calibration  # noqa: E402
-from mtv_world_ros.ros.messages.conversions import values_of  # noqa: E402
+from mtv_world_ros.ros.messages.conversions import (  # noqa: E402
+    NANO,
+    to_stamp,
+    values_of,
+)
 from mtv_world_ros.ros.messages.image_messages import to_compressed, to_image  # noqa: E402
-from mtv_world_ros.ros.messages.stamps import NANO, to_stamp  # noqa: E402
 
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

@@ -12,8 +12,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.task import load_task
-from mtv_world_ros.vision.colour_words import PALETTE
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
 
 GOAL = (-0.1, 0.32, 0.025)
 SAID = 'put the red block where it belongs'

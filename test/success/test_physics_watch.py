@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import SuccessEstimate
-from mtv_world_ros.success.doubts import widened
-from mtv_world_ros.success.physics_watch import PhysicsWatch, SAYS, unforeseen
+from mtv_world_ros.success.doubts import PhysicsWatch, SAYS, unforeseen, widened
 
 
 def futures(*ways):

@@ -2,7 +2,7 @@ from math import isnan, nan
 
 import pytest
 
-from mtv_world_ros.success.verdict import verdict
+from mtv_world_ros.success.estimator import verdict
 
 
 @pytest.mark.parametrize(('probability', 'said'), [(0, 0), (0.499, 0), (0.75, 1), (1, 1)])

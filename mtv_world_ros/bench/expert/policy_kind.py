@@ -10,8 +10,7 @@ from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, refuse_ki
 from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
-from mtv_world_ros.policies.policy_config import ScriptedPolicySettings
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, ScriptedPolicySettings
 
 
 def check(settings: ScriptedPolicySettings) -> None:

@@ -18,7 +18,7 @@ from mtv_world_ros.imagined_episode import ObservedChunk
 from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.images import resize_frames
-from mtv_world_ros.success.verdict import verdict
+from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: an object has parted where its overlap is too small in so many frames in a row

@@ -23,9 +23,9 @@ from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
-from mtv_world_ros.policies.policy import Policy
-from mtv_world_ros.policies.policy_config import (
+from mtv_world_ros.policies.policy import (
     OriginSettings,
+    Policy,
     policy_config,
     PolicyConfig,
     RecordedPolicySettings,

@@ -25,7 +25,7 @@ from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.lab.documents import DASH, render, Table
 from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_SCENES
 from mtv_world_ros.lab.evaluation.report.charts import Point, scatter_chart
-from mtv_world_ros.success.verdict import FAILURE_BELOW, SUCCESS_FROM
+from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 
 TITLE = 'Policy ranking'
 #: hues of the report's style sheet

@@ -14,7 +14,7 @@ from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.data_types import SuccessEstimate
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
-from mtv_world_ros.success.verdict import verdict
+from mtv_world_ros.success.estimator import verdict
 
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (

@@ -23,7 +23,7 @@ from mtv_world_ros.bench.world.scene import (
 from mtv_world_ros.bench.world.workcell import PlacementConfig, Workcell
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.success.situation import TruePoses
-from mtv_world_ros.vision.colour_words import PALETTE
+from mtv_world_ros.vision.segmenters.colour import PALETTE
 
 MAX_DRAWS = 4000
 Rng = np.random.Generator

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+import os
 from pathlib import Path
 import re
 from typing import Annotated, Any, Literal, Self
@@ -26,9 +28,42 @@ from mtv_world_ros.geometry.robot.mesh_pieces import (
     write_convex_hull,
 )
 from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
-from mtv_world_ros.geometry.robot.parser_output import parser_errors
 from mtv_world_ros.geometry.robot.shape import grip_links
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
+
+_ERROR = re.compile(rb'^Error: *(.+)$', re.MULTILINE)
+
+
+@contextmanager
+def parser_errors() -> Iterator[list[str]]:
+    """Takes the parser's errors off stderr; all else that is written there meanwhile goes on.
+
+    Yields:
+        The errors, filled at the end.
+    """
+    found: list[str] = []
+    try:
+        stderr = os.dup(2)
+    except OSError:  # a process without stderr prints nothing
+        yield found
+        return
+    with os.fdopen(os.memfd_create('urdfdom'), 'w+b') as taken:
+        os.dup2(taken.fileno(), 2)
+        try:
+            yield found
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            taken.seek(0)
+            text = taken.read()
+            found += [line.decode(errors='replace').strip() for line in _ERROR.findall(text)]
+            os.write(2, _without_errors(text))
+
+
+def _without_errors(text: bytes) -> bytes:
+    """What is left without errors and the places in urdfdom's source that follow them."""
+    return re.sub(rb'^Error: .+\n(?: +at line \d+ in .+\n)?', b'', text, flags=re.MULTILINE)
+
 
 #: expanded URDFs may keep xacro in comments, and `$(find ...)` in what is not of the robot
 _COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)

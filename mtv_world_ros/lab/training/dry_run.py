@@ -17,7 +17,7 @@ from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.actions import ActionEncoding, EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
+from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 #: bytes of a float32 number: trained weights, their averages, gradients, Adam's two moments

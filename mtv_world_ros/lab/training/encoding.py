@@ -26,9 +26,10 @@ from mtv_world_ros.model.conditioning import (
     condition_on_actions,
     Conditioning,
     encode_chunk,
+    with_anchor,
+    with_history,
 )
 from mtv_world_ros.model.encoders import ImageEncoder
-from mtv_world_ros.model.history_tokens import with_anchor, with_history
 from mtv_world_ros.model.parts import Autoencoder
 
 

@@ -26,7 +26,7 @@ from mtv_world_ros.lab.training.encoding import (
     EncodedBatch,
     Encoders,
 )
-from mtv_world_ros.lab.training.latent_cache.latent_clips import CachedSource
+from mtv_world_ros.lab.training.latent_cache import CachedSource
 from mtv_world_ros.lab.training.objective import (
     add_noise,
     draw_sigmas,
@@ -52,7 +52,7 @@ from mtv_world_ros.model.checkpoint import (
     OBJECT_MOTION_FOLDER,
     save_checkpoint,
 )
-from mtv_world_ros.model.history_tokens import check_history
+from mtv_world_ros.model.conditioning import check_history
 from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place

@@ -43,7 +43,7 @@ from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.clips.fit_actions import kept_actions
 from mtv_world_ros.lab.training.distributed import Processes
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.lab.training.latent_cache.latent_clips import cached, CachedSource
+from mtv_world_ros.lab.training.latent_cache import cached, CachedSource
 from mtv_world_ros.lab.training.log import TrainingLog
 from mtv_world_ros.lab.training.resume import (
     check_architecture,

@@ -18,7 +18,7 @@ from mtv_world_ros.model.actions import (
     TRAJECTORY_VIDEO,
     VOCABULARY,
 )
-from mtv_world_ros.model.transformer.cross_attention import Context
+from mtv_world_ros.model.transformer.block import Context
 
 #: width of Ctrl-World's action encoder; narrower where the model is
 _HIDDEN = 1024

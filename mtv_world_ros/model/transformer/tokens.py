@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.transformer.cross_attention import Context
+from mtv_world_ros.model.transformer.block import Context
 
 #: where the start image may enter: as reference tokens, in its channel slot, or both
 START_IMAGES = ('both', 'either', 'reference', 'channel')

@@ -16,8 +16,11 @@ from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.transformer.action_context import build_control
-from mtv_world_ros.model.transformer.block import hold_levels_by_run
-from mtv_world_ros.model.transformer.cross_attention import check_tokens, fit_cross_attention
+from mtv_world_ros.model.transformer.block import (
+    check_tokens,
+    fit_cross_attention,
+    hold_levels_by_run,
+)
 from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, ReferenceStem
 from mtv_world_ros.model.transformer.tokens import (
     arrange,

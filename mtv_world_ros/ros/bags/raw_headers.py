@@ -8,7 +8,7 @@ import struct
 from typing import Any
 
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.ros.messages.stamps import NANO
+from mtv_world_ros.ros.messages.conversions import NANO
 
 #: the encapsulation header comes first; the stamp is a header's first field
 _OFFSET = 4

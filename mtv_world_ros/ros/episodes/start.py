@@ -16,9 +16,14 @@ from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode import CALIBRATION_FILE, camera_info_topic, optical_frame
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.ros.messages.conversions import to_joint_state, to_positions
+from mtv_world_ros.ros.messages.conversions import (
+    make_header,
+    NANO,
+    to_joint_state,
+    to_positions,
+    to_stamp,
+)
 from mtv_world_ros.ros.messages.image_messages import to_image
-from mtv_world_ros.ros.messages.stamps import make_header, NANO, to_stamp
 from mtv_world_ros.ros.sensing.subscriptions import Handler, MatchedSubscription
 
 

@@ -1,4 +1,4 @@
-"""Joint, instruction, estimate and diagnostic messages to and from data types."""
+"""Joint, instruction, estimate and diagnostic messages to and from data types; time stamps."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
+from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from sensor_msgs.msg import JointState
@@ -17,7 +18,24 @@ from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.ros.messages.rejection import bounded, Reason, refused_plan, Rejection
-from mtv_world_ros.ros.messages.stamps import NANO
+
+NANO = 1_000_000_000
+
+
+def to_ns(stamp: Time | Duration) -> int:
+    """Nanoseconds of a stamp or a duration."""
+    return stamp.sec * NANO + stamp.nanosec
+
+
+def to_stamp(stamp_ns: int) -> Time:
+    """Stamp of nanoseconds since the epoch; they must fit a ROS time (0 to 2^31 s)."""
+    sec, nanosec = divmod(stamp_ns, NANO)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def make_header(stamp_ns: int, frame_id: str = '') -> Header:
+    """A header with this stamp and frame."""
+    return Header(stamp=to_stamp(stamp_ns), frame_id=frame_id)
 
 
 def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:

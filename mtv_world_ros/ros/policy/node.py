@@ -22,13 +22,11 @@ from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ros import parameters
-from mtv_world_ros.ros.messages.conversions import to_trajectory_message, values_of
+from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import make_header
-from mtv_world_ros.ros.policy.loop import PolicyLoop
+from mtv_world_ros.ros.policy.loop import PolicyLoop, PredictedFrames
 from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
 from mtv_world_ros.ros.policy.policy_thread import Actor
-from mtv_world_ros.ros.policy.predicted_frames import PredictedFrames
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer

@@ -2,17 +2,292 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import partial
+import hashlib
+from importlib import import_module
+from typing import Any
 
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+import numpy as np
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
 
-from mtv_world_ros.data.transform_tree import Mount
+from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.data.transform_tree import Mount, STILL, TransformTree
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.errors import CalibrationError, ConfigError, RobotError
+from mtv_world_ros.geometry.robot.description import described_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.geometry.transforms import inverse, quaternion
+from mtv_world_ros.ros.messages.conversions import make_header, NANO
+from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.sensing.extrinsics import Extrinsics
+from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.sensing.observations import SensedScene
-from mtv_world_ros.ros.sensing.robot_description_topic import Handler, RobotDescription
+
+TOPIC = 'robot_description'
+
+
+class RobotDescription:
+    """Holds what is described against the robot that the checkpoint was trained on.
+
+    Args:
+        node: owner of the subscription.
+        expected: the checkpoint's robot.
+        on_robot: gets the same robot with the described kinematics and limits.
+        guarded: wraps a handler so that it never raises.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        expected: RobotModel,
+        on_robot: Callable[[RobotModel], None],
+        guarded: Callable[[Handler], Handler],
+    ) -> None:
+        self._expected, self._on_robot = expected, on_robot
+        self._log = node.get_logger()
+        self._seen = b''
+        self._problem = ''
+        self._offset_m: float | None = None
+        self._topic = node.resolve_topic_name(TOPIC)
+        node.create_subscription(String, TOPIC, guarded(self._take), LATCHED)
+
+    def problems(self) -> list[str]:
+        """What is wrong with the description; empty = nothing."""
+        return [self._problem] if self._problem else []
+
+    def values(self) -> dict[str, object]:
+        """For `/diagnostics`."""
+        if self._problem:
+            return {TOPIC: 'another robot'}
+        if self._offset_m is None:
+            return {TOPIC: 'none'}
+        return {TOPIC: 'used', f'{TOPIC}.offset_m': self._offset_m}
+
+    def _take(self, message: String) -> None:
+        with bounded(Reason.ROBOT_DESCRIPTION):
+            check_limit('urdf_bytes', len(message.data), f'{self._topic}')
+        text = message.data.encode()
+        digest = hashlib.sha256(text).digest()
+        if digest == self._seen:  # several nodes may publish the same one
+            return
+        self._seen = digest
+        try:
+            found = described_robot(self._expected, message.data)
+        except RobotError as error:
+            self._offset_m = None
+            self._problem = (
+                f"{self._topic}: {error}. Set 'use_robot_description' to false, or remap the "
+                'topic, if it is meant for somebody else'
+            )
+            raise Rejection(Reason.ROBOT_DESCRIPTION, self._problem) from error
+        self._problem, self._offset_m = '', found.offset_m
+        self._on_robot(found.robot)
+        self._log.info(
+            f"{self._topic}: robot '{found.robot.name}'; its tools are up to "
+            f"{1000 * found.offset_m:.1f} mm off those of the checkpoint's description"
+        )
+
+
+Handler = Callable[[Any], None]
+
+
+def tf_message() -> Any | None:
+    """Returns tf2_msgs/TFMessage; None = it is not installed."""
+    try:
+        return import_module('tf2_msgs.msg').TFMessage
+    except ModuleNotFoundError:
+        return None
+
+
+class Extrinsics:
+    """Listens to TF, and publishes the frames of views that it lacks.
+
+    Args:
+        node: owner of the subscriptions and the publisher.
+        links: of the robot, those whose pose its joint states determine.
+        settings: the present parameters.
+        guarded: wraps a handler so that it never raises.
+
+    Raises:
+        ConfigError: poses are to come from TF, and tf2_msgs is not installed.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        links: Collection[str],
+        settings: Callable[[], Settings],
+        guarded: Callable[[Handler], Handler],
+    ) -> None:
+        self._node, self._links, self._settings = node, frozenset(links), settings
+        self._tree = TransformTree(settings().tf_prefix)
+        self._used: dict[str, Mount] = {}
+        self._sources: dict[str, str] = {}
+        self._own: dict[str, tuple[str, FloatArray]] = {}
+        self._published: list[TransformStamped] = []
+        self._message = tf_message()
+        self._publisher: Publisher | None = None
+        if self._message is None:
+            self._log_absence()
+            return
+        if settings().publish_tf:
+            self._publisher = node.create_publisher(self._message, '/tf_static', LATCHED)
+        for topic, qos, latched in (
+            ('/tf', QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT), False),
+            ('/tf_static', QoSProfile(depth=100, durability=LATCHED.durability), True),
+        ):
+            take = guarded(partial(self._take, latched=latched))
+            node.create_subscription(self._message, topic, take, qos)
+
+    def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:
+        """Returns what carries a view's camera, and its pose; None = the files say it.
+
+        Args:
+            view: name of the view.
+            frame: its optical frame, as images or CameraInfo name it.
+            stamp_ns: of the image [ns].
+
+        Raises:
+            Rejection: TF does not say it, what it says is too old, or it changed.
+        """
+        settings = self._settings()
+        if not self._uses_tf(frame, settings):
+            self._sources[view] = 'file'
+            return None
+        try:
+            if self._tree.is_moving(frame, self._links):
+                mount = self._tree.moving_mount(frame, self._links, stamp_ns)
+                self._check_age(view, frame, mount, stamp_ns, settings.max_tf_age_s)
+                self._sources[view] = 'tf, moving'
+                self._used.pop(view, None)  # it may be anywhere when /tf starts over
+                return mount
+            mount = self._tree.mount(frame, self._links)
+        except CalibrationError as error:
+            raise Rejection(
+                Reason.CAMERA_POSE_MISSING, f"the camera of view '{view}': {error}"
+            ) from error
+        self._check_age(view, frame, mount, stamp_ns, settings.max_tf_age_s)
+        before = self._used.setdefault(view, mount)
+        if before.link != mount.link or _differ(before.T_link_frame, mount.T_link_frame):
+            raise Rejection(
+                Reason.CAMERA_POSE_CHANGED,
+                f"TF has another pose of view '{view}' than before: {_words(mount)}, it was "
+                f'{_words(before)}; call ~/reset to accept it',
+            )
+        if self._sources.get(view) != 'tf':
+            self._node.get_logger().info(f"the camera of view '{view}' is {_words(mount)} (TF)")
+        self._sources[view] = 'tf'
+        return mount
+
+    def accept(self) -> None:
+        """Takes changed poses as the valid ones from now on."""
+        self._used.clear()
+
+    def forget_moving(self) -> None:
+        """Forgets what /tf said: the clock went back."""
+        self._tree.forget_moving()
+
+    def values(self) -> dict[str, object]:
+        """For `/diagnostics`: where each view's pose comes from."""
+        return {f'extrinsics.{view}': source for view, source in self._sources.items()}
+
+    def show(self, scene: SensedScene) -> None:
+        """Publishes the frames of a scene's views that TF lacks, so that viewers can place them.
+
+        A camera whose frames TF has, but not where the whole camera is (drivers publish those
+        inside of it), gets its topmost frame placed.
+        """
+        if self._publisher is None:
+            return
+        views = zip(scene.observation.cameras, scene.camera_infos, strict=True)
+        news = [self._place(info.header.frame_id, camera) for camera, info in views]
+        if any(news):
+            self._published += self._transforms()
+            latest = self._published[-len(self._own) :]
+            self._publisher.publish(self._message(transforms=latest))  # type: ignore
+
+    def _place(self, frame: str, camera: CameraModel) -> bool:
+        """Places a camera's frame where TF lacks it; tells whether that is news."""
+        name, link, T_link_frame = self._tree.name(frame), camera.mount_link, camera.T_mount_camera
+        if not name or name in self._links or self._tree.is_connected(name, self._links):
+            return False
+        if name in self._tree.frames:
+            mount = self._tree.mount(name, ())
+            if self._tree.parent(mount.link) is not None:
+                return False  # on something that moves and that is not the robot
+            frame = self._settings().tf_prefix + mount.link
+            T_link_frame = T_link_frame @ inverse(mount.T_link_frame)
+        placed = self._own.get(frame)
+        if placed is not None and placed[0] == link and not _differ(placed[1], T_link_frame):
+            return False
+        self._own[frame] = (link, T_link_frame)
+        return True
+
+    def _transforms(self) -> list[TransformStamped]:
+        prefix, now_ns = self._settings().tf_prefix, self._node.get_clock().now().nanoseconds
+        transforms = []
+        for frame, (link, T) in self._own.items():
+            x, y, z, w = quaternion(T[:3, :3]).tolist()
+            place = Vector3(**dict(zip('xyz', T[:3, 3].tolist(), strict=True)))
+            transforms.append(
+                TransformStamped(
+                    header=make_header(now_ns, prefix + link),
+                    child_frame_id=frame,
+                    transform=Transform(
+                        translation=place, rotation=Quaternion(x=x, y=y, z=z, w=w)
+                    ),
+                )
+            )
+        return transforms
+
+    def _take(self, message: Any, *, latched: bool) -> None:
+        if self._own:  # what this node placed itself is no news
+            message.transforms = [t for t in message.transforms if t not in self._published]
+        self._tree.add(message, latched=latched)
+
+    def _uses_tf(self, frame: str, settings: Settings) -> bool:
+        if settings.extrinsics != 'auto':
+            return settings.extrinsics == 'tf'
+        is_given = bool(settings.calibration_file)
+        return not is_given and bool(frame) and self._tree.is_connected(frame, self._links)
+
+    def _check_age(
+        self, view: str, frame: str, mount: Mount, stamp_ns: int, longest_s: float
+    ) -> None:
+        if mount.stamp_ns is None:
+            return
+        age_s = (stamp_ns - mount.stamp_ns) / NANO
+        if age_s > longest_s:
+            raise Rejection(
+                Reason.CAMERA_POSE_STALE,
+                f"/tf from '{mount.link}' to '{frame}', the camera of view '{view}', is "
+                f"{age_s:.3f} s older than the image; 'max_tf_age_s' allows {longest_s:g} s",
+            )
+
+    def _log_absence(self) -> None:
+        if self._settings().extrinsics == 'tf':
+            raise ConfigError(
+                "parameter 'extrinsics' is 'tf', which needs tf2_msgs: it is part of a native ROS "
+                "installation (ros-jazzy-tf2-msgs), not of the wheels; set it to 'file'"
+            )
+        self._node.get_logger().info(
+            "tf2_msgs is not installed: the cameras' poses come from the calibration file, and no "
+            'frames are published'
+        )
+
+
+def _differ(one: FloatArray, other: FloatArray) -> bool:
+    return bool(np.abs(one - other).max() > STILL)
+
+
+def _words(mount: Mount) -> str:
+    ahead, place = (', '.join(f'{v:.3f}' for v in mount.T_link_frame[:3, k]) for k in (2, 3))
+    return f"at ({place}) m in '{mount.link}', looking along ({ahead})"
 
 
 class LiveRobot:

@@ -19,9 +19,8 @@ from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.image_window import window_of, windowed_camera
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
-from mtv_world_ros.ros.messages.conversions import to_positions
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_positions
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 from mtv_world_ros.ros.parameters import NodeSettings
 
 #: images kept a view, so that views which arrive one after the other still find their partner

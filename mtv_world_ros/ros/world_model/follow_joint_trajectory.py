@@ -21,8 +21,8 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import make_header, NANO
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request, Result
 

@@ -18,12 +18,11 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
-from mtv_world_ros.ros.messages.conversions import to_multi_array
+from mtv_world_ros.ros.messages.conversions import NANO, to_multi_array, to_ns
 from mtv_world_ros.ros.messages.rejection import Rejection
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
-from mtv_world_ros.success.physics_watch import PhysicsWatch, unforeseen
+from mtv_world_ros.success.doubts import PhysicsWatch, unforeseen
 from mtv_world_ros.vision.jaccard import mean_of_known, object_scores, persistence_scores
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one

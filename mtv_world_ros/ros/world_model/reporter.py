@@ -15,9 +15,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from mtv_world_ros.data_types import SuccessEstimate
-from mtv_world_ros.ros.messages.conversions import to_diagnostics, to_status
+from mtv_world_ros.ros.messages.conversions import make_header, to_diagnostics, to_status
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import make_header
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import create_publisher, status_name
 from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk

@@ -16,8 +16,8 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import NANO
 from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.vision.camera_check import CameraCheck
 

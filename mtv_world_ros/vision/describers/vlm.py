@@ -13,7 +13,7 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.vision.describers.scene_objects import (
+from mtv_world_ros.vision.describers.describer import (
     BOX_SCALE,
     check_objects,
     DescribedObject,

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import ceil
+from types import MappingProxyType
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.vision.colour_words import colour_of, PALETTE
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import (
     ObjectTrack,
@@ -21,6 +21,27 @@ from mtv_world_ros.vision.segmenters.tracking import (
     TrackingConfig,
     with_part,
 )
+
+#: colour word -> RGB (uint8). Neighbours lie at least 23 degrees of CIELAB hue apart, and keep
+#: apart when the colour is shaded to a third or washed out by a dull highlight.
+PALETTE: MappingProxyType[str, tuple[int, int, int]] = MappingProxyType(
+    {
+        'red': (210, 25, 35),
+        'orange': (245, 130, 15),
+        'yellow': (240, 220, 30),
+        'green': (35, 165, 55),
+        'cyan': (20, 195, 200),
+        'blue': (15, 105, 220),
+        'purple': (125, 40, 185),
+        'pink': (245, 105, 180),
+    }
+)
+
+
+def colour_of(name: str) -> str | None:
+    """Returns the palette word in an object's name, or None."""
+    return next((word for word in name.lower().split() if word in PALETTE), None)
+
 
 Floats = NDArray[np.floating]
 # Saturation is CIELAB chroma / (lightness + 16): it keeps its value when a surface is shaded.

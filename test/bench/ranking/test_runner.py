@@ -14,7 +14,7 @@ from mtv_world_ros.bench.ranking.rollout_runner import (
 from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint, run_jobs
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ConfigError, PolicyError, TrajectoryError
-from mtv_world_ros.vision.describers.scene_objects import DescribedObject
+from mtv_world_ros.vision.describers.describer import DescribedObject
 
 TASK = 'place_block_a2b_left'
 COLOURS = ('red', 'blue', 'green', 'purple')

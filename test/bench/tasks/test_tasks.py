@@ -10,8 +10,8 @@ from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.vision.colour_words import PALETTE
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from mtv_world_ros.vision.segmenters.colour import PALETTE
 
 WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
 

@@ -6,8 +6,8 @@ import pytest
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.mirror import mirrored
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.evaluation.references import mirrored
 
 FLIP = np.diag([-1.0, 1.0, 1.0])
 

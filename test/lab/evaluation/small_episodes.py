@@ -21,8 +21,7 @@ from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.vision.colour_words import PALETTE
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
 
 HEIGHT, WIDTH, NUM_FRAMES = 48, 64, 19
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000

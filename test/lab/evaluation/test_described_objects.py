@@ -8,7 +8,7 @@ import pytest
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import DescriptionError
 from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.vision.describers.scene_objects import DescribedObject
+from mtv_world_ros.vision.describers.describer import DescribedObject
 
 
 class Reader:

@@ -19,7 +19,7 @@ from mtv_world_ros.lab.importing.bags import convert_bag
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
-from mtv_world_ros.ros.world_model.requests import RequestMaker
+from mtv_world_ros.ros.world_model.rollouts import RequestMaker
 
 NUM = 25
 TOPIC = '/cell/joint_trajectory'

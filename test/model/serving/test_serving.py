@@ -20,12 +20,12 @@ from wan_predictions import imported, predict
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.lab.training.training_config import HistoryConfig, load_training_config
+from mtv_world_ros.model import serving
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.serving import memory_check, prepare
-from mtv_world_ros.model.serving.serving_options import ServingOptions
+from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
@@ -122,7 +122,7 @@ def test_compiling_without_a_compiler_is_refused(monkeypatch: pytest.MonkeyPatch
     model = build(TRANSFORMER).eval()
     monkeypatch.setenv('CXX', 'no-such-compiler')
     with pytest.raises(ConfigError, match=r'needs a compiler \(.*\) on the path or named by CXX'):
-        prepare.compile_blocks(model, torch.device('cpu'))
+        serving.compile_blocks(model, torch.device('cpu'))
 
 
 @torch.inference_mode()
@@ -138,7 +138,7 @@ def test_blocks_are_compiled_once_for_all_without_a_break(monkeypatch: pytest.Mo
     )
     torch._dynamo.utils.counters.clear()
     with torch._dynamo.config.patch(recompile_limit=1):
-        prepare.compile_blocks(model, torch.device('cpu'))
+        serving.compile_blocks(model, torch.device('cpu'))
         for count, (value, expected) in enumerate(zip(given, plain, strict=True), 1):
             # another shape is compiled anew, beyond torch's own limit
             torch.testing.assert_close(model(**value), expected, rtol=0, atol=1e-5)
@@ -196,7 +196,7 @@ def test_memory_held_at_most_is_counted() -> None:
         return d + torch.zeros(100)
 
     # at d: b, c and d; a is gone. Before the last sum b is gone: c, d, zeros and the sum
-    assert memory_check.peak_bytes(work) == 4 * (3000 + 100)
+    assert serving.peak_bytes(work) == 4 * (3000 + 100)
 
 
 def preset(name: str) -> SimpleNamespace:
@@ -215,20 +215,20 @@ def test_what_does_not_fit_says_what_it_needs_before_it_starts(
     monkeypatch: pytest.MonkeyPatch, tiny_file: Path
 ) -> None:
     checkpoint = preset('wan-14b')
-    monkeypatch.setattr(memory_check, 'free_bytes', lambda device: 24 * 2**30)
+    monkeypatch.setattr(serving, 'free_bytes', lambda device: 24 * 2**30)
     tiny = f'tiny_decoder={tiny_file}'
     device = torch.device('cuda')
     with pytest.raises(ModelMemoryError) as told:
-        memory_check.check_memory(checkpoint, ServingOptions.parse(tiny), device, torch.bfloat16)
+        serving.check_memory(checkpoint, ServingOptions.parse(tiny), device, torch.bfloat16)
     # 16.40 G numbers of the transformer and 0.13 G of the autoencoder, 2 bytes each
     assert '(30.8 for weights, ' in str(told.value)
     assert "24.0 are free; set offload=true in 'serving'" in str(told.value)
     offloaded = ServingOptions.parse(f'{tiny} offload=true')
-    memory_check.check_memory(checkpoint, offloaded, device, torch.bfloat16)
+    serving.check_memory(checkpoint, offloaded, device, torch.bfloat16)
     block = sum(p.numel() for p in checkpoint.transformer.blocks[0].parameters())
     rest = sum(p.numel() for p in checkpoint.transformer.parameters()) - 40 * block
     vae = sum(p.numel() for p in checkpoint.autoencoder.parameters())
-    held = memory_check.weight_bytes(checkpoint, offloaded, torch.bfloat16)
+    held = serving.weight_bytes(checkpoint, offloaded, torch.bfloat16)
     assert held == 2 * (rest + 2 * block + vae)
 
 

@@ -19,7 +19,7 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.transformer.action_context import by_slot
-from mtv_world_ros.model.transformer.cross_attention import Context
+from mtv_world_ros.model.transformer.block import Context
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 ACTION_CONTROLS = ['policy2vec', 'ee_mlp', 'fast_tokens']

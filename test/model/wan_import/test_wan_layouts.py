@@ -16,7 +16,6 @@ from wan_reference import video_tensors
 
 from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.model.wan_import.wan_weights import NEW
 from mtv_world_ros.model.wan_keys import (
     autoencoder_keys,
     image_encoder_keys,
@@ -24,6 +23,7 @@ from mtv_world_ros.model.wan_keys import (
     text_encoder_keys,
     transformer_keys,
 )
+from mtv_world_ros.model.wan_weights import NEW
 
 
 def hash_of(shapes: Shapes) -> str:

@@ -2,7 +2,7 @@
 
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.bags.player import in_order, Timeline
-from mtv_world_ros.ros.messages.stamps import NANO
+from mtv_world_ros.ros.messages.conversions import NANO
 
 
 def message(topic, stamp_s, msgtype='sensor_msgs/msg/Image'):

@@ -10,9 +10,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from mtv_world_ros.ros.bags.raw_headers import has_header, read_stamp, with_stamp
 from mtv_world_ros.ros.messages.conversions import (
+    make_header,
+    NANO,
     to_joint_state,
     to_multi_array,
+    to_ns,
     to_positions,
+    to_stamp,
     to_status,
     to_trajectory,
     values_of,
@@ -24,7 +28,6 @@ from mtv_world_ros.ros.messages.image_messages import (
     to_rgb,
 )
 from mtv_world_ros.ros.messages.rejection import Rejection
-from mtv_world_ros.ros.messages.stamps import make_header, NANO, to_ns, to_stamp
 
 RGB = np.array([[[1, 2, 3], [4, 5, 6]], [[7, 8, 9], [250, 251, 252]]], np.uint8)
 

@@ -14,8 +14,7 @@ from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.ros.messages.conversions import values_of
-from mtv_world_ros.ros.messages.stamps import NANO
+from mtv_world_ros.ros.messages.conversions import NANO, values_of
 
 FRAME_NS, NUM_FRAMES = 200_000_000, 4
 START_NS = 1_700_000_000 * NANO

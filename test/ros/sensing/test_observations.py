@@ -5,8 +5,8 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import make_header, NANO
 from mtv_world_ros.ros.parameters import NodeSettings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 

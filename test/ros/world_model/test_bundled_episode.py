@@ -17,8 +17,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 from mtv_world_ros.ros.messages.image_messages import to_rgb
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns
 
 START_S = 120
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')

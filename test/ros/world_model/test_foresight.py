@@ -9,7 +9,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32MultiArray, Float64, String
 
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 
 #: seed of the fake world model at which a chunk takes 0.3 s
 SLOW = 1400

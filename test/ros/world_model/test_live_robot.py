@@ -15,7 +15,7 @@ from std_msgs.msg import Header, String
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.transforms import pose, quaternion
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns, to_stamp
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
 needs_tf2 = pytest.mark.skipif(
     find_spec('tf2_msgs') is None,

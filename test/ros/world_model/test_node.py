@@ -8,8 +8,8 @@ import pytest
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import Float32MultiArray, Float64, String
 
+from mtv_world_ros.ros.messages.conversions import to_ns
 from mtv_world_ros.ros.messages.image_messages import to_rgb
-from mtv_world_ros.ros.messages.stamps import to_ns
 
 NUM_FRAMES, FRAME_NS, BLOCKS = 4, 200_000_000, 1200
 CHUNK_S = 0.8

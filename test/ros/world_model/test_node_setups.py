@@ -10,7 +10,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns, to_stamp
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
 PREDICTED = '/world_model/low/predicted/image_raw'
 FRAME_NS = 200_000_000

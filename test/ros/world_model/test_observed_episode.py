@@ -5,7 +5,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
-from mtv_world_ros.ros.messages.stamps import NANO, to_ns, to_stamp
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
 INSTRUCTION = 'stack the red block on the blue block'
 #: pixels of the camera by which the fake model moves everything in a chunk

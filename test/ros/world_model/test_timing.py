@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.messages.stamps import NANO
 from mtv_world_ros.ros.world_model.worker import from_observation, TimeLimits
 
 LIMITS = TimeLimits(trajectory_age=1.0, horizon=10.0)

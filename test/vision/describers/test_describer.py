@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from mtv_world_ros.vision.colour_words import colour_of
 from mtv_world_ros.vision.describers.describer import (
     InstructionDescriber,
     objects_from_instruction,
 )
+from mtv_world_ros.vision.segmenters.colour import colour_of
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,13 @@ import yaml
 from mtv_world_ros.assembly import assemble_describer
 from mtv_world_ros.errors import ConfigError, DescriptionError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.vision.describers.describer import InstructionDescriber
-from mtv_world_ros.vision.describers.describer_config import DescriberConfig, load_describer_config
-from mtv_world_ros.vision.describers.object_list import load_object_list
+from mtv_world_ros.vision.describers.describer import InstructionDescriber, names_of
+from mtv_world_ros.vision.describers.describer_config import (
+    DescriberConfig,
+    load_describer_config,
+    load_object_list,
+)
 from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
-from mtv_world_ros.vision.describers.scene_objects import names_of
 
 FRAME = np.zeros((4, 4, 3), np.uint8)
 OBJECTS = """

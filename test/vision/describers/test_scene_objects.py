@@ -7,7 +7,7 @@ import json
 import pytest
 
 from mtv_world_ros.errors import DescriptionError
-from mtv_world_ros.vision.describers.scene_objects import check_objects, DescribedObject, names_of
+from mtv_world_ros.vision.describers.describer import check_objects, DescribedObject, names_of
 
 CUP = {
     'id': 'cup',

@@ -3,9 +3,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ObservationError
-from mtv_world_ros.vision.colour_words import PALETTE
 from mtv_world_ros.vision.jaccard import jaccard
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
 from mtv_world_ros.vision.segmenters.segmenter import keep_doubts, masks_from_ids, resize_masks
 
 HEIGHT, WIDTH = 72, 96

@@ -23,7 +23,7 @@ from mtv_world_ros.lab.evaluation.calibration.fit import (
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import agreement, reliability_bins
 from mtv_world_ros.lab.evaluation.report.charts import reliability_chart
 from mtv_world_ros.success.calibration import HorizonCurve, Weights
-from mtv_world_ros.success.verdict import FAILURE_BELOW, SUCCESS_FROM
+from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 
 _COLUMNS = {
     'num_abstained': 'no verdict',

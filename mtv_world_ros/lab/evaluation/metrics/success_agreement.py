@@ -10,7 +10,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
-from mtv_world_ros.success.verdict import verdict
+from mtv_world_ros.success.estimator import verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,7 @@ from mtv_world_ros.lab.evaluation.report.headline import all_views, letter, mark
 from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, picks, ranked_by
 from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip, RolloutClip
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
-from mtv_world_ros.success.verdict import verdict
+from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: of all embedded videos [bytes]; base64 adds a third

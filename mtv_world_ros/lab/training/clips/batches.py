@@ -24,8 +24,8 @@ from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
-from mtv_world_ros.lab.training.clips.past import (
+from mtv_world_ros.lab.training.clips.clip_controls import (
+    ControlMaker,
     draw_past,
     history_before,
     Past,

@@ -4,20 +4,72 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.data.recording import Clip
-from mtv_world_ros.data_types import BoolArray, ByteArray
+from mtv_world_ros.data.recording import Clip, frame_indices, Recording
+from mtv_world_ros.data_types import BoolArray, ByteArray, History, WorldModelSpec
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.training.training_config import HistoryConfig
 from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
+
+
+class Past(NamedTuple):
+    """Anchor and history of a clip.
+
+    Attributes:
+        anchor: (V, H, W, 3) uint8 RGB first frame of the rollout.
+        frames: (V, N, H, W, 3) uint8 RGB.
+        sigma: noise level of the frames; 1 = there are none.
+    """
+
+    anchor: ByteArray
+    frames: ByteArray
+    sigma: float
+
+
+def history_before(
+    recording: Recording,
+    start: int,
+    spec: WorldModelSpec,
+    config: HistoryConfig,
+    rng: np.random.Generator,
+) -> History:
+    """Returns the past of a rollout that began some frames before recorded frame `start`."""
+    begins = rng.random() < config.first_share
+    longest = int((recording.times[start] - recording.times[0]) * spec.fps + 1e-3)
+    if begins or not longest:
+        return History.begin(recording.frames[:, start])
+    age = int(rng.integers(1, longest + 1))
+    first = frame_before(recording, start, age / spec.fps)
+    shown = None if first is None else frame_indices(recording, first, spec, age)
+    if shown is None:  # a gap: no rollout can cross it
+        return History.begin(recording.frames[:, start])
+    kept = shown[max(age - config.num_frames, 0) : age]
+    return History(anchor=recording.frames[:, shown[0]], frames=recording.frames[:, kept])
+
+
+def draw_past(history: History, config: HistoryConfig, rng: np.random.Generator) -> Past:
+    """Returns the history of a clip, with a noise level drawn for it."""
+    known = history.frames.shape[1] > 0 and rng.random() >= config.dropout
+    sigma = float(rng.uniform(0.0, config.max_noise)) if known else 1.0
+    return Past(history.anchor, history.filled(config.num_frames), sigma)
+
+
+def frame_before(recording: Recording, start: int, seconds: float) -> int | None:
+    """Returns the recorded frame nearest to a time before another; None = before the first."""
+    wanted = recording.times[start] - seconds
+    if wanted < recording.times[0] - 1e-6:
+        return None
+    return int(np.argmin(np.abs(recording.times - wanted)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.errors import CheckpointError, ConfigError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.clips.batches import BatchSource
-from mtv_world_ros.lab.training.clips.past import draw_past, history_before
+from mtv_world_ros.lab.training.clips.clip_controls import draw_past, history_before
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import (
     HistoryConfig,

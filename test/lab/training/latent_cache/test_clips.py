@@ -18,7 +18,7 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.base import Base, load_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.distributed import Processes
-from mtv_world_ros.lab.training.latent_cache.latent_clips import cached, CachedSource
+from mtv_world_ros.lab.training.latent_cache import cached, CachedSource
 from mtv_world_ros.lab.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
 from mtv_world_ros.model.conditioning import condition, encode_chunk

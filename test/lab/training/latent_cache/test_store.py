@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.lab.training.latent_cache.latent_store import digest_of, LatentCache
+from mtv_world_ros.lab.training.latent_cache import digest_of, LatentCache
 
 SETTINGS = {'fps': 16.0, 'views': ['low', 'high'], 'autoencoder': 'a1'}
 KEYS = {digest_of('episode', start): f'episode from frame {start}' for start in range(5)}

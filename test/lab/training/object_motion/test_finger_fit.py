@@ -8,8 +8,11 @@ import pytest
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.scene import Scene
-from mtv_world_ros.lab.training.object_motion.contact_fit import first_settings
-from mtv_world_ros.lab.training.object_motion.finger_fit import fit_fingers, FreeGrippers
+from mtv_world_ros.lab.training.object_motion.contact_fit import (
+    first_settings,
+    fit_fingers,
+    FreeGrippers,
+)
 
 TRUE = {'finger_stiffness': 80.0, 'finger_damping': 6.0, 'finger_mass_kg': 0.08}
 

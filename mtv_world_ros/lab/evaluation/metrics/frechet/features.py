@@ -7,10 +7,109 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+import torch
+from torch import nn, Tensor
+import torch.nn.functional as F
 
 from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, EpisodeError
+
+#: side of the frames that the network sees [px]
+SIZE = 224
+NUM_FEATURES = 400
+#: fewer frames leave nothing to average after three halvings in time
+MIN_FRAMES = 9
+
+#: channels of the six convolutions of each block, and the pools between blocks
+_BLOCKS: tuple[tuple[str, tuple[int, ...]], ...] = (
+    ('Mixed_3b', (64, 96, 128, 16, 32, 32)),
+    ('Mixed_3c', (128, 128, 192, 32, 96, 64)),
+    ('pool_3', ()),
+    ('Mixed_4b', (192, 96, 208, 16, 48, 64)),
+    ('Mixed_4c', (160, 112, 224, 24, 64, 64)),
+    ('Mixed_4d', (128, 128, 256, 24, 64, 64)),
+    ('Mixed_4e', (112, 144, 288, 32, 64, 64)),
+    ('Mixed_4f', (256, 160, 320, 32, 128, 128)),
+    ('pool_2', ()),
+    ('Mixed_5b', (256, 160, 320, 32, 128, 128)),
+    ('Mixed_5c', (384, 192, 384, 48, 128, 128)),
+)
+
+
+def _same(x: Tensor, kernel: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
+    """Zero padding after which ceil(size / stride) outputs fit; the odd one goes to the end."""
+    padding: list[int] = []
+    for size, k, s in zip(x.shape[2:], kernel, stride, strict=True):
+        total = max(k - (size % s or s), 0)
+        padding = [total // 2, total - total // 2, *padding]
+    return F.pad(x, padding)
+
+
+def _pool(x: Tensor, kernel: tuple[int, int, int], stride: tuple[int, int, int]) -> Tensor:
+    return F.max_pool3d(_same(x, kernel, stride), kernel, stride)
+
+
+class _Unit(nn.Module):
+    def __init__(
+        self, num_inputs: int, num_outputs: int, side: int = 1, stride: int = 1, *, last=False
+    ) -> None:
+        super().__init__()
+        self.kernel, self.stride = (side,) * 3, (stride,) * 3
+        self.conv3d = nn.Conv3d(num_inputs, num_outputs, side, stride, bias=last)
+        self.bn = None if last else nn.BatchNorm3d(num_outputs, eps=1e-3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.conv3d(_same(x, self.kernel, self.stride))
+        return x if self.bn is None else F.relu(self.bn(x))
+
+
+class _Block(nn.Module):
+    def __init__(self, num_inputs: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.b0 = _Unit(num_inputs, widths[0])
+        self.b1a = _Unit(num_inputs, widths[1])
+        self.b1b = _Unit(widths[1], widths[2], 3)
+        self.b2a = _Unit(num_inputs, widths[3])
+        self.b2b = _Unit(widths[3], widths[4], 3)
+        self.b3b = _Unit(num_inputs, widths[5])
+
+    def forward(self, x: Tensor) -> Tensor:
+        pooled = _pool(x, (3, 3, 3), (1, 1, 1))
+        branches = self.b0(x), self.b1b(self.b1a(x)), self.b2b(self.b2a(x)), self.b3b(pooled)
+        return torch.cat(branches, 1)
+
+
+class I3D(nn.Module):
+    """Maps (N, 3, T, H, W) video of 0..255, T >= 9, to (N, 400) logits, the mean over time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Conv3d_1a_7x7 = _Unit(3, 64, 7, 2)
+        self.Conv3d_2b_1x1 = _Unit(64, 64)
+        self.Conv3d_2c_3x3 = _Unit(64, 192, 3)
+        width = 192
+        for name, widths in _BLOCKS:
+            if widths:
+                self.add_module(name, _Block(width, widths))
+                width = widths[0] + widths[2] + widths[4] + widths[5]
+        self.logits = _Unit(width, NUM_FEATURES, last=True)
+
+    def forward(self, video: Tensor) -> Tensor:
+        """Returns the logits."""
+        count, _, num_frames, _, _ = video.shape
+        frames = F.interpolate(video.transpose(1, 2).flatten(0, 1), (SIZE, SIZE), mode='bilinear')
+        x = (frames / 127.5 - 1).unflatten(0, (count, num_frames)).transpose(1, 2)
+        x = _pool(self.Conv3d_1a_7x7(x), (1, 3, 3), (1, 2, 2))
+        x = _pool(self.Conv3d_2c_3x3(self.Conv3d_2b_1x1(x)), (1, 3, 3), (1, 2, 2))
+        for name, widths in _BLOCKS:
+            if widths:
+                x = self.get_submodule(name)(x)
+            else:
+                side = int(name[-1])
+                x = _pool(x, (side, side, side), (2, 2, 2))
+        return self.logits(F.avg_pool3d(x, (2, 7, 7), 1)).mean((2, 3, 4))
+
 
 if TYPE_CHECKING:
     import torch
@@ -72,8 +171,6 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
 def _i3d(weights: Path, device: str) -> ClipFeatures:
     _check_file(weights, 'fvd_weights')
     import torch
-
-    from mtv_world_ros.lab.evaluation.metrics.frechet.i3d import I3D, MIN_FRAMES
 
     network = _loaded(I3D(), weights, device, 'fvd_weights')
 

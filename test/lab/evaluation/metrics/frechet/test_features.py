@@ -12,8 +12,11 @@ from safetensors.torch import save_file
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ConfigError, EpisodeError
-from mtv_world_ros.lab.evaluation.metrics.frechet.features import clip_features, frame_features
-from mtv_world_ros.lab.evaluation.metrics.frechet.i3d import I3D
+from mtv_world_ros.lab.evaluation.metrics.frechet.features import (
+    clip_features,
+    frame_features,
+    I3D,
+)
 from mtv_world_ros.lab.evaluation.metrics.frechet.inception import InceptionV3
 
 #: of the references' sorted names and shapes

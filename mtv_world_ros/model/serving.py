@@ -1,25 +1,175 @@
-"""What serving takes of a device: found on shapes alone, before anything is loaded there."""
+"""How a model is served: its options, what they change in it, and whether it fits the device."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+import os
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+import shlex
+import shutil
+from typing import Any, Self, TYPE_CHECKING
 import weakref
 
+from diffusers.models.attention_dispatch import _AttentionBackendRegistry
+from pydantic import model_validator
 import torch
 from torch import nn, Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from mtv_world_ros.errors import ModelMemoryError
+from mtv_world_ros.config import Schema, validated
+from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError, nearest
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
-from mtv_world_ros.model.parts import build_autoencoder
-from mtv_world_ros.model.serving.serving_options import ServingOptions
-from mtv_world_ros.model.transformer.cross_attention import NUM_TEXT_TOKENS
+from mtv_world_ros.model.parts import Autoencoder, build_autoencoder
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+
+
+def prepare(
+    transformer: MultiViewWanTransformer, serving: ServingOptions, device: torch.device
+) -> None:
+    """Changes the transformer in place, with its adapter in it.
+
+    Raises:
+        ConfigError: an option is not for this machine.
+    """
+    if serving.attention:
+        _set_attention(transformer, serving.attention)
+    if serving.offload:
+        # each block comes while the one before computes; a CPU has no streams for that
+        transformer.enable_group_offload(
+            onload_device=device,
+            offload_device=torch.device('cpu'),
+            offload_type='block_level',
+            num_blocks_per_group=1,
+            use_stream=device.type == 'cuda',
+        )
+    if serving.compile:
+        compile_blocks(transformer, device)
+
+
+def _set_attention(transformer: MultiViewWanTransformer, name: str) -> None:
+    before, _ = _AttentionBackendRegistry.get_active_backend()
+    try:
+        transformer.set_attention_backend(name)
+    except (ValueError, RuntimeError, ImportError) as error:
+        raise ConfigError(f"serving: attention '{name}' cannot be used: {error}") from error
+    finally:
+        # diffusers sets it for all other models of the process, too
+        _AttentionBackendRegistry.set_active_backend(before)
+
+
+def decoder_of(
+    autoencoder: Autoencoder, serving: ServingOptions, dtype: torch.dtype
+) -> Autoencoder:
+    """Returns what decodes: the autoencoder, on its device, or the tiny one in its place.
+
+    Raises:
+        CheckpointError: the tiny one's weights cannot be read, or are for other latents.
+    """
+    if not serving.tiny_decoder:
+        return autoencoder
+    if not isinstance(autoencoder, WanAutoencoder):
+        raise CheckpointError(
+            "tiny_decoder decodes Wan's latents, this checkpoint has an autoencoder of its own; "
+            "leave it out of 'serving'"
+        )
+    return place(TinyAutoencoder.load(Path(serving.tiny_decoder)), autoencoder.device, dtype)
+
+
+#: shapes that may be compiled: numbers of seeds, of views; torch gives up after 8
+_MOST_SHAPES = 64
+_COMPILERS = {'cpu': ('CXX', ('g++', 'clang++')), 'cuda': ('CC', ('gcc', 'clang', 'cc'))}
+
+
+def compile_blocks(transformer: MultiViewWanTransformer, device: torch.device) -> None:
+    """Compiles the repeated block once for all; shapes are static, another one compiles again.
+
+    Raises:
+        ConfigError: there is no compiler to do it.
+    """
+    variable, names = _COMPILERS.get(device.type, _COMPILERS['cuda'])
+    named = os.environ.get(variable)
+    if not any(shutil.which(name) for name in ([named] if named else names)):
+        raise ConfigError(
+            f'serving: compile=true needs a compiler ({" or ".join(names)}) on the path or named '
+            f'by {variable}; install one (apt install g++), or leave it out'
+        )
+    limits = torch._dynamo.config
+    limits.recompile_limit = max(limits.recompile_limit, _MOST_SHAPES)
+    transformer.compile_repeated_blocks(fullgraph=True, dynamic=False)
+
+
+class ServingOptions(Schema):
+    """Ways to serve a checkpoint; the defaults are the plain one.
+
+    Attributes:
+        fuse_lora: add the adapter into the weights; nothing to compute for it in a step.
+        compile: compile the transformer's repeated block; the first prediction waits for it.
+        attention: diffusers' name of the attention's implementation; empty = torch's choice.
+        offload: keep the transformer's blocks on the CPU, each on the device for its turn alone.
+        tiny_decoder: file of TAEHV's `taew2_1` weights that decode in place of Wan's autoencoder.
+        tiny_encoder: the tiny autoencoder encodes, too.
+    """
+
+    section = ''
+
+    fuse_lora: bool = True
+    compile: bool = False
+    attention: str = ''
+    offload: bool = False
+    tiny_decoder: str = ''
+    tiny_encoder: bool = False
+
+    @model_validator(mode='after')
+    def _go_together(self) -> Self:
+        if self.offload and self.compile:
+            # an offloaded block is elsewhere each time, which compiled code does not expect
+            raise ValueError('offload and compile exclude each other')
+        if self.offload and not self.fuse_lora:
+            raise ValueError(
+                'offload needs fuse_lora=true: it knows the weights alone, no adapter that is '
+                'exchanged beside them'
+            )
+        if self.tiny_encoder and not self.tiny_decoder:
+            raise ValueError("tiny_encoder=true needs tiny_decoder, the weights' file")
+        return self
+
+    @classmethod
+    def parse(cls, text: str) -> ServingOptions:
+        """Returns what a text like `compile=true tiny_decoder=FILE` says, apart by spaces.
+
+        A value with spaces stands in quotes.
+
+        Raises:
+            ConfigError: an unknown name or a value that is not one.
+        """
+        values = {}
+        for part in _words(text):
+            name, _, value = part.partition('=')
+            if name not in cls.model_fields:
+                known = list(cls.model_fields)
+                raise ConfigError(
+                    f"serving: '{name}' is not one of {', '.join(known)}{nearest(name, known)}"
+                )
+            is_text = isinstance(cls.model_fields[name].default, str)
+            values[name] = value if is_text else _plain(value)
+        return validated(cls, values, 'serving')
+
+
+def _plain(value: str) -> Any:
+    return {'true': True, 'false': False}.get(value, value)
+
+
+def _words(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise ConfigError(f"serving: '{text}' cannot be read: {error}") from error
+
 
 if TYPE_CHECKING:
     from mtv_world_ros.model.checkpoint import Checkpoint

@@ -5,30 +5,33 @@ Shape letters: B batch, V views, C latent channels, F latent frames, h w latent 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+import hashlib
+import json
 from pathlib import Path
 import shutil
 import time
 from typing import Any
 
 import numpy as np
+from safetensors import safe_open, SafetensorError
+from safetensors.torch import save
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from mtv_world_ros.bounded_input import parse_json, read_json
 from mtv_world_ros.data.recording import commanded, cut_clip, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.files import content_digest
+from mtv_world_ros.files import content_digest, write_whole
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.base import Base
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch, pasts
-from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
-from mtv_world_ros.lab.training.clips.past import draw_past, history_before
+from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker, draw_past, history_before
 from mtv_world_ros.lab.training.distributed import Processes
 from mtv_world_ros.lab.training.encoding import encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.lab.training.latent_cache.latent_store import digest_of, LatentCache
 from mtv_world_ros.lab.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.lab.training.training_config import (
     HistoryConfig,
@@ -37,6 +40,147 @@ from mtv_world_ros.lab.training.training_config import (
 )
 from mtv_world_ros.model.actions import collate, TRAJECTORY_VIDEO
 from mtv_world_ros.model.conditioning import Conditioning, start_slot
+
+#: bytes of tensors that are gathered before they are written
+SHARD_BYTES = 256 * 2**20
+SETTINGS = 'settings.json'
+_STEM = 'latents'
+_LABELS = 'labels'
+
+
+def digest_of(*values: Any) -> str:
+    """Returns 32 hexadecimal digits for plain values."""
+    text = json.dumps(values, sort_keys=True, default=list)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+class LatentCache:
+    """Tensors of clips in shards of safetensors, a folder for each combination of settings.
+
+    A shard appears under its name only when it is whole, so that a run that was killed is resumed
+    at its last shard.
+
+    Args:
+        root: holds caches of any settings.
+        settings: everything that the tensors of all clips depend on, as plain values.
+        shard_bytes: size at which a shard is written.
+
+    Attributes:
+        folder: of these settings.
+        notes: caches in `root` that are not used, and why.
+    """
+
+    def __init__(
+        self, root: Path, settings: Mapping[str, Any], *, shard_bytes: int = SHARD_BYTES
+    ) -> None:
+        self.root, self.settings = root, json.loads(json.dumps(settings, default=list))
+        self.folder = root / digest_of(self.settings)
+        self.notes = [] if self.folder.is_dir() else _other_settings(root, self.settings)
+        self._shard_bytes = shard_bytes
+        self._shards: dict[str, Any] = {}
+        self._labels: dict[str, str] = {}
+        self._waiting: dict[str, Tensor] = {}
+        self._waiting_labels: dict[str, str] = {}
+        for file in sorted(self.folder.glob(f'{_STEM}-*.safetensors')):
+            self._open(file)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._shards
+
+    def __len__(self) -> int:
+        return len(self._shards)
+
+    def read(self, key: str) -> dict[str, Tensor]:
+        """Returns the tensors of a clip by name.
+
+        Raises:
+            TrainingError: the latents are missing.
+        """
+        if key not in self._shards:
+            raise TrainingError(f"latent cache '{self.folder}' has no clip {key}")
+        shard = self._shards[key]
+        names = shard.keys()
+        mine = [name for name in names if name.startswith(f'{key}/')]
+        return {name.partition('/')[2]: shard.get_tensor(name) for name in mine}
+
+    def changed(self, labels: Mapping[str, str]) -> list[str]:
+        """Returns the labels of clips that are here with another content.
+
+        Args:
+            labels: names of the clips, by key.
+        """
+        held = {label: key for key, label in self._labels.items()}
+        return sorted(
+            label for key, label in labels.items() if key not in self._shards and label in held
+        )
+
+    def add(self, key: str, label: str, tensors: Mapping[str, Tensor]) -> None:
+        """Adds the tensors of a clip; they are on disk once its shard is full, or after `flush`.
+
+        Raises:
+            TrainingError: the disk is full, or the folder cannot be written.
+        """
+        for name, tensor in tensors.items():
+            self._waiting[f'{key}/{name}'] = tensor.detach().cpu().contiguous()
+        self._waiting_labels[key] = label
+        if sum(t.nbytes for t in self._waiting.values()) >= self._shard_bytes:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes the clips that wait.
+
+        Raises:
+            TrainingError: the disk is full, or the folder cannot be written.
+        """
+        if not self._waiting:
+            return
+        data = save(self._waiting, {_LABELS: json.dumps(self._waiting_labels)})
+        number = len(list(self.folder.glob(f'{_STEM}-*.safetensors')))
+        while (file := self.folder / f'{_STEM}-{number:05d}.safetensors').exists():
+            number += 1
+        try:
+            text = json.dumps(self.settings, indent=2, sort_keys=True) + '\n'
+            write_whole(self.folder / SETTINGS, text)
+            write_whole(file, data)
+        except OSError as error:
+            raise TrainingError(
+                f"latent cache '{self.folder}' cannot be written: {error.strerror or error}; the "
+                f'shard takes {len(data) / 1e6:.1f} MB, the {len(self)} clips before it are kept. '
+                'Free some space and run the same command again, or give --latent-cache another '
+                'folder'
+            ) from error
+        self._waiting, self._waiting_labels = {}, {}
+        self._open(file)
+
+    def _open(self, file: Path) -> None:
+        try:
+            shard: Any = safe_open(file, framework='pt')
+            labels = dict(
+                parse_json((shard.metadata() or {})[_LABELS], 'what it says of its clips')
+            )
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+            self.notes.append(
+                f"'{file}' is damaged ({error}): its clips are encoded again; remove it"
+            )
+            return
+        self._shards |= dict.fromkeys(labels, shard)
+        self._labels |= labels
+
+
+def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
+    """Settings in which the neighbouring caches differ."""
+    notes = []
+    for file in sorted(root.glob(f'*/{SETTINGS}')):
+        try:
+            theirs = dict(read_json(file))
+        except (OSError, TypeError, ValueError):
+            continue
+        names = sorted(set(mine) | set(theirs))
+        differing = [name for name in names if mine.get(name) != theirs.get(name)]
+        changes = [f'{n} was {theirs.get(n)}, is {mine.get(n)}' for n in differing]
+        notes.append(f"'{file.parent}' is not used: {'; '.join(changes)}")
+    return notes
+
 
 #: to be increased when the stored data or their computation change
 _VERSION = 1

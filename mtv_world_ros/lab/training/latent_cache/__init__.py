@@ -1,1 +1,0 @@
-"""Encoded training clips on disk."""

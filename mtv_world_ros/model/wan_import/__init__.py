@@ -1,1 +1,0 @@
-"""Conversion of public Wan weights into checkpoints."""
