@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from math import isfinite
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -12,44 +10,8 @@ from pydantic import Field, model_validator
 from mtv_world_ros.config import Count, ListOf, Schema
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.recording import DEFAULT
-from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.lab.evaluation.imagined_stretches import check_mode
 from mtv_world_ros.lab.evaluation.references import check_actions
-from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
-from mtv_world_ros.lab.evaluation.results import EpisodeResult
-from mtv_world_ros.viewing.scored_rollout import ScoredRollout
-
-#: says that a folder is an evaluation's
-FILE = 'metrics.json'
-
-
-def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
-    """Yields the rollouts of an evaluation's first `count` episodes whose frames were kept.
-
-    Raises:
-        ConfigError: the folder is no evaluation's.
-        EpisodeError: frames cannot be read.
-    """
-    for evaluated in read_evaluations(folder):
-        label = evaluated.metrics.get('label') or folder.name
-        for name in sorted(evaluated.results)[:count]:
-            rollout = evaluated.rollout(name)
-            if rollout is not None:
-                yield _evaluated(f'{label}/{name}', rollout, evaluated.results[name])
-
-
-def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:
-    last, said = float(rollout.times[-1]), result.probability
-    text = f'success {said:.2f}' if isfinite(said) else 'abstains'
-    return ScoredRollout(
-        name=name,
-        rollout=rollout,
-        estimates={'imagined': ((last, said),)} if isfinite(said) else {},
-        words=(
-            (0.0, f'{result.task}: recorded {result.outcome}'),
-            (last, f'{text}: {"; ".join(result.reasons)}'),
-        ),
-    )
 
 
 class EvaluationConfig(Schema):

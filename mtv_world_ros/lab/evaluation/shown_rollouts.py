@@ -1,0 +1,44 @@
+"""Rollouts of an evaluation for the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import isfinite
+from pathlib import Path
+
+from mtv_world_ros.data.stored_rollout import StoredRollout
+from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
+from mtv_world_ros.lab.evaluation.results import EpisodeResult
+from mtv_world_ros.viewing.scored_rollout import ScoredRollout
+
+#: says that a folder is an evaluation's
+FILE = 'metrics.json'
+
+
+def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
+    """Yields the rollouts of an evaluation's first `count` episodes whose frames were kept.
+
+    Raises:
+        ConfigError: the folder is no evaluation's.
+        EpisodeError: frames cannot be read.
+    """
+    for evaluated in read_evaluations(folder):
+        label = evaluated.metrics.get('label') or folder.name
+        for name in sorted(evaluated.results)[:count]:
+            rollout = evaluated.rollout(name)
+            if rollout is not None:
+                yield _evaluated(f'{label}/{name}', rollout, evaluated.results[name])
+
+
+def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:
+    last, said = float(rollout.times[-1]), result.probability
+    text = f'success {said:.2f}' if isfinite(said) else 'abstains'
+    return ScoredRollout(
+        name=name,
+        rollout=rollout,
+        estimates={'imagined': ((last, said),)} if isfinite(said) else {},
+        words=(
+            (0.0, f'{result.task}: recorded {result.outcome}'),
+            (last, f'{text}: {"; ".join(result.reasons)}'),
+        ),
+    )
