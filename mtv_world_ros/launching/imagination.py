@@ -13,13 +13,16 @@ import subprocess
 import time
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, policy_settings
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
+from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free, check_room
+from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.launching.node_processes import ROOM_BYTES
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.policies.policy import RecordedPolicySettings, ScriptedPolicySettings
@@ -101,6 +104,7 @@ def imagine_episodes(
     views = read_card(checkpoint_path(options.checkpoint)).spec.views
     # a wrong name is an error here, before anything is removed
     _check_policy(options)
+    check_same_cameras(options.episodes, views)
     watch = options.watch
     viewer = {} if watch is None else {'viewer': module_command('live_viewer', *watch)}
     commands = {
@@ -137,6 +141,34 @@ def imagine_episodes(
         raise EpisodeError(
             f"what the episode runner wrote cannot be read: {error} (logs are in '{logs}')"
         ) from error
+
+
+def check_same_cameras(episodes: Sequence[Path], views: Sequence[str]) -> None:
+    """Refuses episodes whose cameras stand elsewhere: one node draws them all with one.
+
+    Raises:
+        ConfigError: two differ.
+    """
+    first: dict[str, CameraModel] = {}
+    for episode in episodes:
+        file = episode / CALIBRATION_FILE
+        known = load_calibration(file) if file.is_file() else {}
+        for view in (view for view in views if view in known):
+            before = first.setdefault(view, known[view])
+            if not _same(before, known[view]):
+                raise ConfigError(
+                    f"'{episode}' and '{episodes[0]}' have different cameras of view '{view}', "
+                    'and one world model draws all of --episodes with one calibration: imagine '
+                    'them one by one (replay --offline and evaluate take each with its own)'
+                )
+
+
+def _same(a: CameraModel, b: CameraModel) -> bool:
+    return (
+        a.mount_link == b.mount_link
+        and np.allclose(a.T_mount_camera, b.T_mount_camera, atol=1e-6)
+        and np.allclose(a.K / a.width, b.K / b.width, atol=1e-6)
+    )
 
 
 def _check_policy(options: ImagineOptions) -> None:

@@ -1,5 +1,6 @@
 """`mtv-world imagine` says whether the policy succeeded, and why an episode failed."""
 
+from dataclasses import replace
 import json
 import subprocess
 import sys
@@ -8,7 +9,10 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
+from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
+from mtv_world_ros.launching.imagination import check_same_cameras
 
 DEMO = share_path('resource', 'demo_episode')
 
@@ -89,3 +93,17 @@ def test_the_success_rate_has_wilsons_interval(verdicts, said):
     lines = episode_table([{**row, 'verdict': verdict} for verdict in verdicts])
     assert said in lines[-1]
     assert lines[2].strip() == 'a' and lines[3].strip() == 'b'
+
+
+def test_episodes_with_other_cameras_are_refused_together(tmp_path):
+    """One node draws them all with one calibration, which would be wrong for the others."""
+    known = load_calibration(DEMO / 'calibration.yaml')
+    T = known['low'].T_mount_camera.copy()
+    T[0, 3] += 0.02
+    for name, low in (('a', known['low']), ('b', replace(known['low'], T_mount_camera=T))):
+        save_calibration(tmp_path / name / 'calibration.yaml', {**known, 'low': low})
+    both = [tmp_path / 'a', tmp_path / 'b']
+    check_same_cameras(both, ['high'])
+    check_same_cameras(both[:1] * 2, ['low', 'high'])
+    with pytest.raises(ConfigError, match=r"b' and .*a' have different cameras of view 'low'"):
+        check_same_cameras(both, ['low', 'high'])

@@ -140,6 +140,8 @@ class JointCamera:
         guess: JointState | None = None,
         points: Sequence[SeenPoint] = (),
         seed: int = 0,
+        *,
+        rough: bool = False,
     ) -> JointState:
         """Estimates all poses and the zoom.
 
@@ -148,6 +150,7 @@ class JointCamera:
             guess: to start from; None = from points, or from cameras all around.
             points: seen tool points, of any of the recordings.
             seed: of the search.
+            rough: leave out the finer images.
         """
         self._points = points
         if guess is not None:
@@ -167,21 +170,25 @@ class JointCamera:
         best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
         if guess is None:
             best = self._respread(places.near(_NEAR)[0], best, places)
-        return self.refined(best, _STAGES[1:], 9)
+        return best if rough else self.refined(best, _STAGES[1:], 9)
 
     def together(
-        self, state: JointState, points: Sequence[SeenPoint] = (), *, from_guess: bool = False
+        self, starts: Sequence[JointState], points: Sequence[SeenPoint] = ()
     ) -> JointState:
-        """The state near one that was found view by view.
+        """The best state near some that were found view by view.
 
         Args:
-            state: with the poses of all places.
+            starts: with the poses of all places. A camera farther away with a longer lens looks
+                much alike, so that one start does not lead to all focal lengths.
             points: seen tool points, of any of the recordings.
-            from_guess: whether the state is a mere guess.
         """
         self._points = points
-        near = self.refined(state, _STAGES[:1], 14) if from_guess else state
-        return self.refined(near, _STAGES[1:], 14)
+        ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
+        return self.refined(min(ends, key=self._cost_of), _STAGES[1:], 14)
+
+    def _cost_of(self, state: JointState) -> float:
+        stage, numbers = _STAGES[0], range(len(self._recordings))
+        return self._cost(state, {n: self._read(n, state, stage) for n in numbers})
 
     def from_points(
         self,
@@ -219,7 +226,7 @@ class JointCamera:
 
         best = None
         reach = float(np.linalg.norm(X - X.mean(axis=0), axis=1).max()) + 0.2
-        for _ in range(_NUM_POINT_STARTS):
+        for _ in range(_NUM_POINT_STARTS if zoom is None else _NUM_POINT_STARTS // 3):
             T = random_camera(X.mean(axis=0), generator.uniform(0.3, 2.5), reach, generator)
             start = np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3], middle])
             found = least_squares(errors, start, loss='soft_l1', max_nfev=60)

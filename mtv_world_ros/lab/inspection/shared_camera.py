@@ -182,13 +182,17 @@ def _together(
         view = each[0]
         start = view.given if guess else None
         return [view.joint.estimate(view.places, start, view.points, seed)]
-    starts = [_start(view, guess, seed) for view in each]
-    zoom = np.exp(np.mean([np.log(state.zoom) for state in starts], axis=0))
-    starts = [
-        view.joint.from_points(view.places, view.points, seed, zoom)
-        if view.points and not guess
-        else replace(state, zoom=zoom)
-        for view, state in zip(each, starts, strict=True)
+    own = [_start(view, guess, seed) for view in each]
+    zooms = [state.zoom for state in own]
+    zooms = [*zooms, np.exp(np.mean(np.log(zooms), axis=0))]
+    candidates = [
+        [
+            view.joint.from_points(view.places, view.points, seed, zoom)
+            if view.points and not guess
+            else replace(state, zoom=zoom)
+            for view, state in zip(each, own, strict=True)
+        ]
+        for zoom in zooms[: 1 if focal_known else None]
     ]
     firsts = np.cumsum([0, *(1 + max(view.numbers) for view in each)])
     recordings = [one for view in each for one in view.recordings]
@@ -202,12 +206,18 @@ def _together(
         for view, row in zip(each, rows, strict=False)
         for point in view.points
     ]
-    poses = {
-        int(first) + place: T
-        for state, first in zip(starts, firsts, strict=False)
-        for place, T in state.poses.items()
-    }
-    found = joint.together(JointState(poses=poses, zoom=zoom), points)
+    starts = [
+        JointState(
+            poses={
+                int(first) + place: T
+                for state, first in zip(states, firsts, strict=False)
+                for place, T in state.poses.items()
+            },
+            zoom=states[0].zoom,
+        )
+        for states in candidates
+    ]
+    found = joint.together(starts, points)
     return [
         JointState(poses={n: found.poses[int(first) + n] for n in view.numbers}, zoom=found.zoom)
         for view, first in zip(each, firsts, strict=False)
@@ -215,12 +225,9 @@ def _together(
 
 
 def _start(view: _View, guess: bool, seed: int) -> JointState:
-    """A view's own state, from which all go on together."""
-    if guess:
-        return view.given
-    if view.points:
-        return view.joint.from_points(view.places, view.points, seed)
-    return view.joint.estimate(view.places, None, (), seed)
+    """A view's own state, roughly."""
+    start = view.given if guess else None
+    return view.joint.estimate(view.places, start, view.points, seed, rough=True)
 
 
 def _judged(

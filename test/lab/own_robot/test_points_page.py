@@ -61,4 +61,6 @@ def test_what_it_saves_is_where_the_clicks_were(page, tmp_path):
     assert len(rows) == len(frames) >= 4
     for k, ((name, row), (episode, seconds)) in enumerate(zip(rows, frames, strict=True)):
         assert name == episode
-        np.testing.assert_allclose(row, [seconds, 100 + k, 60 + 2 * k], atol=0.3)
+        np.testing.assert_allclose(
+            row, [seconds, 100 + k, 60 + 2 * k], atol=0.6
+        )  # whole pixels of the screen

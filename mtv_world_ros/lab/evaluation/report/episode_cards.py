@@ -27,6 +27,8 @@ VIDEO_BUDGET = 24_000_000
 _PICKED_BUDGET = 6_000_000
 #: widths up to which small frames are enlarged, of those and of the others [px]
 _PICKED_TILE, _TILE = 320, 192
+#: episodes with a contact sheet where none can be ranked
+_NUM_UNRANKED = 3
 _BINS = ('0 to .2', '.2 to .4', '.4 to .6', '.6 to .8', '.8 to 1')
 _UNKNOWN = 'not scored'
 _ESTIMATES = ('right', 'wrong', 'no verdict')
@@ -56,7 +58,8 @@ def episode_cards(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
     names.sort(key=lambda name: means.get(name, 2.0))
     found = _filters(evaluations)
     num_clips = sum(name in one.results for one in evaluations for name in names)
-    num_picked = sum(name in one.results for one in evaluations for name in titles)
+    picked = set(titles) or set(names[:_NUM_UNRANKED])  # no object was named: no J to pick by
+    num_picked = sum(name in one.results for one in evaluations for name in picked)
     budgets = (VIDEO_BUDGET // max(num_clips, 1), _PICKED_BUDGET // max(num_picked, 1))
     cards = []
     for name in names:
@@ -64,7 +67,7 @@ def episode_cards(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
         clips = [
             (mark(index, evaluations), _name(one, evaluations), *clip)
             for index, one in enumerate(evaluations)
-            if (clip := _clip(name, one, bool(title), budgets[bool(title)])) is not None
+            if (clip := _clip(name, one, name in picked, budgets[name in picked])) is not None
         ]
         cards.append(
             {
