@@ -71,13 +71,13 @@ def soak_text(folder: Path) -> str:
 
 def plans_table(folders: list[Path]) -> str:
     """What became of plans at a rate, a row a run."""
-    keys = ('commit', 'plans', 'without_end', 'several_ends', 'late', 'median_s', 'worst_s',
-            'tracebacks', 'memory_growth_mb_per_1000')  # fmt: skip
+    keys = ('model', 'commit', 'plans', 'without_end', 'several_ends', 'late', 'median_s', 'p95_s',
+            'p99_s', 'worst_s', 'load', 'tracebacks', 'memory_growth_mb_per_1000')  # fmt: skip
     rows = [json.loads((folder / 'rate.json').read_text()) for folder in folders]
     return table(
-        ('commit', 'plans', 'no end', 'several ends', 'late', 'median [s]', 'worst [s]',
-         'tracebacks', 'memory [MB for 1,000]'),
-        [[_cell(row[key]) for key in keys] for row in rows],
+        ('model', 'commit', 'plans', 'no end', 'several ends', 'late', 'median [s]', '95 % [s]',
+         '99 % [s]', 'worst [s]', 'load', 'tracebacks', 'memory [MB for 1,000]'),
+        [[_cell(row.get(key, '–')) for key in keys] for row in rows],
     )  # fmt: skip
 
 

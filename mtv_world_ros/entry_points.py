@@ -24,11 +24,17 @@ def load(entry: metadata.EntryPoint) -> Any:
     """
     try:
         return entry.load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"entry point '{entry.name} = {entry.value}' of the group '{entry.group}' cannot be "
-            f'loaded ({error}); install the package that registers it again, or remove it'
-        ) from error
+    except Exception as error:  # a module of somebody else's raises anything
+        raise broken(entry, error) from error
+
+
+def broken(entry: metadata.EntryPoint, error: Exception) -> ConfigError:
+    """Returns the error of an entry point that cannot be used."""
+    return ConfigError(
+        f"entry point '{entry.name} = {entry.value}' of the group '{entry.group}' cannot be "
+        f'loaded ({error or type(error).__name__}); install the package that registers it again, '
+        'or remove it'
+    )
 
 
 def policy_kind(name: str) -> Any:

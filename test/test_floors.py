@@ -49,7 +49,7 @@ def test_every_command_of_help_is_registered_and_in_its_order():
     }
     modules = [load(found[name]).__name__ for name in cli._ORDER]
     assert modules[0] == 'mtv_world_ros.lab.cli.demo'
-    assert [module.__name__ for module in cli._commands()][: len(modules)] == modules
+    assert [load(entry).__name__ for entry in cli._commands()][: len(modules)] == modules
 
 
 def registering(monkeypatch, **entries):
@@ -66,7 +66,7 @@ def test_a_command_of_another_package_comes_last(monkeypatch):
         monkeypatch,
         COMMANDS={'aaa': 'mtv_world_ros.cli.view', 'demo': 'mtv_world_ros.lab.cli.demo'},
     )
-    modules = [module.__name__ for module in cli._commands()]
+    modules = [load(entry).__name__ for entry in cli._commands()]
     assert modules == ['mtv_world_ros.lab.cli.demo', 'mtv_world_ros.cli.view']
 
 
@@ -74,6 +74,26 @@ def test_an_installation_without_commands_says_what_to_do(monkeypatch, capsys):
     registering(monkeypatch)
     assert cli.main(['demo']) == 1
     assert 'registers no commands; install it again: make' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ("raise RuntimeError('no such display')", 'no such display'),
+        ('def add(:', 'invalid syntax'),
+        ('', "no attribute 'add'"),
+        ("def add(commands): commands.add_parser('demo')", 'conflicting subparser: demo'),
+    ],
+)
+def test_a_package_with_a_broken_command_is_named(monkeypatch, tmp_path, capsys, text, says):
+    (tmp_path / 'of_somebody.py').write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, 'of_somebody', raising=False)
+    pairs = {'demo': 'mtv_world_ros.lab.cli.demo', 'mine': 'of_somebody'}
+    registering(monkeypatch, COMMANDS=pairs)
+    assert cli.main(['demo', '--help']) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "entry point 'mine = of_somebody'" in line and says in line
 
 
 def test_an_entry_point_that_cannot_be_imported_is_named(monkeypatch, capsys):

@@ -7,14 +7,14 @@ import argparse
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 import errno
-from importlib import import_module
+from importlib import import_module, metadata
 import os
 import shlex
 import signal
 import sys
 from types import ModuleType
 
-from mtv_world_ros.entry_points import COMMANDS, load, registered
+from mtv_world_ros.entry_points import broken, COMMANDS, load, registered
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted
 from mtv_world_ros.signals import ended_by_signals, stopped_by_sigterm
 
@@ -57,16 +57,20 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
-    for command in _commands():
-        command.add(commands)
+    for entry in _commands():
+        module: ModuleType = load(entry)
+        try:
+            module.add(commands)
+        except Exception as error:  # without `add`, or of a name that is taken
+            raise broken(entry, error) from error
     return parser
 
 
-def _commands() -> Iterable[ModuleType]:
-    """The modules of the commands, in the order of `--help`; their imports take a moment.
+def _commands() -> Iterable[metadata.EntryPoint]:
+    """The commands, in the order of `--help`.
 
     Raises:
-        ConfigError: none is registered, or one cannot be imported.
+        ConfigError: none is registered.
     """
     found = registered(COMMANDS)
     if not found:
@@ -75,13 +79,11 @@ def _commands() -> Iterable[ModuleType]:
             'pip install --no-deps --no-build-isolation -e .'
         )
     others = sorted(found.keys() - set(_ORDER))
-    return [load(found[name]) for name in (*_ORDER, *others) if name in found]
+    return [found[name] for name in (*_ORDER, *others) if name in found]
 
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib import metadata
-
         print(f'mtv-world {metadata.version("mtv_world_ros")}')
         parser.exit()
 

@@ -204,7 +204,7 @@ def episode_recorder(folder: Path, one: Signal) -> None:
 # processes of a recording through the node
 
 
-def _episode(folder: Path) -> Path:
+def make_episode(folder: Path) -> Path:
     """Five seconds of an arm that turns."""
     from mtv_world_ros.data.episode_writer import EpisodeWriter
     from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -233,7 +233,7 @@ def through_node(folder: Path, one: Signal) -> None:
     """An episode is played into a node and recorded while one of the three is hit."""
     from mtv_world_ros.launching.node_processes import DemoOptions, record_through_node
 
-    path = _episode(folder)
+    path = make_episode(folder)
     options = DemoOptions(
         checkpoint='bundled', calibration=folder / 'calibration.yaml', robot=None, device='cpu',
         num_threads=1, num_inference_steps=1, seed=0,

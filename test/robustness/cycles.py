@@ -80,13 +80,16 @@ class Cycles:
         self.client.connect_inputs(ros().INPUTS)
         self.problems: list[str] = []
 
-    def run(self, count: int) -> None:
-        """Goes through so many cycles."""
+    def run(self, count: int, most_s: float = float('inf')) -> None:
+        """Goes through so many cycles, or as many as the time allows."""
         from lifecycle_msgs.msg import Transition
 
         kinds = ('DEACTIVATE', 'CLEANUP', 'CONFIGURE', 'ACTIVATE')
+        end_s = time.monotonic() + most_s
         for number in range(count):
             begin_s = time.monotonic()
+            if begin_s > end_s:
+                break
             for kind in kinds:
                 if not self._change(getattr(Transition, f'TRANSITION_{kind}')):
                     self.problems.append(f'cycle {number}: {kind.lower()} failed')
@@ -114,9 +117,9 @@ class Cycles:
             lambda: all(p.get_subscription_count() for p in self.client.publishers.values()),
             'the topics',
         )
-        self.client.spin_for(0.5)
+        self.client.spin_for(0.1)
         self.client.send_scene()
-        self.client.spin_for(0.2)
+        self.client.spin_for(0.1)
         self.client.send_trajectory()
         self.client.wait(
             lambda: any(v['state'] in ros().ENDS for v in self.client.report_values()[since:]),
@@ -185,13 +188,14 @@ def main() -> int:
     """Cycles; 1 if something grew, was left or failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=500, help='cycles')
+    parser.add_argument('--seconds', type=float, default=float('inf'), help='stop then')
     parser.add_argument('--bundled', action='store_true', help='the bundled model, not a fake')
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'cycles')
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     cycles = Cycles(arguments.out, bundled=arguments.bundled)
     try:
-        cycles.run(arguments.cases)
+        cycles.run(arguments.cases, arguments.seconds)
         cycles.write()
         found = cycles.summary()
     finally:

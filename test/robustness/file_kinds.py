@@ -26,6 +26,7 @@ import wild_numbers
 from wild_numbers import judged, with_wild_number
 import wild_plans
 import wild_scenes
+import yaml
 
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, typestore
@@ -332,6 +333,19 @@ def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
     return load_mapping(_file(folder / 'datasets' / 'mapping.yaml', data))
 
 
+def _read_video_mapping(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.lab.importing.videos import find_recordings, load_video_mapping
+
+    (folder / 'joints').mkdir(exist_ok=True)
+    _file(folder / 'joints' / 'a.csv', b'q1,q2\n0,0\n')
+    mapping = load_video_mapping(_file(folder / 'videos.yaml', data))
+    find_recordings(folder, mapping)
+
+
+def _video_mappings() -> list[bytes]:
+    return [share_path('config', 'datasets', 'videos.yaml').read_bytes()]
+
+
 def _read_preset(data: bytes, folder: Path) -> Any:
     from mtv_world_ros.lab.training.training_config import load_training_config
 
@@ -436,7 +450,26 @@ def _read_contact(data: bytes, folder: Path) -> Any:
     return load_contact(_file(folder / 'contact.json', data).parent)
 
 
+def _scene_files() -> list[bytes]:
+    """Two blocks, and a plan of the bundled robot's home."""
+    block = {'name': 'red block', 'centre': [0.0, 0.3, 0.02], 'size': [0.04, 0.04, 0.04]}
+    can = {'name': 'can', 'centre': [0.1, 0.3, 0.05], 'size': [0.06, 0.06, 0.1], 'round': True}
+    rows = [[0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.03] * 2] * 3
+    values = {'objects': [block, can | {'yaw': 0.5}], 'times': [0.0, 0.4, 1.0], 'positions': rows}
+    return [yaml.safe_dump(values).encode()]
+
+
+def _read_scene_file(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.lab.inspection.foreseen_scene import load_scene
+
+    return load_scene(_file(folder / 'scene.yaml', data), _yam())
+
+
 KINDS = {
+    'scene file': Kind(_scene_files, _read_scene_file),
+    'scene file, numbers': Kind(
+        _scene_files, judged(_read_scene_file, wild_numbers.plausible_scene),
+        damage=with_wild_number),
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
     'urdf': Kind(_urdfs, _read_urdf),
@@ -449,6 +482,7 @@ KINDS = {
     'dataset mapping': Kind(
         lambda: [share_path('config', 'datasets', 'example.yaml').read_bytes()],
         _read_dataset_mapping),
+    'videos mapping': Kind(_video_mappings, _read_video_mapping),
     'describer': Kind(lambda: [share_path('config', 'describer.yaml').read_bytes()],
                       _read_describer),
     'object list': Kind(_object_lists, _read_objects),

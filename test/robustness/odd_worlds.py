@@ -1,9 +1,9 @@
 """Worlds that are odd around a node that is well: each plan still gets exactly one stated end.
 
 Clocks that jump in mid-chunk under `use_sim_time`, cameras of one image a second, plans of a
-minute, cameras that swap their views, two nodes in namespaces. The model is a fake that takes its
-time. Prints a table; the exit status is 1 if a plan got no end or several, an end that is a defect
-of the node (`internal_error`), or if a node died or wrote a traceback.
+minute, cameras that swap their views, two nodes in namespaces, and with two players. The model is
+a fake that takes its time. Prints a table; the exit status is 1 if a plan got no end or several,
+an end that is a defect of the node (`internal_error`), or if a node died or wrote a traceback.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ from collections import Counter
 from collections.abc import Callable
 import json
 from pathlib import Path
+import signal
 import sys
 import time
 from typing import Any
 
+from children import make_episode
 from node_messages import commit, ROOT, ros
 import numpy as np
 
@@ -87,6 +89,16 @@ class World:
             stamp_ns += 1000
         self.plans[stamp_ns] = time.monotonic()
         self.send('/joint_trajectory', ros().make_trajectory(stamp_ns=stamp_ns, **fields))
+
+    def follow(self) -> None:
+        """Counts plans that others send in the namespace."""
+
+        def take(message: Any) -> None:
+            stamp = message.header.stamp
+            self.plans[stamp.sec * 10**9 + stamp.nanosec] = time.monotonic()
+
+        topic = f'/{self.space}/joint_trajectory'
+        self.client.node.create_subscription(ros().PLAN, topic, take, 1000)
 
     def spin(self, seconds: float) -> None:
         """Takes what is said for so long."""
@@ -202,12 +214,38 @@ def namespaces(out: Path, count: int, rng: np.random.Generator) -> list[dict[str
     return [world.close() for world in worlds]
 
 
+def players(out: Path, count: int, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Two nodes, and two players of an episode in a loop: so many plans of each, in lock-step."""
+    spaces = ('left_cell', 'right_cell')
+    worlds = [World(out / space, space=space) for space in spaces]
+    for world in worlds:
+        world.follow()
+    episode = make_episode(out)
+    words = [sys.executable, '-m', 'mtv_world_ros.ros.bags.player', str(episode), '--loop']
+    words += ['--lock-step', '--rate', '2', '--wait-timeout', '60', '--ros-args', '-r']
+    processes = [
+        ros().NodeProcess([*words, f'__ns:=/{space}'], out / space / 'player.log')
+        for space in spaces
+    ]
+    end_s = time.monotonic() + PATIENCE_S + 3 * count
+    while min(len(w.plans) for w in worlds) < count and time.monotonic() < end_s:
+        for world in worlds:
+            world.spin(0.05)
+    codes = [process.stop(signal.SIGINT) for process in processes]
+    rows = [world.close() for world in worlds]
+    for row, code, process in zip(rows, codes, processes, strict=True):
+        row['died'] |= code not in (0, 130)
+        row['tracebacks'] += process.output().count('Traceback')
+    return rows
+
+
 WORLDS: dict[str, Callable[[Path, int, np.random.Generator], list[dict[str, Any]]]] = {
     'clock jumps in mid-chunk': clock_jumps,
     'one image a second': slow_cameras,
     'plans of a minute': long_plans,
     'cameras that swap': swapped_cameras,
     'two nodes in namespaces': namespaces,
+    'two nodes and two players in namespaces': players,
 }
 #: what must be 0
 WRONG = ('without_end', 'several_ends', 'unknown_ends', 'tracebacks', 'died')

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 import json
+import os
 from pathlib import Path
 import signal
 import sys
@@ -30,6 +31,9 @@ BURST, BURST_EVERY = 40, 100
 STOP_EVERY, STOP_S = 250, 1.5
 #: ends that are missing are waited for this long [s]
 PATIENCE_S = 180.0
+#: by then the node's buffers are full: it keeps 256 frames of a view, of which one comes with
+#: every tenth plan, and the bundled model's take 10 MB
+BUFFERS_FULL = 3000
 PLANS, REPORT = '/joint_trajectory', '/world_model/report'
 #: what a plan is given to be answered with the bundled model
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
@@ -39,7 +43,7 @@ class Rate:
     """A node, a client that sends plans, and the ends of each by its stamp."""
 
     def __init__(self, out: Path, *, bundled: bool) -> None:
-        self.out = out
+        self.out, self.bundled = out, bundled
         self.sent: dict[int, float] = {}
         self.ends: Counter[int] = Counter()
         self.latencies: list[float] = []
@@ -110,9 +114,11 @@ class Rate:
     def row(self) -> dict[str, Any]:
         """What became of the plans."""
         log = self.process.output()
-        number, megabytes = np.array(self.memory[len(self.memory) // 4 :] or [(0, 0.0)]).T
-        grown = np.polyfit(number, megabytes, 1)[0] * 1000 if len(number) > 4 else float('nan')
+        kept = [row for row in self.memory if row[0] >= BUFFERS_FULL] or [(0, 0.0)]
+        number, megabytes = np.array(kept).T
+        grown = np.polyfit(number, megabytes, 1)[0] * 1000 if len(kept) > 100 else float('nan')
         return {
+            'model': 'bundled' if self.bundled else 'small',
             'commit': commit(),
             'plans': len(self.sent),
             'without_end': len(set(self.sent) - set(self.ends)),
@@ -121,6 +127,9 @@ class Rate:
             'late': sum(latency > LATE_S + STOP_S for latency in self.latencies),
             'median_s': float(np.median(self.latencies)) if self.latencies else None,
             'worst_s': max(self.latencies, default=None),
+            'p95_s': float(np.quantile(self.latencies, 0.95)) if self.latencies else None,
+            'p99_s': float(np.quantile(self.latencies, 0.99)) if self.latencies else None,
+            'load': os.getloadavg()[0],
             'memory_growth_mb_per_1000': float(grown),
             'tracebacks': log.count('Traceback'),
             'died': self.process.process.poll() is not None,

@@ -6,12 +6,15 @@ import json
 import shutil
 from xml.etree import ElementTree
 
+from folder_kinds import FOLDERS
 import pytest
 from safetensors.torch import load_file, save_file
 import torch
+from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
 
 from mtv_world_ros.bounded_input import check_finite
+from mtv_world_ros.cli import main
 from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.loading import load_contact
@@ -93,3 +96,39 @@ def test_tools_and_joints_out_of_all_reach_are_refused(tmp_path):
     tree.write(urdf)
     with pytest.raises(RobotError, match='at most 100 m are accepted'):
         load_robot(file)
+
+
+def _spoil(file, value=float('nan')):
+    tensors = load_file(file)
+    name = max(tensors, key=lambda name: tensors[name].numel())
+    tensors[name].reshape(-1)[-1] = value
+    save_file(tensors, file)
+
+
+@pytest.mark.parametrize('kind', ['LoRA', 'weights in shards'])
+def test_factors_and_shards_with_a_value_that_is_no_number_are_not_read(tmp_path, kind):
+    make, _, read = FOLDERS[kind]
+    make(tmp_path)
+    read(tmp_path)
+    _spoil(sorted(tmp_path.glob('*.safetensors'))[-1])
+    with pytest.raises(CheckpointError, match='that are no finite numbers'):
+        read(tmp_path)
+
+
+def test_public_weights_with_a_value_that_is_no_number_are_not_imported(tmp_path, capsys):
+    public = write_videox(tmp_path / 'public')
+    sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
+    video = {'num_frames': 4, 'width': 32, 'height': 32}
+    (tmp_path / 'tiny.yaml').write_text(yaml.safe_dump({**sections, 'video': video}))
+    words = ['import-weights', str(public), '--preset', str(tmp_path / 'tiny.yaml'), '--out']
+    assert main([*words, str(tmp_path / 'whole')]) == 0
+    files = sorted(public.rglob('*.safetensors'))
+    assert len(files) == 4
+    for file in files:
+        whole = file.read_bytes()
+        _spoil(file)
+        capsys.readouterr()
+        assert main([*words, str(tmp_path / 'out')]) == 1, file.name
+        assert 'that are no finite numbers' in capsys.readouterr().err
+        assert not (tmp_path / 'out').exists()
+        file.write_bytes(whole)

@@ -141,3 +141,13 @@ def plausible_checkpoint(checkpoint: Any) -> None:
         value = getattr(card, name)
         assert not isinstance(value, bool) and 1 <= value <= 1e5, f'{name} is {value}'
     assert np.isfinite(card.guidance_scale) and abs(card.guidance_scale) < 1e4, 'guidance'
+
+
+def plausible_scene(scene: Any) -> None:
+    """Objects of a room, and commands for minutes at most."""
+    _, solids, commands = scene
+    assert np.isfinite(commands).all() and (np.abs(commands) < 100).all(), 'commands'
+    assert len(commands) < 20_000, f'{len(commands)} commands'
+    for solid in solids:
+        assert (solid.size > 0).all() and (solid.size < 1e3).all(), f'size is {solid.size}'
+        assert (np.abs(solid.centre) < 1e3).all() and abs(solid.yaw) < 1e3, 'place'

@@ -85,7 +85,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         threads=arguments.threads or threads_each(1),
         report=partial(print, flush=True),
     )
-    settings = settings.model_copy(update={'num_motions': arguments.motions})
+    settings = settings.replace(num_motions=arguments.motions)
     folder.mkdir(parents=True, exist_ok=True)
     if response is not None:
         save_response(response, folder)

@@ -67,7 +67,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     threads, count = threads_each(1), {'num_motions': arguments.futures}
     if arguments.contact is None:
         print("numbers of contact are guessed: 'fit-contact' finds them, '--contact' takes them")
-        settings = first_settings(Arms(robot, None)).model_copy(update=count)
+        settings = first_settings(Arms(robot, None)).replace(**count)
         return SolidForesight(robot, None, settings, threads)
     found = load_foresight(
         checkpoint_path(arguments.contact) / OBJECT_MOTION_FOLDER, robot, threads
@@ -77,7 +77,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
             f"'{arguments.contact}' holds no '{OBJECT_MOTION_FOLDER}/contact.json'; run "
             "'mtv-world fit-contact' with '--out' of this folder"
         )
-    settings = found.settings.model_copy(update=count)
+    settings = found.settings.replace(**count)
     return SolidForesight(robot, found.response, settings, threads)
 
 

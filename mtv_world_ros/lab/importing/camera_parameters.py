@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, ValidationInfo
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.config import Pair, Schema
+from mtv_world_ros.config import Pair, Schema, wrong
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -59,7 +59,11 @@ class CameraParameters(Schema):
         return self
 
 
-def _is_there(name: str, info: ValidationInfo[dict[str, Any]]) -> Path:
+def _is_there(name: Any, info: ValidationInfo[dict[str, Any]]) -> Path | None:
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise wrong('the name of a file')
     file = info.context['folder'] / name
     if not file.is_file():
         raise ValueError(f"calibration file '{file}' does not exist")

@@ -16,7 +16,7 @@ from pydantic import (
     ValidationInfo,
 )
 
-from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated, wrong
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
 from mtv_world_ros.data_types import FloatArray
@@ -96,8 +96,10 @@ class ActionStream(Stream):
         return positions, tuple(filter(None, odd))
 
 
-def load_mapped_robot(name: str, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
+def load_mapped_robot(name: Any, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
     """Loads the robot that a mapping names; its file is put into the context."""
+    if not isinstance(name, str):
+        raise wrong("the name of a bundled robot, or a robot's YAML")
     is_path = Path(name).suffix in ('.yaml', '.yml')
     file = info.context['folder'] / name if is_path else bundled('robots', name, 'robot')
     info.context.update(robot_file=file, robot=load_robot(file))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass
+from glob import escape
 from itertools import islice
 import json
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
-from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
+from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated, wrong
 from mtv_world_ros.data.bag_mapping import BagMapping, ViewTopics
 from mtv_world_ros.data.episode import check_outcome, Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
@@ -34,6 +35,13 @@ from mtv_world_ros.lab.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.lab.importing.tool_states import joints_of_poses
 
 
+def _inside(pattern: str) -> str:
+    path = Path(pattern)
+    if path.is_absolute() or '..' in path.parts:
+        raise wrong('a path inside of the folder of recordings')
+    return pattern
+
+
 class VideoMapping(Schema):
     """A mapping file of videos and tables; `{name}` in a path is the recording's name."""
 
@@ -42,7 +50,9 @@ class VideoMapping(Schema):
     robot: Annotated[RobotModel, BeforeValidator(load_mapped_robot)] = Field(
         description="name of a bundled robot, or a robot's YAML relative to this file"
     )
-    rows: str = Field(description='JSON or CSV file of each recording, e.g. `joints/{name}.json`')
+    rows: Annotated[str, AfterValidator(_inside)] = Field(
+        description='JSON or CSV file of each recording, e.g. `joints/{name}.json`'
+    )
     views: dict[str, str] = Field(description='video file by view, e.g. `videos/{name}/0.mp4`')
     state: ActionStream = Field(description='measured joints, or poses of tools, of each row')
     fps: float | None = Field(
@@ -119,7 +129,7 @@ def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]
     """
     before, _, after = mapping.rows.partition('{name}')
     found = []
-    for path in folder.glob(f'{before}*{after}'):
+    for path in folder.glob(f'{escape(before)}*{escape(after)}'):
         text = path.relative_to(folder).as_posix()
         name = text[len(before) : len(text) - len(after)]
         if path.is_file() and name and '/' not in name:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator, Strict
 
-from mtv_world_ros.config import Length, ListOf, Metres, read_yaml, Schema, validated, Wait
+from mtv_world_ros.config import Length, ListOf, Metres, read_yaml, Schema, validated
 from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory
 from mtv_world_ros.errors import TrajectoryError
 from mtv_world_ros.files import write_whole
@@ -38,14 +38,20 @@ _TABLE, _ROBOT = (0.75, 0.73, 0.7, 1.0), (0.45, 0.47, 0.5, 1.0)
 _COLOURS = ((0.8, 0.2, 0.2, 1.0), (0.2, 0.4, 0.8, 1.0), (0.2, 0.6, 0.3, 1.0), (0.8, 0.6, 0.1, 1.0))
 #: instants that a picture shows, as shares of the plan
 _SHOWN = (0.0, 0.5, 1.0)
+#: a plan that is longer is of another unit [s]
+LONGEST_S = 120.0
 
 
 class SolidEntry(Schema):
     """An object: a box, or an upright cylinder."""
 
     name: str
-    centre: ListOf[Metres] = Field(description='x, y, z in the base frame [m]')
-    size: ListOf[Length] = Field(description='along its own x, y, z [m]')
+    centre: Annotated[tuple[Metres, Metres, Metres], Strict(False)] = Field(
+        description='x, y, z in the base frame [m]'
+    )
+    size: Annotated[tuple[Length, Length, Length], Strict(False)] = Field(
+        description='along its own x, y, z [m]'
+    )
     yaw: float = Field(default=0.0, ge=-10, le=10, description='[rad]')
     round: bool = False
 
@@ -63,10 +69,37 @@ class SolidEntry(Schema):
 class SceneFile(Schema):
     """Objects, and a plan of joint positions."""
 
-    objects: ListOf[SolidEntry]
+    objects: ListOf[SolidEntry] = Field(min_length=1, max_length=50)
     joints: ListOf[str] | None = Field(default=None, description="null = the robot's order")
-    times: ListOf[Wait] = Field(description='of the positions, increasing; the first is 0 [s]')
+    times: ListOf[Annotated[float, Field(ge=0, le=LONGEST_S)]] = Field(
+        min_length=2, description='of the positions, increasing; the first is 0 [s]'
+    )
     positions: ListOf[ListOf[Position]] = Field(description='a row a time [rad or m]')
+
+    @model_validator(mode='after')
+    def _is_told_apart_and_begins_now(self) -> Self:
+        names = [entry.name for entry in self.objects]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two objects are called '{twice}'; give each a name of its own")
+        if self.times[0] != 0:
+            raise ValueError(f'times begin at {self.times[0]:g}; the first must be 0')
+        return self
+
+    def rows(self, num_joints: int) -> FloatArray:
+        """Returns the positions (T, J).
+
+        Raises:
+            TrajectoryError: a row has another number of joints, or there is none for a time.
+        """
+        counts = {len(row) for row in self.positions}
+        if counts != {num_joints} or len(self.positions) != len(self.times):
+            raise TrajectoryError(
+                f'{len(self.times)} times and {len(self.positions)} rows of positions, of '
+                f'{", ".join(map(str, sorted(counts)))} joints; give a row of {num_joints} for '
+                'each time'
+            )
+        return np.array(self.positions, float)
 
 
 def load_scene(
@@ -79,24 +112,24 @@ def load_scene(
         TrajectoryError: the plan does not fit the robot.
     """
     file = validated(SceneFile, read_yaml(path, 'scene', 'the scene'), str(path))
-    rows = np.array(file.positions, float)
-    names = file.joints or robot.joint_names
-    if rows.shape != (len(file.times), len(names)) or file.times[0] != 0:
-        raise TrajectoryError(
-            f"'{path}' has {len(file.times)} times from {file.times[0]} on and positions of "
-            f'shape {rows.shape}; give a row of {len(names)} for each time, the first time 0'
+    names = tuple(file.joints or robot.joint_names)
+    try:
+        # its first row is where the robot stands
+        plan = JointTrajectory(
+            joint_names=names, times=np.array(file.times), positions=file.rows(len(names))
         )
-    plan = JointTrajectory(
-        joint_names=tuple(names), times=np.array(file.times[1:], float), positions=rows[1:]
-    )
-    start = np.zeros(len(robot.joint_names))
-    start[[robot.joint_names.index(name) for name in names if name in robot.joint_names]] = rows[0]
-    plan = match_joints(plan, robot, start)
-    check_positions(robot, plan.positions)
-    steps = round(float(plan.times[-1]) / STEP_S)
+        plan = match_joints(plan, robot, np.zeros(len(robot.joint_names)))
+        check_positions(robot, plan.positions)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"'{path}': {error}") from error
+    steps = max(round(float(plan.times[-1]) / STEP_S), 1)
     times = np.arange(steps * COMMANDS_A_STEP + 1, dtype=np.float64) * PERIOD_S
     solids = tuple(entry.solid() for entry in file.objects)
-    return tuple(e.name for e in file.objects), solids, resample(plan, start, times)
+    return (
+        tuple(entry.name for entry in file.objects),
+        solids,
+        resample(plan, plan.positions[0], times),
+    )
 
 
 def in_words(names: Sequence[str], motions: Sequence[ObjectMotion]) -> list[str]:

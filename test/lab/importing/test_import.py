@@ -203,7 +203,10 @@ def test_joints_in_another_unit_fail_with_advice(datasets, make_mapping, tmp_pat
         ('closed: 100, open: 0}\na', 'closed: 1, open: 1}\na', 'both ends of the range are 1'),
         ('calibration: calibration.yaml', 'calibration: cal.yaml', "cal.yaml' does not exist"),
         (', calibration: calibration.yaml', '', "give either 'calibration'"),
+        ('calibration: calibration.yaml', 'calibration: null', "give either 'calibration'"),
+        ('calibration: calibration.yaml', 'calibration: 5', 'must be the name of a file'),
         ('robot: robot.yaml', 'robot: robot.yml', 'robot.yml'),
+        ('robot: robot.yaml', 'robot: [1]', 'must be the name of a bundled robot'),
         ('task: stack', 'outcome: won', "outcome 'won' is not one of"),
     ],
 )  # fmt: skip

@@ -145,6 +145,9 @@ def yaw_pitch_roll(R):
         ({'fps': None}, "either 'fps' or 'time'"),
         ({'rows': 'joints/{name}.json'}, "has no 'joints/{name}.json'"),
         ({'viewz': {}}, "unknown key 'viewz'"),
+        ({'rows': '/rows/{name}.json'}, 'must be a path inside of the folder'),
+        ({'rows': '../{name}.json'}, 'must be a path inside of the folder'),
+        ({'rows': '**x/{name}.json'}, "has no '**x/{name}.json'"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, franka, positions, capsys, change, said):

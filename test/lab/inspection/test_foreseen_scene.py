@@ -53,4 +53,33 @@ def test_a_plan_that_does_not_fit_is_named(tmp_path, capsys):
     assert main(['foresee', scene_file(tmp_path, 3)]) != 0
     assert 'give a row of 14 for each time' in capsys.readouterr().err
     assert main(['foresee', scene_file(tmp_path, 14, times=[0.5, 1])]) != 0
-    assert 'the first time 0' in capsys.readouterr().err
+    assert 'the first must be 0' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('changed', 'says'),
+    [
+        ({'times': [], 'positions': []}, 'times'),
+        ({'times': [0], 'positions': [[0.0] * 14]}, 'times'),
+        ({'times': [0, 1e4]}, 'must be at most 120'),
+        ({'times': [0, 0]}, 'not increasing'),
+        ({'positions': [[0.0] * 14, [0.0]]}, 'give a row of 14'),
+        ({'positions': [[9.0] * 14, [0.0] * 14]}, 'its limits are'),
+        ({'objects': []}, 'objects'),
+        ({'objects': [BLOCK, BLOCK]}, "two objects are called 'red block'"),
+        ({'objects': [BLOCK | {'centre': [0.0, 0.3]}]}, 'centre'),
+        ({'objects': [BLOCK | {'size': [0.04, 0.04, 0.0]}]}, 'size'),
+        ({'objects': [BLOCK | {'centre': [0.0, 1e6, 0.0]}]}, 'must be at most 100'),
+    ],
+)
+def test_a_scene_that_is_none_is_refused_in_one_line(tmp_path, capsys, changed, says):
+    assert main(['foresee', scene_file(tmp_path, 14, **changed)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line and 'scene.yaml' in line
+
+
+@pytest.mark.parametrize('count', ['0', '-3', '1000000'])
+def test_a_number_of_futures_that_cannot_be_is_refused(tmp_path, capsys, count):
+    words = ['foresee', scene_file(tmp_path, 14), '--contact', 'bundled', '--futures', count]
+    assert main(words) == 1
+    assert f"'num_motions' is {count}, must be at " in capsys.readouterr().err
