@@ -40,7 +40,7 @@ def data_files() -> list[tuple[str, Sequence[str]]]:
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='0.2.0',
     description='An online embodied world model for ROS 2.',
     maintainer='mtv_world_ros maintainers',
     maintainer_email='mtv-world-ros@example.org',

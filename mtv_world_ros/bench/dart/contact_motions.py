@@ -26,7 +26,7 @@ from mtv_world_ros.geometry.solids import Solid
 
 #: steps of the engine in a period of commands
 _SUBSTEPS = 5
-_STEP_S = PERIOD_S / _SUBSTEPS
+STEP_S = PERIOD_S / _SUBSTEPS
 #: periods for which everything is still before arms only pass by
 _STILL_PERIODS = 5
 #: standard deviations: of places [m], turns [rad]; relative: sizes, friction, weight, stiffness
@@ -132,7 +132,7 @@ class ContactMotions:
     def _moved(self, robot: RobotModel, where: FloatArray, rows: int, number: int) -> _Moved:
         """One of the K motions, of arms whose joints are at (1 + N, J)."""
         settings, solids = self._disturbed(number)
-        bodies = RigidBodies(robot, self.response, solids, settings, _STEP_S, self.pose)
+        bodies = RigidBodies(robot, self.response, solids, settings, STEP_S, self.pose)
         begin = None if self.swings is None else self.swings[:, number]
         first = self.speeds[number] if self.speeds else None
         course, speeds, swings = course_of(bodies.arms, where, first, begin)
@@ -190,7 +190,7 @@ def check_robot(settings: ContactSettings, robot: RobotModel, response: ArmRespo
             f"the joints of robot '{robot.name}' were found without inertias of its URDF; "
             'contact cannot be computed'
         )
-    RigidBodies(robot, response, (), settings, _STEP_S)
+    RigidBodies(robot, response, (), settings, STEP_S)
 
 
 def _disturbed(solid: Solid, table: float, share: float, rng: np.random.Generator) -> Solid:
@@ -254,6 +254,7 @@ def course_of(
     where: FloatArray,
     speeds: FloatArray | None = None,
     swings: FloatArray | None = None,
+    last: FloatArray | None = None,
 ) -> tuple[Course, FloatArray, FloatArray]:
     """Returns what arms are to do; speeds (D,) and swings (2, F) after it.
 
@@ -262,19 +263,24 @@ def course_of(
         where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
         speeds: (D,) at first; None = at rest.
         swings: (2, F) of the fingers at first, see `ContactMotions`; None = none.
+        last: (D,) speeds at last; None = as the way there goes on.
     """
     fingers = arms.fingers
-    ways, velocities, forces, pulls = driven(arms, where, _SUBSTEPS, speeds)
+    ways, velocities, forces, pulls = driven(arms, where, _SUBSTEPS, speeds, last)
     start = np.zeros((2, len(fingers))) if swings is None else swings
-    off, then = arms.finger_drives.swings(pulls, ways[:, fingers], _STEP_S, start)
+    off, then = arms.finger_drives.swings(pulls, ways[:, fingers], STEP_S, start)
     free, fast = ways.copy(), velocities.copy()
     free[:, fingers] += off
-    fast[:, fingers] += np.concatenate([start[1:], np.diff(off, axis=0) / _STEP_S])
+    fast[:, fingers] += np.concatenate([start[1:], np.diff(off, axis=0) / STEP_S])
     return Course(ways, velocities, forces, free, fast), velocities[-1], then
 
 
 def driven(
-    arms: Arms, where: FloatArray, substeps: int, speeds: FloatArray | None = None
+    arms: Arms,
+    where: FloatArray,
+    substeps: int,
+    speeds: FloatArray | None = None,
+    last: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Returns what moves arms in free air, at N = T * `substeps` steps of the engine.
 
@@ -283,6 +289,7 @@ def driven(
         where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
         substeps: of a period.
         speeds: (D,) at first; None = at rest.
+        last: (D,) likewise at last; None = as the way there goes on.
 
     Returns:
         Ways (1 + N, D) of drives, velocities (1 + N, D), forces (N, D), and those with which hands
@@ -291,7 +298,8 @@ def driven(
     coarse, step_s = arms.ways(where), PERIOD_S / substeps
     times = np.arange(len(coarse)) * PERIOD_S
     first = np.zeros(coarse.shape[1]) if speeds is None else speeds
-    curve = CubicSpline(times, coarse, bc_type=((1, first), 'not-a-knot'))  # type: ignore[arg-type]
+    end = 'not-a-knot' if last is None else (1, last)
+    curve = CubicSpline(times, coarse, bc_type=((1, first), end))  # type: ignore[arg-type]
     ways = curve(np.arange((len(coarse) - 1) * substeps + 1) * step_s)
     velocities = np.concatenate([first[None], np.diff(ways, axis=0) / step_s])
     share = np.arange(substeps)[:, None] / substeps
@@ -313,19 +321,7 @@ def _run(bodies: RigidBodies, course: Course, every: int) -> tuple[FloatArray, F
     poses, joints = [bodies.poses()], [bodies.arms.joints]
     state, still = bodies.state, 0
     for period, first in enumerate(range(0, len(course.forces), _SUBSTEPS), 1):
-        last = first + _SUBSTEPS
-        still = still + 1 if bodies.is_at_rest else 0
-        is_free = still > _STILL_PERIODS and bodies.arms.is_on(
-            course.free[first], course.fast[first]
-        )
-        if not (is_free and bodies.passes(course.free[last], course.fast[last])):
-            before = bodies.state
-            bodies.notice_touch()
-            _step(bodies, course, first, last)
-            if bodies.is_lost:  # cones are solved by an iteration, which may diverge
-                bodies.state = before
-                bodies.solve_friction(as_cone=False)
-                _step(bodies, course, first, last)
+        still = run_period(bodies, course, first, still)
         if period % every == 0:
             poses.append(bodies.poses())
             if np.isfinite(poses[-1]).all():
@@ -334,6 +330,29 @@ def _run(bodies: RigidBodies, course: Course, every: int) -> tuple[FloatArray, F
                 bodies.state, poses[-1] = state, poses[-2]
             joints.append(bodies.arms.joints)
     return np.stack(poses), np.stack(joints)
+
+
+def run_period(bodies: RigidBodies, course: Course, first: int, still: int) -> int:
+    """Goes on by one period of commands; returns for how many periods no solid has moved.
+
+    Args:
+        bodies: are moved.
+        course: what arms do.
+        first: step of the course at which the period begins.
+        still: for how many periods no solid has moved before.
+    """
+    last = first + _SUBSTEPS
+    still = still + 1 if bodies.is_at_rest else 0
+    is_free = still > _STILL_PERIODS and bodies.arms.is_on(course.free[first], course.fast[first])
+    if not (is_free and bodies.passes(course.free[last], course.fast[last])):
+        before = bodies.state
+        bodies.notice_touch()
+        _step(bodies, course, first, last)
+        if bodies.is_lost:  # cones are solved by an iteration, which may diverge
+            bodies.state = before
+            bodies.solve_friction(as_cone=False)
+            _step(bodies, course, first, last)
+    return still
 
 
 def _step(bodies: RigidBodies, course: Course, first: int, last: int) -> None:

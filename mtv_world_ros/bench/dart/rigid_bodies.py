@@ -99,6 +99,7 @@ class RigidBodies:
         settings: of contact.
         step_s: of the engine.
         pose: (J,) near which the arms work; None = the middle of their range [rad or m].
+        masses: (O,) of the solids [kg]; None = as their density has it.
 
     Raises:
         RobotError: the robot cannot be a tree of rigid bodies.
@@ -112,6 +113,7 @@ class RigidBodies:
         settings: ContactSettings,
         step_s: float,
         pose: FloatArray | None = None,
+        masses: Sequence[float] | None = None,
     ) -> None:
         self._world = dart.simulation.World()
         self._world.setTimeStep(step_s)
@@ -119,7 +121,11 @@ class RigidBodies:
         still.mEnabled = False  # what sleeps is not woken by fingers that close gently
         self._world.setDeactivationOptions(still)
         self._settings = settings
-        self._solids = [_body(number, solid, settings) for number, solid in enumerate(solids)]
+        given = [None] * len(solids) if masses is None else masses
+        self._solids = [
+            _body(number, solid, settings, mass)
+            for number, (solid, mass) in enumerate(zip(solids, given, strict=True))
+        ]
         middle = (robot.lower + robot.upper) / 2
         self.arms = Arms(robot, response, settings, middle if pose is None else pose)
         detector = _detector(self.arms.skeleton)
@@ -610,8 +616,8 @@ def _table(settings: ContactSettings) -> Any:
     return skeleton
 
 
-def _body(number: int, solid: Solid, settings: ContactSettings) -> Any:
-    """A solid, as it stands."""
+def _body(number: int, solid: Solid, settings: ContactSettings, given: float | None) -> Any:
+    """A solid of a mass, as it stands; None = as its density has it."""
     skeleton = dart.dynamics.Skeleton(f'object {number}')
     joint, body = skeleton.createFreeJointAndBodyNodePair()
     parts = _parts(solid, settings)
@@ -623,9 +629,10 @@ def _body(number: int, solid: Solid, settings: ContactSettings) -> Any:
         turn, arm = part.pose[:3, :3], part.pose[:3, 3] - middle
         inertia += turn @ part.inertia @ turn.T
         inertia += part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    body.setMass(mass)
+    share = 1.0 if given is None else given / mass
+    body.setMass(share * mass)
     body.setLocalCOM(middle)
-    _set_inertia(body, inertia)
+    _set_inertia(body, share * inertia)
     pose = _turned(solid.yaw)
     pose[:3, 3] = solid.centre
     skeleton.setPositions(dart.dynamics.FreeJoint.convertToPositions(dart.math.Isometry3(pose)))

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -20,6 +20,8 @@ from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.model import RobotModel
 
+#: the second engine
+DART = 'dart'
 #: geoms of this priority are the pads of fingers
 _PAD_PRIORITY = 1
 #: draws which way each joint's zero is off; of an episode's pictures and cameras its seed does
@@ -32,6 +34,9 @@ class Physics(Schema):
     """One entry of `config/physics.yaml`: how the truth differs from the nominal one."""
 
     text: str = Field(description='what is different, in words')
+    engine: Literal['mujoco', 'dart'] = Field(
+        default='mujoco', description='what steps the bodies; MuJoCo draws them'
+    )
     table_friction: Factor = Field(default=1.0, description='factor, of all but finger pads')
     grip_friction: Factor = Field(default=1.0, description='factor, of finger pads')
     object_mass: Factor = Field(default=1.0, description='factor')

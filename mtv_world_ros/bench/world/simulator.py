@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from mtv_world_ros.bench.tasks.tasks import Task, task_named
 from mtv_world_ros.bench.world.arm import actuators_of
 from mtv_world_ros.bench.world.opengl import load_mujoco
 from mtv_world_ros.bench.world.physics import (
+    DART,
     DelayLine,
     ModelParts,
     physics_named,
@@ -18,12 +19,16 @@ from mtv_world_ros.bench.world.physics import (
 )
 from mtv_world_ros.bench.world.randomize import draw_scene, instruction_of, RandomizationConfig
 from mtv_world_ros.bench.world.scene import Scene, scene_xml, TIMESTEP_S
+from mtv_world_ros.bench.world.second_engine import second_engine
 from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.success.situation import TruePoses
+
+if TYPE_CHECKING:
+    from mtv_world_ros.bench.dart.stepped_world import SteppedWorld
 
 CONTROL_PERIOD_S = 0.02
 
@@ -155,6 +160,10 @@ class SimEpisode:
         self._data.qpos[self._arm_qpos] = self._spread(self.home - self._zeros)
         self._data.ctrl[:] = self._spread(self.home - self._zeros)
         mujoco.mj_forward(self._model, self._data)
+        self._second = None
+        if self._physics.engine == DART:
+            rest = self.home - self._zeros
+            self._second = second_engine(self._model, scene, self.robot, actuators, rest)
         return self.observe()
 
     def close(self) -> None:
@@ -189,11 +198,29 @@ class SimEpisode:
         """
         targets = self._checked(targets)
         arrived = self._delay.pass_on(targets)
+        if self._second is not None:
+            self._second.advance(arrived - self._zeros)
+            self._show(self._second)
+            self._target, self._arrived = targets, arrived
+            return
         velocity = (self._spread(arrived) - self._spread(self._arrived)) / CONTROL_PERIOD_S
         self._data.ctrl[:] = self._spread(arrived - self._zeros) + self._lead * velocity
         num_steps = round(CONTROL_PERIOD_S / TIMESTEP_S)
         self._mujoco.mj_step(self._model, self._data, nstep=num_steps)
         self._target, self._arrived = targets, arrived
+
+    def _show(self, second: SteppedWorld) -> None:
+        """Puts arms and objects where the second engine has them, for pictures and poses."""
+        mujoco, data = self._mujoco, self._data
+        data.qpos[self._arm_qpos] = self._spread(second.joints)
+        for item, pose in zip(self.scene.objects, second.poses, strict=True):
+            first, turn = self._model.joint(item.role).qposadr[0], np.zeros(4)
+            mujoco.mju_mat2Quat(turn, pose[:3, :3].ravel())
+            data.qpos[first : first + 7] = [*pose[:3, 3], *turn]
+        data.time += CONTROL_PERIOD_S
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_comPos(self._model, data)
+        mujoco.mj_camlight(self._model, data)
 
     def _checked(self, targets: FloatArray) -> FloatArray:
         targets = np.asarray(targets, dtype=np.float64)

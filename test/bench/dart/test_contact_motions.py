@@ -39,7 +39,7 @@ SETTINGS = ContactSettings(
     num_motions=1,
 )
 #: of the engine [s]
-STEP_S = contact_motions._STEP_S
+STEP_S = contact_motions.STEP_S
 #: out of the arms' reach
 AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
 
