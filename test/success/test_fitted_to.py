@@ -99,11 +99,16 @@ def test_other_numbers_of_contact_are_another_setting(tmp_path):
     assert fitting_setting(own, ROBOT) != fitting_setting('bundled', ROBOT)
 
 
-def test_the_bundled_estimate_was_fitted_with_an_earlier_foresight():
+def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
     calibration = load_calibration(share_path('resource', 'checkpoint'))
-    found = calibration.elsewhere(fitting_setting('bundled', ROBOT), CAMERAS, is_foreseen=True)
-    assert found == 'fitted with the foresight of mtv_world_ros 0.1.0'
+    here = fitting_setting('bundled', ROBOT)
+    assert calibration.elsewhere(here, CAMERAS, is_foreseen=True) == ''
+    found = calibration.elsewhere(HERE, CAMERAS, is_foreseen=True)
+    assert found.startswith('fitted with another foresight')
     assert not calibration.elsewhere(HERE, CAMERAS, is_foreseen=False)
+    old = calibration.replace(fitted_to=None, made={'versions': 'mtv_world_ros 0.1.0, torch 2'})
+    found = old.elsewhere(here, CAMERAS, is_foreseen=True)
+    assert found == 'fitted with the foresight of mtv_world_ros 0.1.0'
 
 
 def test_it_is_read_back_as_it_was_written():
