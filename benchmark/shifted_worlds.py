@@ -50,13 +50,12 @@ from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.imagined_episode import ImaginedEpisode
+from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.success.estimator import capped
+from mtv_world_ros.success.estimator import capped, verdict
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell
-from mtv_world_ros.success.verdict import verdict
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: how rollouts are recorded
