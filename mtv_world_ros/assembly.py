@@ -16,7 +16,6 @@ from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
-from mtv_world_ros.parallel import threads_each
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.policies.policy import (
     EpisodeOrigin,
@@ -27,6 +26,7 @@ from mtv_world_ros.policies.policy import (
     RecordedPolicySettings,
     ScriptedPolicySettings,
 )
+from mtv_world_ros.processes import threads_each
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     CALIBRATION,

@@ -1,17 +1,31 @@
-"""Starts and stops the package's nodes as processes that do not outlive the one they belong to."""
+"""Processes: signals that end this one, nodes beside it, workers that run its jobs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import as_completed, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from functools import partial
+import importlib
+import multiprocessing
 import os
 from pathlib import Path
 import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from types import FrameType
+from typing import Any, Protocol, TypeVar
 
+from mtv_world_ros.errors import ConfigError, MtvWorldError
+from mtv_world_ros.files import plain
+
+#: a stopped command tidies up for this long [s]
+_TIDY_S = 5.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: tells a node whose child it is: it ends with that process, however that ends
 PARENT_VARIABLE = 'MTV_WORLD_PARENT'
 _STOP_S = 30.0
@@ -19,7 +33,103 @@ _STOP_S = 30.0
 STILL_S = 5.0
 #: who looks no oftener than this may have stood still as well [s]
 _LONGEST_GAP_S = 2.0
+#: between two looks of a pool at its workers, and of a worker at its parent [s]
+_LOOK_S = 0.5
 _TAIL_BYTES = 4000
+#: libraries that start threads read these when they are loaded
+_THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
+#: scores as plain values, or why there are none
+Outcome = dict[str, Any] | str
+#: runs one job
+Run = Callable[..., Any]
+Job = TypeVar('Job')
+#: of this process, if it is a worker
+_run: Run | None = None
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asks the process to stop.
+
+    Attributes:
+        signum: its number.
+    """
+
+    def __init__(self, signum: int) -> None:
+        super().__init__()
+        self.signum = signum
+
+
+class Starting:
+    """Ends the process at once on a signal, whatever it imports or makes, until `is_over`.
+
+    Args:
+        name: of the program, for the line on stderr.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self.is_over = name, False
+
+    def __call__(self, signum: int, _: FrameType | None) -> None:
+        """Handles the signal."""
+        if not self.is_over:
+            text = f'{self._name}: stopped while starting ({signal.Signals(signum).name})\n'
+            os.write(2, text.encode())
+            os._exit(128 + signum)
+
+
+def end_on_signals(name: str) -> Starting:
+    """Lets SIGINT and SIGTERM end this process while it starts; ignored ones stay ignored."""
+    starting = Starting(name)
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, starting)
+    return starting
+
+
+@contextmanager
+def ended_by_signals(name: str) -> Iterator[None]:
+    """Within it SIGINT and SIGTERM end the process, if this is its main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    end_on_signals(name)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # None: it was not installed from Python
+                signal.signal(number, handler)
+
+
+@contextmanager
+def stopped_by_sigterm() -> Iterator[None]:
+    """Within it SIGTERM raises `Stopped`, as SIGINT does KeyboardInterrupt: the command tidies up.
+
+    What still tidies up after `_TIDY_S` is ended, and at once at a second SIGTERM. Where SIGTERM
+    has a handler, that stays.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    timer = threading.Timer(_TIDY_S, os._exit, (128 + signal.SIGTERM,))
+    timer.daemon = True
+
+    def stop(signum: int, _: FrameType | None) -> None:
+        signal.signal(signum, signal.SIG_DFL)
+        timer.start()
+        raise Stopped(signum)
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        timer.cancel()
+        if signal.getsignal(signal.SIGTERM) is stop:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def private_domain() -> dict[str, str]:
@@ -127,3 +237,253 @@ def stop_process(process: subprocess.Popen[bytes] | None) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+class Scores(Protocol):
+    """What a job gives."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values."""
+        ...
+
+
+class Scorer(Protocol):
+    """Scores one job after the other."""
+
+    def score(self, job: Any) -> Scores:
+        """Returns a job's scores; raises MtvWorldError where there are none."""
+        ...
+
+
+def run_all(
+    jobs: Sequence[Job], make_run: Callable[[], Run], workers: int, threads: int = 1
+) -> Iterator[tuple[Job, Any]]:
+    """Yields jobs with their result, in the order in which they are done.
+
+    Workers are spawned, not forked, since the threads of torch and OpenCV do not survive a fork.
+    They end with this process, however that ends.
+
+    Args:
+        jobs: arguments of the function, one a call.
+        make_run: makes what runs a job, once in every process; has to be picklable for more than
+            one.
+        workers: processes; 1 = this one.
+        threads: of each process, where there are several.
+
+    Raises:
+        ConfigError: less than one worker.
+        MtvWorldError: a worker died, or what a job raised.
+    """
+    if workers < 1:
+        raise ConfigError(f'workers is {workers}; it must be at least 1')
+    if workers > 1 and len(jobs) > 1:
+        yield from _in_processes(jobs, make_run, min(workers, len(jobs)), threads)
+    elif jobs:
+        run = make_run()
+        for job in jobs:
+            yield job, run(job)
+
+
+def _in_processes(
+    jobs: Sequence[Job], make_run: Callable[[], Run], workers: int, threads: int
+) -> Iterator[tuple[Job, Any]]:
+    pool = WorkerPool(make_run, workers, threads)
+    try:
+        with _environment(dict.fromkeys(_THREAD_VARIABLES, str(threads))):
+            futures = {pool.submit(run_job, job): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool as error:
+        raise MtvWorldError(
+            f'one of {workers} workers died, most likely of lack of memory (one that is stopped '
+            f'for {STILL_S:g} s is ended, too); what is done is kept: run the command again, with '
+            'fewer --workers'
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+class WorkerPool(ProcessPoolExecutor):
+    """Processes whose `run_job` runs jobs; they end with this process, however that ends.
+
+    One that stands still (SIGSTOP) is killed: the pool breaks, and nobody waits on.
+
+    Args:
+        make_run: makes what runs a job, once in every process.
+        workers: processes.
+        threads: of OpenCV in each of them.
+        method: `spawn`, or `fork`, where nothing is copied or pickled.
+    """
+
+    def __init__(
+        self, make_run: Callable[[], Run], workers: int, threads: int = 1, method: str = 'spawn'
+    ) -> None:
+        arguments = (make_run, threads, os.getpid())
+        super().__init__(workers, multiprocessing.get_context(method), _start_worker, arguments)
+        self._closed = threading.Event()
+        threading.Thread(target=self._kill_still, daemon=True).start()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Ends the processes."""
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        self._closed.set()
+
+    def _kill_still(self) -> None:
+        still = StandStill()
+        while not self._closed.wait(_LOOK_S):
+            found = still.find(list(self._processes or ()))
+            if found is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(found, signal.SIGKILL)
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables as processes that start within it see them."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker(make_run: Callable[[], Run], threads: int, parent: int) -> None:
+    """Prepares a worker; an error is raised by every job."""
+    global _run
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    import cv2
+
+    cv2.setNumThreads(threads)
+    try:
+        _run = make_run()
+    except MtvWorldError as error:
+        _run = _raising(error)
+
+
+def _end_with(parent: int) -> None:
+    """A killed command must not go on writing: the same command may have been started again."""
+    while os.getppid() == parent:
+        time.sleep(_LOOK_S)
+    os._exit(1)
+
+
+def _raising(error: MtvWorldError) -> Run:
+    def run(job: Any) -> Any:
+        raise error
+
+    return run
+
+
+def run_job(*job: Any) -> Any:
+    """Runs a job in a worker of a `WorkerPool`."""
+    assert _run is not None
+    return _run(*job)
+
+
+class _Scoring:
+    """Runs a scorer, and says why where a job has no scores.
+
+    Args:
+        make_scorer: makes it.
+        is_late: in another process, where what goes wrong meanwhile is told by every job.
+    """
+
+    def __init__(self, make_scorer: Callable[[], Scorer], is_late: bool = True) -> None:
+        try:
+            self._score: Run = make_scorer().score
+        except MtvWorldError as error:
+            if not is_late:
+                raise
+            self._score = _raising(error)
+
+    def __call__(self, job: Any) -> Outcome:
+        try:
+            return plain(self._score(job).as_json())
+        except MtvWorldError as error:
+            return str(error)
+
+    def numbered(self, number: int, job: Any) -> tuple[int, Outcome]:
+        return number, self(job)
+
+
+def threads_each(workers: int) -> int:
+    """Returns the usable cores' share of each of some processes, at least 1."""
+    return max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)
+
+
+def score_all(
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
+) -> Iterator[tuple[Job, Outcome]]:
+    """Yields jobs with their scores, or why there are none; see `run_all`.
+
+    Args:
+        jobs: to score, in any order.
+        make_scorer: called once in every process; has to be picklable for more than one.
+        workers: processes; 1 = this one.
+        threads: of each process, where there are several.
+    """
+    several = workers > 1 and len(jobs) > 1
+    make_run = partial(_Scoring, make_scorer, is_late=several)
+    yield from run_all(jobs, make_run, workers, threads)
+
+
+def score_with_ray(
+    jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, address: str = ''
+) -> Iterator[tuple[Job, Outcome]]:
+    """Yields jobs with their scores, or why there are none, from actors of a Ray cluster.
+
+    Every machine of the cluster needs this package, and checkpoints under the same path.
+
+    Args:
+        jobs: to score, in any order.
+        make_scorer: called once in every actor; has to be picklable.
+        workers: actors, of one core each.
+        address: of the cluster; empty = `RAY_ADDRESS`, else a new one on this machine.
+
+    Raises:
+        ConfigError: Ray is not installed or cannot be reached, or less than one worker.
+        MtvWorldError: an actor died.
+    """
+    if workers < 1:
+        raise ConfigError(f'workers is {workers}; it must be at least 1')
+    ray = _ray()
+    try:
+        ray.init(address=address or None, log_to_driver=False, include_dashboard=False)
+    except (ConnectionError, ValueError) as error:
+        raise ConfigError(f"Ray cannot be reached at '{address}': {error}; set --ray") from error
+    except ray.exceptions.AuthenticationError as error:
+        raise ConfigError(
+            f"the Ray cluster at '{address or 'this machine'}' asks for its token, and there is "
+            'none, or another one, here: copy ~/.ray/auth_token of the head node to this user, '
+            'or set RAY_AUTH_TOKEN (docs/ray.md)'
+        ) from error
+    try:
+        actor = ray.remote(num_cpus=1)(_Scoring)
+        pool = ray.util.ActorPool([actor.remote(make_scorer) for _ in range(workers)])
+        numbered = list(enumerate(jobs))
+        done = pool.map_unordered(lambda a, one: a.numbered.remote(*one), numbered)
+        yield from ((jobs[number], outcome) for number, outcome in done)
+    except ray.exceptions.RayError as error:
+        raise MtvWorldError(
+            f'a Ray worker died ({error}); what is done is kept: run the command again'
+        ) from error
+    finally:
+        ray.shutdown()
+
+
+def _ray() -> Any:
+    """Ray, which is optional and large."""
+    try:
+        ray = importlib.import_module('ray')
+        importlib.import_module('ray.util')
+    except ImportError as error:
+        raise ConfigError(
+            "--ray needs Ray: pip install 'mtv_world_ros[rank]', or leave it out and use --workers"
+        ) from error
+    return ray

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import load_recording
@@ -11,7 +12,6 @@ from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpe
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.imagined_episode import SEED_STEP
-from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.success.calibration import HorizonCurve
 

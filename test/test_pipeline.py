@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.assembly import assemble
 from mtv_world_ros.data.recording import cached_recording, load_recording, Recording
@@ -29,7 +30,6 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
     observe_stretch,
     stretches,
 )
-from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline

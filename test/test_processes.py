@@ -9,8 +9,7 @@ import time
 import pytest
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.parallel import run_all
-from mtv_world_ros.processes import StandStill, STILL_S, stop_process
+from mtv_world_ros.processes import run_all, StandStill, STILL_S, stop_process
 
 
 class StopsItself:

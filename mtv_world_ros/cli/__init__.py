@@ -16,7 +16,7 @@ from types import ModuleType
 
 from mtv_world_ros.entry_points import broken, COMMANDS, load, registered
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted
-from mtv_world_ros.signals import ended_by_signals, stopped_by_sigterm
+from mtv_world_ros.processes import ended_by_signals, stopped_by_sigterm
 
 #: of the extra `evaluate`, which several commands need
 _EVALUATE_PACKAGES = ('matplotlib', 'scipy')

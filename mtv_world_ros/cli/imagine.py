@@ -12,15 +12,7 @@ from statistics import NormalDist
 import sys
 
 from mtv_world_ros.cli.shared_options import (
-    add_checkpoint,
-    add_describer,
-    add_dtype,
-    add_model_options,
-    add_overwrite,
-    add_segmenter,
-    add_serving,
-    add_source,
-    add_task,
+    add_options,
     add_watch,
     check_model,
     pipeline_of,
@@ -50,15 +42,7 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('episode', type=Path)
     parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
-    add_overwrite(parser)
-    add_source(parser)
-    add_checkpoint(parser)
-    add_dtype(parser)
-    add_model_options(parser)
-    add_describer(parser)
-    add_segmenter(parser)
-    add_serving(parser)
-    add_task(parser)
+    add_options(parser, 'overwrite source checkpoint dtype model describer segmenter serving task')
     parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
 
 
@@ -127,11 +111,7 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
         '--no-video', dest='video', action='store_false', help='no comparison.mp4 of each episode'
     )
     add_watch(parser, 'every episode')
-    add_overwrite(parser)
-    add_checkpoint(parser)
-    add_model_options(parser)
-    add_describer(parser)
-    add_segmenter(parser)
+    add_options(parser, 'overwrite checkpoint model describer segmenter')
     parser.set_defaults(handler=_imagine)
 
 

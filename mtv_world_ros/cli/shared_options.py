@@ -29,73 +29,6 @@ _CHOICES = (
 )
 
 
-def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Adds robot, device, threads, steps and seed."""
-    parser.add_argument('--robot', help='robot YAML; default: the one of the checkpoint')
-    parser.add_argument('--device', default='cpu')
-    parser.add_argument(
-        '--threads', type=int, default=0, help='CPU threads; 0 = all but one, of two both'
-    )
-    parser.add_argument(
-        '--no-foresight',
-        dest='foresight',
-        action='store_false',
-        help="the paper's way: trails and first masks are drawn, no object motion is foreseen, "
-        'and pictures alone decide',
-    )
-    parser.add_argument(
-        '--no-camera-check',
-        dest='camera_check',
-        action='store_false',
-        help="do not compare the first pictures with the arm's outline, nor correct the cameras",
-    )
-    parser.add_argument(
-        '--steps',
-        type=_num_steps,
-        default=0,
-        help='denoising steps; 0 = as the checkpoint says, else 4',
-    )
-    parser.add_argument('--seed', type=int, default=0)
-
-
-def add_serving(parser: argparse.ArgumentParser) -> None:
-    """Adds `--serving` and `--adapter`."""
-    parser.add_argument(
-        '--serving',
-        default='',
-        metavar='"NAME=VALUE ..."',
-        help='options that make the model faster or smaller, e.g. "compile=true"',
-    )
-    parser.add_argument(
-        '--adapter', type=Path, help="LoRA folder or file, instead of the checkpoint's own"
-    )
-
-
-def add_task(parser: argparse.ArgumentParser) -> None:
-    """Adds `--task`."""
-    parser.add_argument(
-        '--task',
-        help='task to judge: a name, or a YAML file; default: the one each instruction matches',
-    )
-
-
-def add_source(parser: argparse.ArgumentParser) -> None:
-    """Adds `--topics` and `--calibration`."""
-    parser.add_argument(
-        '--topics',
-        type=Path,
-        metavar='FILE',
-        help="mapping of a robot's own bags (see config/datasets/bag.yaml); default: the names of "
-        'this package',
-    )
-    parser.add_argument(
-        '--calibration',
-        type=Path,
-        metavar='FILE',
-        help="of the cameras; default: calibration.yaml beside each bag, or the bag's TF",
-    )
-
-
 def names(text: str) -> tuple[str, ...]:
     """Returns the names of a comma-separated list, as an option's type."""
     return tuple(name.strip() for name in text.split(',') if name.strip())
@@ -108,13 +41,6 @@ def _num_steps(text: str) -> int:
     return number
 
 
-def add_seeds(parser: argparse.ArgumentParser) -> None:
-    """Adds `--seeds`."""
-    parser.add_argument(
-        '--seeds', type=_count, default=1, help='rollouts of each, for the success estimate'
-    )
-
-
 def _count(text: str) -> int:
     number = int(text)
     if number < 1:
@@ -122,36 +48,100 @@ def _count(text: str) -> int:
     return number
 
 
-def add_segmenter(parser: argparse.ArgumentParser) -> None:
-    """Adds `--segmenter`."""
-    parser.add_argument(
-        '--segmenter',
-        default='auto',
-        help='auto, colour, sam2 or sam3; auto = sam2 where MTV_WORLD_WEIGHTS has it, else colour',
-    )
+#: options by the word that `add_options` knows them by
+_OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
+    'model': {
+        '--robot': {'help': 'robot YAML; default: the one of the checkpoint'},
+        '--device': {'default': 'cpu'},
+        '--threads': {
+            'type': int,
+            'default': 0,
+            'help': 'CPU threads; 0 = all but one, of two both',
+        },
+        '--no-foresight': {
+            'dest': 'foresight',
+            'action': 'store_false',
+            'help': "the paper's way: trails and first masks are drawn, no object motion is "
+            'foreseen, and pictures alone decide',
+        },
+        '--no-camera-check': {
+            'dest': 'camera_check',
+            'action': 'store_false',
+            'help': "do not compare the first pictures with the arm's outline, nor correct the "
+            'cameras',
+        },
+        '--steps': {
+            'type': _num_steps,
+            'default': 0,
+            'help': 'denoising steps; 0 = as the checkpoint says, else 4',
+        },
+        '--seed': {'type': int, 'default': 0},
+    },
+    'serving': {
+        '--serving': {
+            'default': '',
+            'metavar': '"NAME=VALUE ..."',
+            'help': 'options that make the model faster or smaller, e.g. "compile=true"',
+        },
+        '--adapter': {
+            'type': Path,
+            'help': "LoRA folder or file, instead of the checkpoint's own",
+        },
+    },
+    'task': {
+        '--task': {
+            'help': 'task to judge: a name, or a YAML file; default: the one each instruction '
+            'matches'
+        }
+    },
+    'source': {
+        '--topics': {
+            'type': Path,
+            'metavar': 'FILE',
+            'help': "mapping of a robot's own bags (see config/datasets/bag.yaml); default: the "
+            'names of this package',
+        },
+        '--calibration': {
+            'type': Path,
+            'metavar': 'FILE',
+            'help': "of the cameras; default: calibration.yaml beside each bag, or the bag's TF",
+        },
+    },
+    'seeds': {
+        '--seeds': {
+            'type': _count,
+            'default': 1,
+            'help': 'rollouts of each, for the success estimate',
+        }
+    },
+    'segmenter': {
+        '--segmenter': {
+            'default': 'auto',
+            'help': 'auto, colour, sam2 or sam3; auto = sam2 where MTV_WORLD_WEIGHTS has it, '
+            'else colour',
+        }
+    },
+    'describer': {
+        '--describer': {
+            'type': Path,
+            'metavar': 'YAML',
+            'help': 'how objects are named (see config/describer.yaml); default: the names '
+            'stored with the episode, else the colour words of its instruction',
+        }
+    },
+    'checkpoint': {'--checkpoint': {'default': 'bundled', 'help': "folder, or 'bundled'"}},
+    'overwrite': {
+        '--overwrite': {'action': 'store_true', 'help': 'replace what an earlier run wrote'}
+    },
+    'dtype': {'--dtype': {'default': 'auto', 'help': 'auto, float32 or bfloat16'}},
+}
 
 
-def add_describer(parser: argparse.ArgumentParser) -> None:
-    """Adds `--describer`."""
-    parser.add_argument(
-        '--describer',
-        type=Path,
-        metavar='YAML',
-        help='how objects are named (see config/describer.yaml); default: the names stored with '
-        'the episode, else the colour words of its instruction',
-    )
-
-
-def add_checkpoint(parser: argparse.ArgumentParser) -> None:
-    """Adds `--checkpoint`."""
-    parser.add_argument('--checkpoint', default='bundled', help="folder, or 'bundled'")
-
-
-def add_overwrite(parser: argparse.ArgumentParser) -> None:
-    """Adds `--overwrite`."""
-    parser.add_argument(
-        '--overwrite', action='store_true', help='replace what an earlier run wrote'
-    )
+def add_options(parser: argparse.ArgumentParser, words: str) -> None:
+    """Adds options that several commands share, e.g. those of `overwrite model task`."""
+    for word in words.split():
+        for flag, how in _OPTIONS[word].items():
+            parser.add_argument(flag, **how)
 
 
 def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
@@ -216,14 +206,9 @@ class Watch:
         return cls(port=int(text))
 
 
-def add_dtype(parser: argparse.ArgumentParser) -> None:
-    """Adds `--dtype`."""
-    parser.add_argument('--dtype', default='auto', help='auto, float32 or bfloat16')
-
-
 def threads_of_workers(arguments: argparse.Namespace) -> int:
     """Returns the CPU threads of each of `--workers` processes: as asked, else its share."""
-    from mtv_world_ros.parallel import threads_each
+    from mtv_world_ros.processes import threads_each
 
     return arguments.threads or threads_each(arguments.workers)
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_overwrite
+from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free
 
@@ -49,7 +49,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='N',
         help='of an evaluation the first N, of a ranking the worst N',
     )
-    add_overwrite(parser)
+    add_options(parser, 'overwrite')
     parser.set_defaults(handler=_view)
 
 

@@ -19,8 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.processes import PARENT_VARIABLE
-from mtv_world_ros.signals import end_on_signals
+from mtv_world_ros.processes import end_on_signals, PARENT_VARIABLE
 
 _PR_SET_PDEATHSIG = 1
 AnyNode = TypeVar('AnyNode', bound=Node)

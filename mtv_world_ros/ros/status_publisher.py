@@ -13,7 +13,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from std_msgs.msg import Header
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.ros.messages.conversions import make_header, to_diagnostics, to_status
@@ -23,20 +22,23 @@ _WARN_S = 5.0
 
 
 class StatusPublisher:
-    """What a node beside the world model has to say.
+    """Publishes a node's `~/report` and `/diagnostics`, and counts what its side node does.
 
     Attributes:
         counts: whatever is counted, by name.
+        hardware_id: of its statuses; empty = none.
 
     Args:
         node: owner of the publishers and the logger.
+        subject: what a report is about.
+        reports_kept: for a subscriber that is busy.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, subject: str = 'episode', reports_kept: int = 100) -> None:
+        self._node, self._subject, self.hardware_id = node, subject, ''
         self.counts: Counter[str] = Counter()
         self._last: tuple[float, str] | None = None
-        self._report = create_publisher(node, DiagnosticArray, '~/report', 100)
+        self._report = create_publisher(node, DiagnosticArray, '~/report', reports_kept)
         self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
 
     def fault(self, kind: str, text: str) -> None:
@@ -45,16 +47,12 @@ class StatusPublisher:
         self._last = (time.monotonic(), f'{kind}: {text}')
         self._node.get_logger().warning(f'{kind}: {text}')
 
-    def report(self, state: str, values: Mapping[str, object]) -> None:
+    def report(
+        self, state: str, values: Mapping[str, object], level: bytes = DiagnosticStatus.OK
+    ) -> None:
         """Publishes a report at once."""
-        status = to_status(
-            f'{status_name(self._node)}: episode',
-            '',
-            DiagnosticStatus.OK,
-            state,
-            {'state': state, **values},
-        )
-        self._report.publish(to_diagnostics(self._header(), status))
+        name = f': {self._subject}'
+        self._publish(self._report, name, level, state, {'state': state, **values})
 
     def publish_diagnostics(self, state: Mapping[str, object], warning: str = '') -> None:
         """Publishes `/diagnostics`: the state, the counts and the last fault.
@@ -70,16 +68,26 @@ class StatusPublisher:
             recent = self._last[1] if age < _WARN_S else ''
             warning = '; '.join(filter(None, (recent, warning)))
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
-        status = to_status(status_name(self._node), '', level, warning or 'ready', values)
-        self._diagnostics.publish(to_diagnostics(self._header(), status))
+        self.diagnose(level, warning or 'ready', values)
 
-    def _header(self) -> Header:
-        return make_header(self._node.get_clock().now().nanoseconds)
+    def diagnose(self, level: bytes, message: str, values: Mapping[str, object]) -> None:
+        """Publishes `/diagnostics` as they are given."""
+        self._publish(self._diagnostics, '', level, message, values)
 
-
-def status_name(node: Node) -> str:
-    """Returns the node's name in diagnostics: with its namespace, without the first slash."""
-    return node.get_fully_qualified_name().lstrip('/')
+    def _publish(
+        self,
+        publisher: Publisher,
+        suffix: str,
+        level: bytes,
+        message: str,
+        values: Mapping[str, object],
+    ) -> None:
+        node = self._node
+        # in diagnostics a node has its namespace in its name, without the first slash
+        name = f'{node.get_fully_qualified_name().lstrip("/")}{suffix}'
+        status = to_status(name, self.hardware_id, level, message, values)
+        header = make_header(node.get_clock().now().nanoseconds)
+        publisher.publish(to_diagnostics(header, status))
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Publisher:

@@ -101,7 +101,7 @@ def _job(number: int) -> int:
 
 def worker(folder: Path, one: Signal) -> None:
     """Two workers do eight jobs."""
-    from mtv_world_ros.parallel import run_all
+    from mtv_world_ros.processes import run_all
 
     assert len(list(run_all(list(range(8)), _make_job, 2))) == 8
 

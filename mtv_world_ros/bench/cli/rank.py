@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING
 
 from mtv_world_ros.bench.cli.physics_option import add_physics, physics_text
 from mtv_world_ros.cli.shared_options import (
-    add_checkpoint,
-    add_describer,
-    add_dtype,
-    add_model_options,
-    add_overwrite,
-    add_segmenter,
-    add_serving,
+    add_options,
     add_watch,
     check_model,
     pipeline_choices,
@@ -115,13 +109,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     add_watch(parser, 'rates so far and every rollout that has ended')
     add_physics(parser)
-    add_overwrite(parser)
-    add_checkpoint(parser)
-    add_dtype(parser)
-    add_model_options(parser)
-    add_describer(parser)
-    add_segmenter(parser)
-    add_serving(parser)
+    add_options(parser, 'overwrite checkpoint dtype model describer segmenter serving')
     parser.set_defaults(handler=_rank, steps=1)
 
 

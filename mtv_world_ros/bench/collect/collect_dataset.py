@@ -48,7 +48,7 @@ from mtv_world_ros.bench.tasks.tasks import Task, tasks_named
 from mtv_world_ros.bench.world.opengl import load_mujoco
 from mtv_world_ros.bench.world.zero_shot import kinds_named
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.parallel import run_all
+from mtv_world_ros.processes import run_all
 from mtv_world_ros.rendering.images import encode_png
 
 #: episodes between two writings of the card

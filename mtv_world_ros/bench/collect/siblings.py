@@ -24,7 +24,7 @@ from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import PolicyError, SimulatorError
 from mtv_world_ros.files import write_json
-from mtv_world_ros.parallel import run_all
+from mtv_world_ros.processes import run_all
 
 #: what the search found, in the folder of the data set
 SIBLINGS_FILE = 'siblings.json'

@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
-    add_dtype,
-    add_model_options,
-    add_overwrite,
-    add_seeds,
-    add_segmenter,
-    add_serving,
-    add_task,
+    add_options,
     check_model,
     pipeline_choices,
     provenance,
@@ -59,7 +53,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episodes', type=int, help='use only so many')
     parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
-    add_seeds(parser)
+    add_options(parser, 'seeds')
     parser.add_argument(
         '--l2', type=float, default=1.0, help='strength of the prior on the weights'
     )
@@ -69,12 +63,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action='store_false',
         help='write the report only; do not change the checkpoint',
     )
-    add_overwrite(parser)
-    add_dtype(parser)
-    add_model_options(parser)
-    add_serving(parser)
-    add_segmenter(parser)
-    add_task(parser)
+    add_options(parser, 'overwrite dtype model serving segmenter task')
     parser.set_defaults(handler=_calibrate)
 
 

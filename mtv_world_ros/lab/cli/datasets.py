@@ -7,7 +7,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_describer
+from mtv_world_ros.cli.shared_options import add_options
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import BagMapping
@@ -59,7 +59,7 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _add_objects(parser: argparse.ArgumentParser) -> None:
-    add_describer(parser)
+    add_options(parser, 'describer')
     parser.add_argument(
         '--segmenter',
         choices=('auto', 'colour', 'sam2', 'sam3'),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_checkpoint, add_model_options, add_overwrite
+from mtv_world_ros.cli.shared_options import add_options
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -15,9 +15,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episode', type=Path, help='default: the bundled one')
     parser.add_argument('--out', type=Path, default=Path('out/demo'))
-    add_overwrite(parser)
-    add_checkpoint(parser)
-    add_model_options(parser)
+    add_options(parser, 'overwrite checkpoint model')
     parser.set_defaults(handler=_demo)
 
 

@@ -11,15 +11,7 @@ import sys
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
-    add_describer,
-    add_dtype,
-    add_model_options,
-    add_overwrite,
-    add_seeds,
-    add_segmenter,
-    add_serving,
-    add_source,
-    add_task,
+    add_options,
     check_model,
     names,
     pipeline_choices,
@@ -97,15 +89,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
     parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
-    add_overwrite(parser)
-    add_dtype(parser)
-    add_model_options(parser)
-    add_serving(parser)
-    add_seeds(parser)
-    add_describer(parser)
-    add_segmenter(parser)
-    add_source(parser)
-    add_task(parser)
+    add_options(parser, 'overwrite dtype model serving seeds describer segmenter source task')
     parser.set_defaults(handler=_evaluate)
 
 
@@ -294,7 +278,7 @@ def _add_report(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, help="HTML file; default: the evaluation's report.html, written anew"
     )
-    add_overwrite(parser)
+    add_options(parser, 'overwrite')
     parser.set_defaults(handler=_report)
 
 

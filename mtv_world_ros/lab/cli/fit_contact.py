@@ -6,7 +6,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_overwrite, names
+from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.files import check_free
 
 
@@ -38,7 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
     parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
     parser.add_argument('--threads', type=int, default=0, help='that foresee; 0 = all but one')
-    add_overwrite(parser)
+    add_options(parser, 'overwrite')
     parser.set_defaults(handler=_fit)
 
 
@@ -61,7 +61,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.lab.training.object_motion.response_fit import found_response
     from mtv_world_ros.lab.training.training_run import find_episodes, spread
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.parallel import threads_each
+    from mtv_world_ros.processes import threads_each
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_overwrite, names
+from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--futures', type=int, default=16)
     parser.add_argument('--picture', type=Path, metavar='PNG', help='draw the first future')
-    add_overwrite(parser)
+    add_options(parser, 'overwrite')
     parser.set_defaults(handler=_foresee)
 
 
@@ -61,7 +61,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import first_settings
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.parallel import threads_each
+    from mtv_world_ros.processes import threads_each
 
     robot = load_robot(robot_path(arguments.robot))
     threads, count = threads_each(1), {'num_motions': arguments.futures}

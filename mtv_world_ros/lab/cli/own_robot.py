@@ -11,7 +11,7 @@ import sys
 import tempfile
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_source, names
+from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def _add_doctor(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--views', type=names, help='comma-separated; default: all; needed with --live'
     )
-    add_source(parser)
+    add_options(parser, 'source')
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
     parser.set_defaults(handler=_doctor)
@@ -330,7 +330,7 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
         'recorded',
     )
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
-    add_source(parser)
+    add_options(parser, 'source')
     parser.add_argument(
         '--between',
         type=_interval,

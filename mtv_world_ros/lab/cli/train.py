@@ -11,7 +11,7 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_describer, add_dtype, add_segmenter, add_source
+from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
         'share it',
     )
-    add_source(parser)
+    add_options(parser, 'source')
     add_run_options(parser)
     parser.add_argument(
         '--data-workers',
@@ -103,9 +103,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
-    add_describer(parser)
-    add_segmenter(parser)
-    add_dtype(parser)
+    add_options(parser, 'describer segmenter dtype')
     parser.add_argument(
         '--threads',
         type=int,
@@ -189,7 +187,7 @@ def use_threads(arguments: argparse.Namespace) -> None:
 
     import torch
 
-    from mtv_world_ros.parallel import threads_each
+    from mtv_world_ros.processes import threads_each
 
     processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     torch.set_num_threads(arguments.threads or threads_each(processes))

@@ -31,8 +31,8 @@ from mtv_world_ros.lab.evaluation.references import round_trip
 from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
-from mtv_world_ros.parallel import score_all, threads_each
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.processes import score_all, threads_each
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.jaccard import mean_of_known
 

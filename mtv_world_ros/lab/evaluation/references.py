@@ -13,9 +13,7 @@ from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data_types import (
     ByteArray,
     FloatArray,
-    History,
     JointTrajectory,
-    WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, nearest, RobotError
 from mtv_world_ros.geometry.robot.model import RobotModel, Tool
@@ -174,29 +172,6 @@ def _commanding(recording: Recording, positions: FloatArray) -> Recording:
         joint_names=commands.joint_names, times=commands.times, positions=positions
     )
     return replace(recording, commands=other)
-
-
-class PersistenceWorldModel:
-    """Predicts that nothing ever changes: repeats the start frame."""
-
-    def __init__(self, spec: WorldModelSpec) -> None:
-        self.spec = spec
-
-    def predict(
-        self,
-        start_frame: ByteArray,
-        trajectory_frames: ByteArray,
-        *,
-        positions: FloatArray,
-        seed: int,
-        num_inference_steps: int,
-        should_stop: Callable[[], bool],
-        history: History | None = None,
-    ) -> ByteArray:
-        """Returns the start frame T times; see `pipeline.WorldModel.predict`."""
-        del positions, seed, num_inference_steps, should_stop, history
-        num_frames = trajectory_frames.shape[1] - 1
-        return np.repeat(start_frame[:, None], num_frames, axis=1)
 
 
 def round_trip(world_model: WorldModel) -> Reconstruct | None:

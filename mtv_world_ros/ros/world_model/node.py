@@ -76,7 +76,7 @@ class WorldModelNode(LifecycleNode):
         self._error = None
         try:
             pipeline = self._load(self._settings)
-            self._reporter.robot_name = pipeline.robot.name
+            self._reporter.name_robot(pipeline.robot.name)
             self._rollouts = Rollouts(self, pipeline, self.settings, self._reporter)
             parameters.refuse_unknown(self)
         except Exception as error:

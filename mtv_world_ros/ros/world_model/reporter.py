@@ -9,16 +9,14 @@ import time
 import traceback
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 from mtv_world_ros.data_types import SuccessEstimate
-from mtv_world_ros.ros.messages.conversions import make_header, to_diagnostics, to_status
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.status_publisher import create_publisher, status_name
+from mtv_world_ros.ros.status_publisher import StatusPublisher
 from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
 from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
@@ -45,9 +43,6 @@ _ERRORS = (Reason.OUT_OF_MEMORY, Reason.WORKER_STUCK, Reason.INTERNAL_ERROR)
 class Reporter:
     """Publishes reports and diagnostics.
 
-    Attributes:
-        robot_name: the hardware id, with the node's namespace before it; empty = not known yet.
-
     Args:
         node: owner of the publishers and the logger.
         settings: the present parameters.
@@ -62,11 +57,15 @@ class Reporter:
         state: Callable[[], Mapping[str, object]],
         missing: Callable[[], Sequence[str]],
     ) -> None:
-        self._node, self.robot_name = node, ''
+        self._node = node
         self._settings, self._state, self._missing = settings, state, missing
         self._tally = Tally()
-        self._report = create_publisher(node, DiagnosticArray, '~/report', REPORTS_KEPT)
-        self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
+        self._status = StatusPublisher(node, 'rollout', REPORTS_KEPT)
+        self.name_robot('')
+
+    def name_robot(self, name: str) -> None:
+        """Sets the hardware id: a robot's name behind the node's namespace."""
+        self._status.hardware_id = f'{self._node.get_namespace()}/{name}'.strip('/')
 
     def count(self, what: str) -> None:
         """Counts something that is no rejection."""
@@ -168,7 +167,7 @@ class Reporter:
         num_policies, missing = int(str(state['policies'])), self._missing()
         level, message = self._tally.level(now_s, num_policies=num_policies, missing=missing)
         values = {**state, **self._tally.values(now_s)}
-        self._publish(self._diagnostics, '', level, message, values)
+        self._status.diagnose(level, message, values)
 
     def _add_seconds(self, values: Mapping[str, object]) -> None:
         """Keeps the durations for `/diagnostics`."""
@@ -183,22 +182,7 @@ class Reporter:
     def _publish_report(
         self, state: str, values: Mapping[str, object], level: bytes | None = None
     ) -> None:
-        level = level or _LEVELS.get(state, DiagnosticStatus.OK)
-        self._publish(self._report, ': rollout', level, state, {'state': state, **values})
-
-    def _publish(
-        self,
-        publisher: Publisher,
-        suffix: str,
-        level: bytes,
-        message: str,
-        values: Mapping[str, object],
-    ) -> None:
-        name = f'{status_name(self._node)}{suffix}'
-        hardware_id = f'{self._node.get_namespace()}/{self.robot_name}'.strip('/')
-        status = to_status(name, hardware_id, level, message, values)
-        header = make_header(self._node.get_clock().now().nanoseconds)
-        publisher.publish(to_diagnostics(header, status))
+        self._status.report(state, values, level or _LEVELS.get(state, DiagnosticStatus.OK))
 
 
 class Tally:

@@ -16,7 +16,6 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory, Wo
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
@@ -30,6 +29,16 @@ INSTRUCTION = 'place the red block to the left of the blue block'
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5, num_frames=4, width=64, height=48, robot='yam_bimanual'
 )
+
+
+class PersistenceWorldModel:
+    """Predicts that nothing ever changes: repeats the start frame T times."""
+
+    def __init__(self, spec):
+        self.spec = spec
+
+    def predict(self, start_frame, trajectory_frames, **_):
+        return np.repeat(start_frame[:, None], trajectory_frames.shape[1] - 1, axis=1)
 
 
 def camera(view: str) -> CameraModel:

@@ -6,13 +6,10 @@ Shape letters: B batch, V views, T frames, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-import multiprocessing
-import os
-from threading import Thread
-import time
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -32,7 +29,7 @@ from mtv_world_ros.lab.training.clips.clip_controls import (
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.actions import ActionEncoding, collate
-from mtv_world_ros.parallel import WorkerWatch
+from mtv_world_ros.processes import run_job, WorkerPool
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -268,8 +265,6 @@ def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> B
 #: makes the clip of a step and a number
 MakeClip = Callable[[int, int], Any]
 
-_make_clip: MakeClip | None = None
-
 
 class ClipWorkers:
     """Makes clips in worker processes, forked so that they share the recordings.
@@ -280,13 +275,7 @@ class ClipWorkers:
     """
 
     def __init__(self, make_clip: MakeClip, count: int) -> None:
-        self._pool = ProcessPoolExecutor(
-            count,
-            mp_context=multiprocessing.get_context('fork'),  # nothing is copied or pickled
-            initializer=_begin,
-            initargs=(make_clip, os.getpid()),
-        )
-        self._watch = WorkerWatch(self._pool)
+        self._pool = WorkerPool(partial(_on_one_thread, make_clip), count, method='fork')
 
     def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
         """Returns the clips of a step.
@@ -295,7 +284,7 @@ class ClipWorkers:
             TrainingError: a process was killed.
         """
         try:
-            return list(self._pool.map(_run, [step] * len(numbers), numbers))
+            return list(self._pool.map(run_job, [step] * len(numbers), numbers))
         except BrokenProcessPool as error:
             raise TrainingError(
                 f'a process that prepares clips was killed at step {step}, perhaps for memory '
@@ -306,25 +295,8 @@ class ClipWorkers:
     def close(self) -> None:
         """Ends the processes."""
         self._pool.shutdown(cancel_futures=True)
-        self._watch.close()
 
 
-def _begin(make_clip: MakeClip, parent: int) -> None:
-    global _make_clip
-    _make_clip = make_clip
-    # thread pools do not survive a fork, and the processes are the parallelism
-    cv2.setNumThreads(0)
-    torch.set_num_threads(1)
-    Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
-    """Ends this worker when the training process was killed."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
-def _run(step: int, number: int) -> Any:
-    assert _make_clip is not None
-    return _make_clip(step, number)
+def _on_one_thread(make_clip: MakeClip) -> MakeClip:
+    torch.set_num_threads(1)  # thread pools do not survive a fork
+    return make_clip

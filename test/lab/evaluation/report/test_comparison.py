@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.lab.evaluation.references import PersistenceWorldModel
 from mtv_world_ros.lab.evaluation.report.comparison import (
     lines,
     method_table,
