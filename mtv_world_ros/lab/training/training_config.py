@@ -131,7 +131,7 @@ class AugmentConfig(Schema):
 
 
 class HistoryConfig(HistorySettings):
-    """How clips are shown what came before them; see `clips/past.py`."""
+    """How clips are shown what came before them; see `clips/clip_controls.py`."""
 
     max_noise: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.3,

@@ -44,7 +44,7 @@ class ClipBatch:
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         actions: output of `ActionEncoding`, where actions are not drawn.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
-            history; see `past.py`.
+            history; see `draw_past`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
         history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
         step: of the training, from 0.
