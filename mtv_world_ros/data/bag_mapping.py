@@ -74,7 +74,7 @@ class BagMapping(Schema):
     robot_description: str = 'robot_description'
     tf_prefix: str = Field(default='', description='of frame names in TF, removed')
     instruction_topic: str = 'instruction'
-    instruction: str = Field(default='', description='what the robot is told; empty = the topic')
+    instruction: str = Field(default='', description='of the robot; empty = the topic')
     task: str = ''
     outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
     objects: ListOf[str] = ()

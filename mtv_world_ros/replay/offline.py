@@ -70,14 +70,14 @@ class ReplaySummary:
         return self.video_s / self.model_s if self.model_s else float('nan')
 
     def __str__(self) -> str:
-        told = ', '.join(
+        estimates = ', '.join(
             'abstains' if np.isnan(value) else f'{value:.2f}' for value in self.probabilities
         )
         counts = f'{self.num_trajectories} trajectories, {self.num_chunks} chunks'
         lines = [
             f'{counts}, {self.num_frames} frames a view -> {self.out}',
             f'{self.model_s:.1f} s of computing, real-time factor {self.real_time_factor:.2f}',
-            f'success estimates: {told}',
+            f'success estimates: {estimates}',
             *(f'rejected at {stamp / 1e9:.3f} s: {why}' for stamp, why in self.rejected),
             *(f'warning: {text}' for text in self.warnings),
         ]
@@ -145,8 +145,8 @@ def replay_offline(
                 before = starts[index - 1] if index else stamp
                 for seen in _seen_between(episode, pipeline, before, stamp, limits):
                     observed.see(seen)
-                told = instruction_at(episode, stamp)
-                imagined = observed.begin(observation, instruction=told, objects=stored)
+                text = instruction_at(episode, stamp)
+                imagined = observed.begin(observation, instruction=text, objects=stored)
                 imagined.seed = seed + 1000 * index
                 imagined.num_inference_steps = num_inference_steps
                 _write_rollout(writer, imagined.extend(shifted), summary, until, spec.fps)

@@ -142,7 +142,7 @@ class Settings(NodeSettings):
         'without.',
     )
     instruction: str = parameter(
-        '', 'What the robot is told until the topic `instruction` says so.'
+        '', 'The instruction until the topic `instruction` gives another.'
     )
     objects: Names = parameter(
         (),
@@ -163,7 +163,7 @@ class Settings(NodeSettings):
     least_goal_success: float = parameter(
         0.0,
         'Goals of `~/follow_joint_trajectory` whose success estimate is lower, or abstains, fail; '
-        '0 = the estimate is only told.',
+        '0 = the estimate is only reported.',
         (0.0, 1.0),
     )
     max_trajectory_age_s: float = parameter(

@@ -70,8 +70,8 @@ def _fit(arguments: argparse.Namespace) -> int:
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
     if response is None:
-        response, told = found_response(paths, Arms(robot, None).robot)
-        print(told)
+        response, report = found_response(paths, Arms(robot, None).robot)
+        print(report)
     arms = Arms(robot, response)
     for note in arms.notes:
         print(note)

@@ -206,11 +206,11 @@ def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
             f'{view:8} moving objects: J {_number(means["j_moving"])}, first frame held '
             f'{_number(means["j_copy_moving"])}; all objects: J {_number(means["j_object_mean"])}'
         )
-    told = ', '.join(
+    estimates = ', '.join(
         'abstains' if value is None else f'{value:.2f}' for value in report['success_by_chunk']
     )
     lines.append(
-        f'success estimate after each chunk: {told} (recorded outcome: {report["outcome"]})'
+        f'success estimate after each chunk: {estimates} (recorded outcome: {report["outcome"]})'
     )
     latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
     leads = ', '.join(f'{value:.2f}' for value in report['lead_s'])

@@ -276,7 +276,7 @@ class TrainingConfig(Schema):
 
 
 class TrainingRun(Schema):
-    """A training: what `mtv-world train` is told."""
+    """A training as a whole: preset, data, device, saving."""
 
     section: ClassVar = ''
 

@@ -16,7 +16,7 @@ class PolicySettings(NodeSettings):
     mode: Mode = parameter(
         'imagine', 'Later observations: `imagine` = predictions, `observe` = cameras.'
     )
-    instruction: str = parameter('', 'What the policy is told.')
+    instruction: str = parameter('', 'The instruction that the policy gets.')
     task: str = parameter('', 'Task of the scene, for policies that know it (scripted).')
     scene_seed: int = parameter(-1, 'Seed of the scene, for the same; -1 = none.', (-1, 2**62))
     recording: str = parameter('', 'Episode folder, for policies that repeat it (recorded).')

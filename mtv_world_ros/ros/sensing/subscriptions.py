@@ -144,10 +144,10 @@ class MatchedSubscription:
         prefix = f'qos_overrides.{self.topic}.subscription'
 
         def declare(name: str, value: object, text: str) -> Any:
-            told = ParameterDescriptor(description=f'{text} of {self.topic}', read_only=True)
+            descriptor = ParameterDescriptor(description=f'{text} of {self.topic}', read_only=True)
             if node.has_parameter(f'{prefix}.{name}'):  # a lifecycle node is configured again
                 return node.get_parameter(f'{prefix}.{name}').value
-            return parameters.declare_one(node, f'{prefix}.{name}', value, told)
+            return parameters.declare_one(node, f'{prefix}.{name}', value, descriptor)
 
         words = ', '.join(_RELIABILITIES)
         choice = declare('reliability', default, f'{words}: reliability of the subscription')

@@ -190,21 +190,21 @@ class FollowJointTrajectory:
 
     def _outcome(self, goal: Goal, ended: Ended) -> tuple[str, str, str]:
         """The goal's last event, the name of its code, and why in words."""
-        told = _verdict(ended)
+        verdict = _verdict(ended)
         if goal.violation:
             code, text = goal.violation
-            return 'abort', code, f'{text}; {told}'
+            return 'abort', code, f'{text}; {verdict}'
         if ended.state == 'done':
             least = self._settings().least_goal_success
             probability = ended.last.prediction.success.probability if ended.last else float('nan')
             if least and not probability >= least:
                 text = f"'least_goal_success' asks for {least:g}"
-                return 'abort', 'GOAL_TOLERANCE_VIOLATED', f'{told}; {text}'
-            return 'succeed', 'SUCCESSFUL', told
+                return 'abort', 'GOAL_TOLERANCE_VIOLATED', f'{verdict}; {text}'
+            return 'succeed', 'SUCCESSFUL', verdict
         why = ended.text or _WHY.get(ended.state, ended.state)
         if goal.handle.is_cancel_requested:
-            return 'canceled', 'SUCCESSFUL', f'{why}; {told}'
-        return 'abort', _code(ended.reason), f'{why}; {told}'
+            return 'canceled', 'SUCCESSFUL', f'{why}; {verdict}'
+        return 'abort', _code(ended.reason), f'{why}; {verdict}'
 
     def _conclude(self, goal: Goal, event: str, code: str, text: str) -> None:
         result = self._action.Result(error_code=getattr(self._action.Result, code))

@@ -69,8 +69,8 @@ class Sample:
     @property
     def as_unforeseen(self) -> Sample:
         """The same with nothing foreseen; empty where pictures do not tell."""
-        told = isfinite(self.resumed.get('margin', nan))
-        return replace(self, features=({**self.resumed, 'foreseen': nan} if told else {},))
+        is_judged = isfinite(self.resumed.get('margin', nan))
+        return replace(self, features=({**self.resumed, 'foreseen': nan} if is_judged else {},))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,10 +167,10 @@ def calibrate(
             of_others = _fits_without(others, groups, segmenter, l2)
             judgements[name] = _judged_by(of_others, others)
     if UNFORESEEN in judgements:
-        told = _judged_by(fits, [sample.as_resumed for sample in samples])
+        resumed = _judged_by(fits, [sample.as_resumed for sample in samples])
         judgements[RESUMED] = tuple(
             one if isfinite(sample.resumed.get('foreseen', nan)) else other
-            for sample, one, other in zip(samples, told, judgements[UNFORESEEN], strict=True)
+            for sample, one, other in zip(samples, resumed, judgements[UNFORESEEN], strict=True)
         )
     scores = {name: agreement(found) for name, found in judgements.items()}
     calibration = Calibration(**fitted, **special, scores=scores, made=dict(made or {}))

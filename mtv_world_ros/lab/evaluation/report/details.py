@@ -216,8 +216,8 @@ def episodes(evaluations: Sequence[Evaluated]) -> list[tuple[Mark | None, Table]
         for name in sorted(found.results, key=lambda n: (by_key['j_moving'].get(n, 2.0), n)):
             result = found.results[name]
             numbers = [number(by_key[key].get(name)) for key in keys]
-            told = number(result.probability) if isfinite(result.probability) else 'abstains'
-            rows.append([name, result.task, result.outcome, *numbers, told])
+            estimate = number(result.probability) if isfinite(result.probability) else 'abstains'
+            rows.append([name, result.task, result.outcome, *numbers, estimate])
         tables.append((mark(index, evaluations), Table(head=head, rows=rows, num_labels=3)))
     return tables
 

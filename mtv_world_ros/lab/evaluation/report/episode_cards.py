@@ -167,7 +167,9 @@ def _rows(name: str, evaluations: Sequence[Evaluated], key: str) -> list[dict[st
                 f'{view} {number(episode_means(result.rows, view)[key])}'
                 for view in evaluations[index].views
             ],
-            'told': number(result.probability, 2) if isfinite(result.probability) else 'abstains',
+            'estimate': number(result.probability, 2)
+            if isfinite(result.probability)
+            else 'abstains',
             'reasons': '; '.join(result.reasons),
             'objects': '; '.join(
                 f'{row.view} {row.name}: {row.status}'
