@@ -43,7 +43,7 @@ from mtv_world_ros.assembly import (
     robot_path,
 )
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
-from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+from mtv_world_ros.data.splits import refuse_test_kinds
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path

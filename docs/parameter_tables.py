@@ -10,7 +10,7 @@ import re
 
 from mtv_world_ros.config import Schema
 from mtv_world_ros.ros.parameters import is_read_only, Settings, shown_default, valid_values
-from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+from mtv_world_ros.ros.policy.loop import PolicySettings
 
 NODES: dict[str, type[Schema]] = {'world_model': Settings, 'policy': PolicySettings}
 PAGES = ('parameters.md', 'policies.md')

@@ -3,10 +3,10 @@ import shutil
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data import recorded_policies
+from mtv_world_ros.data import splits
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data.recorded_policies import recorded_kinds, refuse_test_kinds
+from mtv_world_ros.data.splits import recorded_kinds, refuse_test_kinds
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.lab.cli.calibrate import result_kinds
 from mtv_world_ros.lab.evaluation.evaluate_episodes import make_jobs
@@ -74,7 +74,7 @@ def test_an_episode_says_its_split_itself_and_no_simulator_is_asked(tmp_path, mo
         ) as writer:  # fmt: skip
             writer.outcome = 'failure'
             writer.write_instruction(1_700_000_000_000_000_000)
-    monkeypatch.setattr(recorded_policies, 'policy_kind', None)
+    monkeypatch.setattr(splits, 'policy_kind', None)
     refuse_test_kinds([tmp_path / '0', tmp_path / '1'], 'training')
     with pytest.raises(PolicyError, match='split test are not for training: .*unheard_of-2'):
         refuse_test_kinds([tmp_path / name for name in '012'], 'training')

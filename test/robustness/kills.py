@@ -32,7 +32,7 @@ from rosbags.highlevel import AnyReader
 
 from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.ros.bags.raw_headers import read_stamp
+from mtv_world_ros.ros.messages.conversions import read_stamp
 
 sys.path.insert(0, str(ROOT / 'test' / 'ros'))
 

@@ -130,7 +130,7 @@ def call(case: Any, _: Any) -> None:
     from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.ros import parameters
     from mtv_world_ros.ros.parameters import Settings
-    from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+    from mtv_world_ros.ros.policy.loop import PolicySettings
 
     kind, service, rows = case
     node = _node(kind)

@@ -12,7 +12,7 @@ import yaml
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.ros.parameters import descriptor, Settings
-from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+from mtv_world_ros.ros.policy.loop import PolicySettings
 
 
 def test_parameter_file_holds_every_parameter_with_its_default():

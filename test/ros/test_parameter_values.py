@@ -10,7 +10,7 @@ NODE = """
 import sys
 from rclpy.node import Node
 from mtv_world_ros.ros import parameters
-from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+from mtv_world_ros.ros.policy.loop import PolicySettings
 from mtv_world_ros.ros.run_node import run
 
 kind = {'world_model': parameters.Settings, 'policy': PolicySettings}[sys.argv[1]]
@@ -41,7 +41,7 @@ def lists(kind):
 @pytest.mark.parametrize('in_file', [False, True])
 def test_an_empty_list_is_an_empty_list(ros, tmp_path, in_file):
     from mtv_world_ros.ros.parameters import Settings
-    from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+    from mtv_world_ros.ros.policy.loop import PolicySettings
 
     asked = 0
     for node, kind in (('world_model', Settings), ('policy', PolicySettings)):

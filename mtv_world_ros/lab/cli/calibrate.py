@@ -76,7 +76,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     folder = checkpoint_path(arguments.checkpoint)
     _check_places(arguments, folder)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
-    from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.lab.evaluation.calibration.calibration_report import (
         write_calibration_report,
     )
@@ -127,7 +127,7 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
         EpisodeError: the metadata of an episode cannot be used.
         PolicyError: a policy has an unknown fault.
     """
-    from mtv_world_ros.data.recorded_policies import recorded_kinds
+    from mtv_world_ros.data.splits import recorded_kinds
     from mtv_world_ros.lab.evaluation.evaluate_episodes import result_names
 
     names = result_names(paths)

@@ -44,7 +44,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.foresight.arms import Arms
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,

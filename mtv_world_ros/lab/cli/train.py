@@ -149,7 +149,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     check_device(arguments.device)
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.data.recorded_policies import refuse_test_kinds
+    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.training_run import train
 

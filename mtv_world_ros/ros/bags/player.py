@@ -22,8 +22,15 @@ from rosgraph_msgs.msg import Clock
 
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.ros.bags.raw_headers import has_header, message_class, read_stamp, with_stamp
-from mtv_world_ros.ros.messages.conversions import NANO, to_stamp, values_of
+from mtv_world_ros.ros.messages.conversions import (
+    has_header,
+    message_class,
+    NANO,
+    read_stamp,
+    to_stamp,
+    values_of,
+    with_stamp,
+)
 from mtv_world_ros.ros.peers import Peers
 from mtv_world_ros.ros.qos_profiles import is_latched, LATCHED
 from mtv_world_ros.ros.run_node import run

@@ -20,7 +20,7 @@ from rclpy.utilities import remove_ros_args
 from mtv_world_ros.data.bag.metadata import Qos
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.ros.bags.raw_headers import (
+from mtv_world_ros.ros.messages.conversions import (
     has_header,
     message_class,
     MIN_STAMPED_BYTES,

@@ -24,8 +24,7 @@ from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.policy.loop import PolicyLoop, PredictedFrames
-from mtv_world_ros.ros.policy.policy_parameters import PolicySettings
+from mtv_world_ros.ros.policy.loop import PolicyLoop, PolicySettings, PredictedFrames
 from mtv_world_ros.ros.policy.policy_thread import Actor
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.run_node import run

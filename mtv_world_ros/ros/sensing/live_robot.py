@@ -19,7 +19,7 @@ from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data.transform_tree import Mount, STILL, TransformTree
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, RobotError
-from mtv_world_ros.geometry.robot.description import described_robot
+from mtv_world_ros.geometry.robot.file import described_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse, quaternion
 from mtv_world_ros.ros.messages.conversions import make_header, NANO

@@ -7,8 +7,7 @@ import pytest
 
 from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot.description import described_robot
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.file import described_robot, load_robot
 
 FILE = robot_path('yam_bimanual')
 YAM = load_robot(FILE)

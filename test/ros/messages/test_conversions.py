@@ -8,10 +8,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from mtv_world_ros.ros.bags.raw_headers import has_header, read_stamp, with_stamp
 from mtv_world_ros.ros.messages.conversions import (
+    has_header,
     make_header,
     NANO,
+    read_stamp,
     to_joint_state,
     to_multi_array,
     to_ns,
@@ -20,6 +21,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_status,
     to_trajectory,
     values_of,
+    with_stamp,
 )
 from mtv_world_ros.ros.messages.image_messages import (
     scale_camera_info,
