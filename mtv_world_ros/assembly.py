@@ -90,7 +90,7 @@ def robot_path(name: str | Path) -> Path:
     """Returns the YAML of a robot given by path or by the name of a bundled one.
 
     Raises:
-        ConfigError: neither.
+        ConfigError: no such file, and no bundled robot of this name.
     """
     path = bundled('robots', name, 'robot_file')
     if not path.is_file():
@@ -187,7 +187,7 @@ def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:
 
     Args:
         checkpoint: folder, or `bundled`.
-        robot: that is imagined.
+        robot: the robot that moves in the pictures.
     """
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 
@@ -289,7 +289,7 @@ def checkpoint_cameras(checkpoint: str | Path) -> Path:
     """Returns the default calibration that a checkpoint carries or, older ones, the robot's.
 
     Raises:
-        CalibrationError: there is none.
+        CalibrationError: neither the checkpoint nor the robot has one.
     """
     folder = checkpoint_path(checkpoint)
     carried = folder / ROBOT_FOLDER / CAMERAS
@@ -312,7 +312,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
     Args:
         name: YAML file, name of one in `config/policies`, or a scripted policy such as
             `expert-noise-0.02`.
-        robot: whose joints it moves.
+        robot: the robot that the policy moves.
 
     Raises:
         ConfigError, PolicyError: no such policy, or its file is wrong.

@@ -35,8 +35,8 @@ def wrong(what: str, says: str = ', must be', parts: int = 1) -> PydanticCustomE
     """Returns the error of a value: `what` is valid, e.g. `in [0, 1]`.
 
     Args:
-        what: is valid.
-        says: stands between the value and `what`, where a value is named by its quoted key.
+        what: the valid values in words.
+        says: text between the value and `what`, where a value is named by its quoted key.
         parts: number of keys of the value's path that are quoted.
     """
     return PydanticCustomError('expected', '{what}', {'what': what, 'says': says, 'parts': parts})
@@ -160,7 +160,7 @@ def validated(
     """Returns the model that plain values describe.
 
     Args:
-        kind: the model.
+        kind: class of the model.
         values: e.g. of a YAML file.
         where: beginning of the error text, e.g. the file.
         context: values that validators use, e.g. the robot.

@@ -752,9 +752,9 @@ class LazyFrames:
     """Frames that are decoded when asked for (`episode.Frames`).
 
     Args:
-        topic: of the messages, for error texts.
-        messages: the image messages.
-        decode: message to frame.
+        topic: name of the topic, for error texts.
+        messages: image messages of the topic.
+        decode: turns a message into a frame, (H, W, 3) uint8 RGB.
     """
 
     def __init__(

@@ -117,10 +117,10 @@ def check_plan_joints(plan: JointTrajectory, robot: RobotModel, tolerance: float
     Args:
         plan: of all joints, or of some of them.
         robot: the robot.
-        tolerance: by which limits may be exceeded [rad or m].
+        tolerance: how far outside of the limits a position may be [rad or m].
 
     Raises:
-        PlanError: as said.
+        PlanError: an unknown joint, or a position outside of its limits.
     """
     home = np.clip(0.0, robot.lower, robot.upper)
     try:

@@ -145,7 +145,7 @@ def of_physics(selection: Selection, physics: str | None = None) -> tuple[Select
     """Returns the episodes of one physics, and what is true in them, in words.
 
     Args:
-        selection: any episodes.
+        selection: episodes to choose from.
         physics: as `collect --physics` named it; None = all of them.
 
     Raises:

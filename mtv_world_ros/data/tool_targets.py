@@ -92,18 +92,18 @@ def add_tool_poses(
     by the measured positions of the row that follows.
 
     Args:
-        positions: to be changed.
-        measured: (T, J).
+        positions: (T, J) [rad or m]; the arm's columns are overwritten.
+        measured: (T, J) measured positions [rad or m].
         robot: the robot.
-        arm: whose tool it is.
+        arm: name of the arm.
         poses: frame, units and reference of the poses.
-        wanted: (T, 4, 4) poses or differences.
+        wanted: (T, 4, 4) commanded poses of the tool, or differences [m].
 
     Returns:
         How many poses are out of reach, in words; empty where none is.
 
     Raises:
-        EpisodeError: most of them are.
+        EpisodeError: most poses are out of reach.
     """
     tool = poses.check(arm, robot)
     solver, lost = ArmSolver(robot, tool), 0
@@ -166,9 +166,9 @@ def joints_of_tools(
     pose is reached at its own stamp, a difference at the stamp that follows.
 
     Args:
-        tools: by arm.
+        tools: commanded poses, by arm.
         robot: the robot.
-        states: measured positions.
+        states: measured joint positions.
         others: commands of the other joints; those that have none keep the measured positions.
 
     Raises:

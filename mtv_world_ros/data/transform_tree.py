@@ -313,7 +313,7 @@ class TransformTree:
         A breadth-first search that visits a frame once: frames in a circle end it, too.
 
         Args:
-            frame: the chain begins at it.
+            frame: where the search begins.
             only_still: leave out transforms that move.
             stamp_ns: when the poses are wanted [ns]; None = by the newest transforms.
         """

@@ -111,9 +111,9 @@ def lean(
     that fits the planes of all views; a round mask tells none.
 
     Args:
-        cameras: V of them.
-        T_base_camera: V of (4, 4).
-        masks: V of (H, W), not empty.
+        cameras: of the V views.
+        T_base_camera: pose of each camera, (4, 4) [m].
+        masks: of the object in each view, (H, W), not empty.
     """
     planes = np.array([_plane(*view) for view in zip(cameras, T_base_camera, masks, strict=True)])
     level, up = planes[:, :2], planes[:, 2]

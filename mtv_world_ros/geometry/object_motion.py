@@ -136,10 +136,10 @@ class TrackedObjects(Protocol):
 
         Args:
             positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
-            should_stop: asked all the time.
+            should_stop: True ends the computation; called often.
 
         Raises:
-            RolloutPreempted: `should_stop` said so.
+            RolloutPreempted: `should_stop` returned True.
         """
         ...
 
@@ -171,8 +171,8 @@ class ObjectMotionModel(Protocol):
             whole: what `find` returned on a frame in which nothing hid the objects.
             names: see `find`; so are the others.
             masks: of what is seen of them now.
-            cameras: V cameras.
-            poses: V of T_base_camera.
+            cameras: of the V views.
+            poses: T_base_camera of each view, (4, 4) [m].
 
         Returns:
             The objects; which of them (O,) are surely where they are said to be, as large as they
@@ -190,7 +190,7 @@ class FoundObjects:
     """The named objects as a real frame shows them, and where they are now.
 
     Attributes:
-        names: O of them.
+        names: of the O objects.
         cuts: (V, O, H, W, 4) `cut_outs` of the frame that shows each best, at the model's size.
         poses: (V, O, 4, 4) T_base_camera then.
         tracked: current poses of the objects.
@@ -282,10 +282,10 @@ class FoundObjects:
 
         Args:
             positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced.
-            should_stop: asked all the time.
+            should_stop: True ends the computation; called often.
 
         Raises:
-            RolloutPreempted: `should_stop` said so.
+            RolloutPreempted: `should_stop` returned True.
         """
         motions, tracked = self.tracked.advance(positions, should_stop)
         positions = positions[:: self.tracked.commands_a_step]

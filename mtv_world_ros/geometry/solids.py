@@ -59,10 +59,10 @@ class Solid:
     Attributes:
         centre: (3,) of its bounding box [m].
         size: (3,) along its own x, y and z [m].
-        yaw: about z [rad].
-        is_round: a cylinder.
-        is_open: at the top, and hollow.
-        is_hidden: in part, where it was found again.
+        yaw: rotation about z [rad].
+        is_round: it is a cylinder.
+        is_open: it is hollow, and open at the top.
+        is_hidden: something hid a part of it when it was found again.
         fills: (V,) how much of its outline its mask fills in each view, 0 = not seen.
         error_px: by how much its outline misses those of the masks, root mean square.
     """

@@ -82,7 +82,7 @@ def check_width(part: str, source: Path, config: Mapping[str, Any], expected: in
     """Checks that an encoder's tokens are as wide as the transformer takes them.
 
     Raises:
-        CheckpointError: they are not.
+        CheckpointError: the encoder has another width.
     """
     width = config['d_model' if part == 'text_encoder' else 'hidden_size']
     if width != expected:

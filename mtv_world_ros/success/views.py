@@ -129,7 +129,7 @@ class Views:
         """Refuses an object that has nearly vanished in every view that knows it.
 
         Raises:
-            CannotTell: it has.
+            CannotTell: it has nearly vanished in each of them.
         """
         masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         last = np.median(masks.sum((-2, -1)), axis=1)

@@ -106,7 +106,7 @@ def raw_to_rgb(
     Of 16 bits the upper 8 are taken.
 
     Raises:
-        ObservationError: as `check_raw`.
+        ObservationError: an unknown encoding, or too little data; see `check_raw`.
     """
     check_raw(encoding=encoding, height=height, width=width, step=step, num_bytes=len(data))
     channels, conversion = ENCODINGS[encoding]

@@ -20,9 +20,9 @@ class Recovered:
     """A bag that was made whole.
 
     Attributes:
-        source: the damaged one, which stays as it is.
-        path: the whole one.
-        num_messages: by topic.
+        source: the damaged bag, which stays as it is.
+        path: the recovered bag.
+        num_messages: number of messages by topic.
         seconds: from the first message to the last.
         lost: one line for each part that could not be read.
     """
@@ -38,7 +38,7 @@ def find_damaged(path: Path) -> list[Path]:
     """Bags to recover: `path` itself, the hidden folders of that name, or those in the folder.
 
     Raises:
-        EpisodeError: there is none.
+        EpisodeError: there is no bag to recover.
     """
     is_bag = path.is_file() or any(path.glob('*.mcap'))
     found = [path] if is_bag else []

@@ -38,7 +38,7 @@ def codec_of(encoding: str) -> str:
     """Returns the decoder of a packet's `encoding`, e.g. `h264_nvenc` or `h264;yuv420p;bgr8`.
 
     Raises:
-        ObservationError: there is none.
+        ObservationError: no decoder is known for it.
     """
     name = encoding.split(';')[0].strip().lower()
     for suffix in _HARDWARE:

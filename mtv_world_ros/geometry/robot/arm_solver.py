@@ -27,8 +27,8 @@ class ArmSolver:
 
     Args:
         robot: the robot.
-        tool: of the arm.
-        rest: its joints at rest; None = the first start.
+        tool: the tool that is brought to a pose.
+        rest: joint positions at rest [rad or m]; None = those where a search starts.
     """
 
     def __init__(self, robot: RobotModel, tool: Tool, rest: FloatArray | None = None) -> None:

@@ -16,7 +16,7 @@ class RobotMechanics:
     """Evaluates one configuration after the other.
 
     Args:
-        robot: of which.
+        robot: the robot.
     """
 
     def __init__(self, robot: RobotModel) -> None:

@@ -320,13 +320,13 @@ class _Setter:
     """Where Pinocchio keeps a joint, and which of the robot's it follows.
 
     Attributes:
-        joint: its number.
-        first: first of its numbers in a configuration.
-        velocity: its velocity's.
+        joint: number of the joint in Pinocchio's model.
+        first: index of its first entry in a configuration vector.
+        velocity: index of its entry in a velocity vector.
         endless: whether the joint turns without limits; its position is then cosine and sine.
-        column: of the robot's joint.
-        multiplier: of that.
-        offset: added.
+        column: of the robot's joint that it follows.
+        multiplier: factor of that joint's position.
+        offset: added to it [rad or m].
     """
 
     joint: int

@@ -120,7 +120,7 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
         mine: `seed`, `control` and `base` (a digest, or None) of this run.
 
     Raises:
-        TrainingError: it does not.
+        TrainingError: seed, control or base of the state differ from this run's.
     """
     trained = {'control': 'trajectory_video', 'base': None, **card}
     state = folder / STATE
