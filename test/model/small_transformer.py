@@ -6,6 +6,20 @@ import torch
 
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
+#: card of a checkpoint without what it was trained on
+CARD = {
+    'views': ['low', 'high'],
+    'fps': 5.0,
+    'num_frames': 4,
+    'width': 32,
+    'height': 32,
+    'robot': 'yam_bimanual',
+    'control': 'trajectory_video',
+    'object_mask': True,
+    'rendering': {},
+    'trained_on': {},
+}
+
 SMALL = {
     'patch_size': (1, 4, 4),
     'num_attention_heads': 2,

@@ -8,7 +8,7 @@ from pathlib import Path
 from diffusers import FlowMatchEulerDiscreteScheduler
 import numpy as np
 import pytest
-from small_transformer import build, inputs, SMALL
+from small_transformer import build, CARD, inputs, SMALL
 import torch
 
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
@@ -16,19 +16,6 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-
-CARD = {
-    'views': ['low', 'high'],
-    'fps': 5.0,
-    'num_frames': 4,
-    'width': 32,
-    'height': 32,
-    'robot': 'yam_bimanual',
-    'control': 'trajectory_video',
-    'object_mask': True,
-    'rendering': {},
-    'trained_on': {},
-}
 
 
 @pytest.fixture

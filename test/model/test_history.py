@@ -8,7 +8,7 @@ from typing import Any
 from diffusers import FlowMatchEulerDiscreteScheduler
 import numpy as np
 import pytest
-from small_transformer import build, inputs, PATCH, SMALL
+from small_transformer import build, CARD, inputs, PATCH, SMALL
 import torch
 from torch import Tensor
 
@@ -175,18 +175,6 @@ def test_an_unknown_start_image_is_refused() -> None:
         build(PATCH, start_image='none')
 
 
-CARD = {
-    'views': ['low', 'high'],
-    'fps': 5.0,
-    'num_frames': 4,
-    'width': 32,
-    'height': 32,
-    'robot': 'yam_bimanual',
-    'control': 'trajectory_video',
-    'object_mask': True,
-    'rendering': {},
-    'trained_on': {},
-}
 SETTINGS = {'num_frames': 4, 'noise_level': 0.1, 'reference': 'first_frame'}
 
 

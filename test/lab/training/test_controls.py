@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sources import make_source, with_batch_size
+from sources import make_source, ONE_STEP, with_batch_size
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
@@ -127,23 +127,8 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(
 def test_one_view_from_the_command_line_trains_and_evaluates(
     episode: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    tiny = [
-        f'--set={key}={value}'
-        for key, value in {
-            'transformer.num_attention_heads': 2,
-            'transformer.attention_head_dim': 12,
-            'transformer.ffn_dim': 32,
-            'transformer.num_layers': 1,
-            'transformer.stem_widths': [8, 16, 16],
-            'transformer.freq_dim': 16,
-            'video.width': 48,
-            'video.height': 40,
-            'optimizer.batch_size': 1,
-            'optimizer.steps': 1,
-        }.items()
-    ]
     out = tmp_path / 'run'
-    command = ['train', str(episode.parent), '--out', str(out), '--threads', '1', *tiny]
+    command = ['train', str(episode.parent), '--out', str(out), '--threads', '1', *ONE_STEP]
     options = ['--views', 'low', '--object-mask', 'off', '--control', 'ee_mlp']
     assert main([*command, *options, '--dtype', 'float32']) == 0
     card = json.loads((out / 'checkpoint' / 'world_model.json').read_text())

@@ -7,6 +7,7 @@ from pathlib import Path
 import shutil
 
 import pytest
+from sources import ONE_STEP
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
@@ -49,22 +50,9 @@ def test_the_command_scores_held_out_episodes_as_evaluate_does(
     (data / 'dataset.json').write_text(
         json.dumps({'splits': {'train': ['seen'], 'test': ['unseen']}})
     )
-    tiny = {
-        'transformer.num_attention_heads': 2,
-        'transformer.attention_head_dim': 12,
-        'transformer.ffn_dim': 32,
-        'transformer.num_layers': 1,
-        'transformer.stem_widths': [8, 16, 16],
-        'transformer.freq_dim': 16,
-        'video.width': 48,
-        'video.height': 40,
-        'optimizer.batch_size': 1,
-        'optimizer.steps': 1,
-    }
     out = tmp_path / 'run'
     command = ['train', str(data), '--out', str(out), '--threads', '1', '--dtype', 'float32']
-    command += [f'--set={key}={value}' for key, value in tiny.items()]
-    command += ['--sample-every', '5']
+    command += [*ONE_STEP, '--sample-every', '5']
     assert main([*command, '--split', 'all']) == 1
     assert 'would be trained on and held out' in capsys.readouterr().err
     assert main(command) == 0
