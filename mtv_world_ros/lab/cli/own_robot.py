@@ -13,9 +13,14 @@ from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.lab.cli.shared_camera import (
+    calibrate_shared,
+    is_shared,
+    read_for_checks,
+    robot_file,
+)
 
 if TYPE_CHECKING:
-    from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.data.episode import Episode, JointStates, Track
     from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot.model import RobotModel
@@ -222,38 +227,6 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     return _STATUS[inspection.verdict]
 
 
-def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
-    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
-    from mtv_world_ros.assembly import recorded_robot, robot_path
-    from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.data.episode_reader import read_info
-
-    source = load_source(arguments.topics, arguments.calibration)
-    name = arguments.robot or (source.mapping.robot if source.mapping else '')
-    return robot_path(name) if name else recorded_robot(path, read_info(path).robot), source
-
-
-def read_for_checks(
-    path: Path,
-    views: Sequence[str] | None,
-    source: EpisodeSource,
-    robot: RobotModel,
-    unknown_mount: str = '',
-) -> Episode:
-    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
-    from mtv_world_ros.data.episode_reader import read_episode
-
-    return read_episode(
-        path,
-        views=views,
-        calibration=source.calibration,
-        with_masks=False,
-        mapping=source.mapping,
-        robot=robot,
-        unknown_mount=unknown_mount,
-    )
-
-
 def _write_inspection(
     inspector: Inspector, episode: Episode, inspection: Inspection, out: Path
 ) -> None:
@@ -352,8 +325,6 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.lab.cli.shared_camera import calibrate_shared, is_shared
-
     if is_shared(arguments):
         return calibrate_shared(arguments)
     arguments.episode, arguments.view = arguments.episodes[0], arguments.views[0]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot.model import RobotModel
@@ -115,9 +116,40 @@ def _estimate(
         _write(arguments, estimate, episodes, robot, parts)
 
 
+def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
+    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
+    from mtv_world_ros.assembly import recorded_robot, robot_path
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.episode_reader import read_info
+
+    source = load_source(arguments.topics, arguments.calibration)
+    name = arguments.robot or (source.mapping.robot if source.mapping else '')
+    return robot_path(name) if name else recorded_robot(path, read_info(path).robot), source
+
+
+def read_for_checks(
+    path: Path,
+    views: Sequence[str] | None,
+    source: EpisodeSource,
+    robot: RobotModel,
+    unknown_mount: str = '',
+) -> Episode:
+    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
+    from mtv_world_ros.data.episode_reader import read_episode
+
+    return read_episode(
+        path,
+        views=views,
+        calibration=source.calibration,
+        with_masks=False,
+        mapping=source.mapping,
+        robot=robot,
+        unknown_mount=unknown_mount,
+    )
+
+
 def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
     from mtv_world_ros.geometry.robot.file import load_robot
-    from mtv_world_ros.lab.cli.own_robot import read_for_checks, robot_file
 
     paths = recordings(arguments.episodes)
     file, source = robot_file(arguments, paths[0])
