@@ -24,10 +24,10 @@ from mtv_world_ros.model.conditioning import (
 )
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.sampler import denoise, sample_latents
 from mtv_world_ros.model.serving import prepare, ServingOptions
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.model.world_model import denoise, sample_latents
 
 _IMAGE_TOKENS = 257
 #: of a stock Wan image-to-video transformer: noisy 16, mask 4, image 16

@@ -13,7 +13,7 @@ from torch import Tensor
 from mtv_world_ros.errors import CheckpointError, RolloutPreempted
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.parts import build_scheduler, Scheduler
-from mtv_world_ros.model.sampler import sample_latents, set_timesteps
+from mtv_world_ros.model.world_model import sample_latents, set_timesteps
 
 CLEAN = torch.linspace(-1, 1, 2 * 12 * 3 * 4 * 4).reshape(1, 2, 12, 3, 4, 4)
 EULER = {'_class_name': 'FlowMatchEulerDiscreteScheduler', 'shift': 5.0}
