@@ -120,7 +120,7 @@ def describe(robot: RobotModel) -> str:
 
 
 def _draw_robot(robot: RobotModel, path: Path) -> None:
-    from mtv_world_ros.lab.inspection.robot_picture import robot_picture
+    from mtv_world_ros.lab.inspection.pictures import robot_picture
     from mtv_world_ros.rendering.images import write_png
 
     write_png(path, robot_picture(robot))
