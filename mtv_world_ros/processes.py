@@ -21,7 +21,6 @@ from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.files import plain
 
 #: a stopped command tidies up for this long [s]
 _TIDY_S = 5.0
@@ -403,6 +402,8 @@ class _Scoring:
             self._score = _raising(error)
 
     def __call__(self, job: Any) -> Outcome:
+        from mtv_world_ros.files import plain  # yaml: signals are handled before it is imported
+
         try:
             return plain(self._score(job).as_json())
         except MtvWorldError as error:
