@@ -98,6 +98,23 @@ def test_a_mistyped_key_of_an_entry_is_named_with_the_nearest():
         validated(FaultKind, {**values, 'split': 'tests'}, 'a')
 
 
+@pytest.mark.parametrize(
+    ('steps', 'said'),
+    [
+        ({'edits': [{'edt': {}}]}, r"unknown step 'edt' \(did you mean 'edit'\?\)"),
+        ({'edits': [{'edit': {'phasse': []}}]}, "step 'edit' has no option 'phasse'"),
+        ({'edits': [{'insert': {'rows': [{'bye': {}}]}}]}, r"no option 'bye' \(did you mean 'by'"),
+        ({'commands': [{'delay': {'onli': ''}}]}, r"'onli' \(did you mean 'only'\?\)"),
+        ({'second_arm': {'too': ''}}, r"unknown key 'too' \(did you mean 'to'\?\)"),
+    ],
+)
+def test_a_mistyped_step_or_option_is_named_with_the_nearest(steps, said):
+    values = {'family': 'height', 'split': 'train', 'text': ''}
+    values |= {'size': {'typical': 0.1, 'largest': 1.0}}
+    with pytest.raises(ConfigError, match=said):
+        validated(FaultKind, {**values, **steps}, 'a')
+
+
 def test_lengths_are_numbers_the_size_or_a_line_over_it():
     for far, expected in ((0.03, 0.03), ('size', 0.2), ([0.01, -0.5], -0.09)):
         changed = after([{'edit': {'phases': ['grasp'], 'by': {'up': far}}}], 0.2)

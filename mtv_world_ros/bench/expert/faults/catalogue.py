@@ -6,15 +6,21 @@ The kinds are data, in `config/faults`. A policy's name says its faults and thei
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from inspect import signature
 from math import isfinite
 import re
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator
 
+from mtv_world_ros.bench.expert.faults.commands import COMMANDS
 from mtv_world_ros.bench.expert.faults.drawn import drawn_names, drawn_values, is_drawn
+from mtv_world_ros.bench.expert.faults.edits import PRIMITIVES, ROW
+from mtv_world_ros.bench.expert.faults.second_arm import SecondArm
 from mtv_world_ros.config import ListOf, Number, read_yaml, Schema, validated
 from mtv_world_ros.errors import nearest, PolicyError
 from mtv_world_ros.files import share_path
@@ -28,6 +34,23 @@ _FILES = (
     *('speed', 'joint', 'regrasp'),
 )
 Steps = ListOf[dict[str, dict[str, Any]]]
+
+
+def _known_steps(primitives: Mapping[str, Callable[..., Any]], steps: Steps) -> Steps:
+    """Refuses steps whose primitive does not exist, or does not have their options."""
+    for name, options in (item for step in steps for item in step.items()):
+        if name not in primitives:
+            raise ValueError(f"unknown step '{name}'{nearest(name, primitives)}")
+        parameters = signature(primitives[name]).parameters.values()
+        known = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} | {'scale'}
+        known |= {*ROW} if any(p.kind is p.VAR_KEYWORD for p in parameters) else set()
+        for row, keys in (
+            (options, known),
+            *((r, {*ROW, 'like'}) for r in options.get('rows', ())),
+        ):
+            for key in row.keys() - keys:
+                raise ValueError(f"step '{name}' has no option '{key}'{nearest(key, keys)}")
+    return steps
 
 
 class FaultSize(Schema):
@@ -74,9 +97,9 @@ class FaultKind(Schema):
     contact: bool = True
     needs: ListOf[Literal['gripper', 'two_arms']] = ()
     keeps_tempo: bool = False
-    edits: Steps = ()
-    second_arm: dict[str, Any] = {}
-    commands: Steps = ()
+    edits: Annotated[Steps, AfterValidator(partial(_known_steps, PRIMITIVES))] = ()
+    second_arm: SecondArm | None = None
+    commands: Annotated[Steps, AfterValidator(partial(_known_steps, COMMANDS))] = ()
 
 
 def _read() -> dict[str, FaultKind]:

@@ -28,8 +28,8 @@ _NUM_WRIST, _RESTS_M = 3, 1e-6
 #: length of a chunk of commands [s]; how often commands are lost
 _CHUNK_S, _NUM_LOST = 0.8, 3
 #: of arms that swing, as a share of the critical damping; times in which arms begin to swap their
-#: commands, and do [s]; periods of a wavy error over one turn of a joint
-_DAMPING, _SWAP_S, _NUM_WAVES = 0.2, (0.2, 0.4), 4
+#: commands, do, and end [s]; periods of a wavy error over one turn of a joint
+_DAMPING, _SWAP_S, _NUM_WAVES = 0.2, (0.2, 0.4, 0.2), 4
 #: time in which arms that give way sink, lie, and rise again [s]; period of waves on which all
 #: tools go up and down [s]; a step to find out which joint lowers the tool by how much [rad];
 #: squares of those that are too small to sink by [m2/rad2]
@@ -63,21 +63,17 @@ def _blended(before: FloatArray, rest: FloatArray, num: int) -> FloatArray:
 def delay(c: Commands, size: float, rng: Rng, *, only: str = '') -> FloatArray:
     """The grippers follow later [s]; `only` where they open: `opening`."""
     whole, late = c.delayed(c.num(size))
+    opens, follows = np.sign(c.travel), late[:, c.grippers]
     if only == 'opening':
-        opens = np.sign(c.travel)
-        both = np.stack([whole[:, c.grippers], late[:, c.grippers]]) * opens
-        whole[:, c.grippers] = both.min(axis=0) * opens
-    else:
-        whole[:, c.grippers] = late[:, c.grippers]
+        follows = np.minimum(whole[:, c.grippers] * opens, follows * opens) * opens
+    whole[:, c.grippers] = follows
     return whole
 
 
 def lead(c: Commands, size: float, rng: Rng) -> FloatArray:
     """The grippers go ahead of the arms [s]."""
     ahead = np.minimum(np.arange(len(c.positions)) + c.num(size), len(c.positions) - 1)
-    whole = c.positions.copy()
-    whole[:, c.grippers] = c.positions[ahead][:, c.grippers]
-    return whole
+    return c.grippers_of(c.positions[ahead][:, c.grippers])
 
 
 def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
@@ -92,17 +88,15 @@ def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
 
 def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
     """Grippers are at least as far open as a share of their range, by what happens to them."""
-    opens, whole = np.sign(c.travel), c.positions.copy()
+    opens = np.sign(c.travel)
     least = c.closed + np.minimum(size * GIVE_WAY[by](c), 1.0) * c.travel
-    both = np.stack([c.positions[:, c.grippers], least]) * opens
-    whole[:, c.grippers] = both.max(axis=0) * opens
-    return whole
+    return c.grippers_of(np.maximum(c.positions[:, c.grippers] * opens, least * opens) * opens)
 
 
 def _twitches(c: Commands) -> FloatArray:
     """(T, 1) from 0, which is most of the time, to 1."""
-    times = c.times % _TWITCH_EVERY_S
-    return np.interp(times, _JUMP_S * np.arange(4), [0.0, 1.0, 1.0, 0.0])[:, None]
+    knots = _JUMP_S * np.arange(4)
+    return np.interp(c.times % _TWITCH_EVERY_S, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
 
 
 def _haste(c: Commands) -> FloatArray:
@@ -382,8 +376,7 @@ def slip_one(c: Commands, size: float, rng: Rng) -> FloatArray:
     own, whole = _own(rng), c.positions.copy()
     joint = c.moving(own)
     first = int(own.uniform(*_ONCE) * len(whole))
-    since = np.maximum(np.arange(len(whole)) - first, 0) * c.period
-    whole[:, joint] += own.choice((-size, size)) * np.minimum(since / _JUMP_S, 1.0)
+    whole[:, joint] += own.choice((-size, size)) * c.ramp(_JUMP_S, c.times[first])
     return whole
 
 
@@ -397,11 +390,8 @@ def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def lose_one_way(c: Commands, size: float, rng: Rng) -> FloatArray:
     """An arm joint loses a share of its way to one side, drawn, and its error adds up."""
-    steps, sides = (
-        np.diff(c.positions, axis=0),
-        _own(rng).choice((-1.0, 1.0), c.positions.shape[1]),
-    )
-    whole = c.positions.copy()
+    sides = _own(rng).choice((-1.0, 1.0), c.positions.shape[1])
+    steps, whole = np.diff(c.positions, axis=0), c.positions.copy()
     whole[1:] -= np.cumsum(np.where(steps * sides > 0, size * steps, 0.0), axis=0)
     return c.arms_of(whole)
 
@@ -431,9 +421,7 @@ def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
 def sink_once(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Once, all tools sink by the size [m], and rise again."""
     share = float(_own(rng).uniform(*_ONCE))
-    since = (np.arange(len(c.positions)) - share * len(c.positions)) * c.period
-    shape = np.interp(since, np.cumsum([0.0, *_SLUMP_S]), [0.0, 1.0, 1.0, 0.0])
-    return _lowered(c, size * shape)
+    return _lowered(c, size * c.pulse(share * len(c.positions), *_SLUMP_S))
 
 
 def heave(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -474,10 +462,8 @@ def warp(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Once, the arms take a share of each other's commands."""
-    (begins, lasts), first = _SWAP_S, int(float(_own(rng).uniform(0.1, 0.9)) * len(c.positions))
-    knots = np.cumsum([0.0, begins, lasts, begins])
-    times = (np.arange(len(c.positions)) - first) * c.period
-    weights = size * np.interp(times, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
+    first = int(float(_own(rng).uniform(0.1, 0.9)) * len(c.positions))
+    weights = size * c.pulse(first, *_SWAP_S)[:, None]
     others = c.positions[0] + crossed(c.positions, c.positions.shape[1] // c.num_arms)
     return c.positions + weights * (others - c.positions)
 
@@ -594,9 +580,8 @@ def tempo(c: Commands, size: float, rng: Rng, *, faster: bool) -> FloatArray:
 
 def opening_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
     """A slow error of how far the grippers open, as a share of their range."""
-    added, whole = _slow_noise(c, size, rng)[:, c.grippers], c.positions.copy()
-    whole[:, c.grippers] += added * c.travel
-    return whole
+    added = _slow_noise(c, size, rng)[:, c.grippers] * c.travel
+    return c.grippers_of(c.positions[:, c.grippers] + added)
 
 
 def stop(c: Commands, size: float, rng: Rng) -> FloatArray:

@@ -14,101 +14,20 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.bench.expert.faults.edited_move import By, EditedMove
 from mtv_world_ros.bench.expert.faults.random_edits import RANDOM_EDITS
-from mtv_world_ros.bench.expert.faults.surroundings import PLACES, WAYS
 from mtv_world_ros.bench.expert.way_points import Draws, Stops, WayPoint
-from mtv_world_ros.data_types import FloatArray
 
 #: a program of `config/faults`: steps of one primitive and its options
 Program = Sequence[Mapping[str, Mapping[str, Any]]]
-By = Mapping[str, Any]
 #: half a finger and half a small object lie between the tool and the object's centre [m]
 _BEHIND_M, _SHORT_M = 0.07, 0.03
 _KEPT: Any = object()
+#: options of a row: what `changed` takes
+ROW = ('place', 'by', 'phase', 'seconds', 'opening', 'yaw', 'lean')
 
 
-class Move:
-    """A move under edit: its way points, and what a program refers to by name.
-
-    Attributes:
-        stops: its way points.
-        size: of the fault.
-        draws: what is drawn for the move.
-        end: behind the way points that were inserted last.
-        there, home: way points of a second arm: where it works, and where it rests.
-    """
-
-    def __init__(self, stops: Stops, size: float, draws: Draws) -> None:
-        self.stops, self.size, self.draws = list(stops), size, draws
-        self.end = 0
-        self.there = self.home = stops[-1]
-        self._ways: dict[str, FloatArray] = {}
-        self._side = 0.0
-
-    def index(self, name: str) -> int:
-        """Returns the number of a way point: `start`, `carry_end`, `over`, or a phase's first."""
-        match name:
-            case 'start':
-                return 0
-            case 'carry_end':
-                return self.index('lower') - 1
-            case 'over':
-                return max(self.index('open') - 2, 0)
-        return next(i for i, stop in enumerate(self.stops) if stop.phase == name)
-
-    def stop(self, name: str) -> WayPoint:
-        """Returns a way point by name."""
-        return self.there if name == 'there' else self.stops[self.index(name)]
-
-    def at(self, where: str) -> int:
-        """Returns where way points are inserted: `start`, `before X`, `after X`, `after last`."""
-        if where == 'start':
-            return 0
-        word, name = where.split()
-        return self.end if name == 'last' else self.index(name) + (word == 'after')
-
-    def place(self, name: str) -> FloatArray:
-        """Returns a place (3,) by name [m]: of an object, or of a way point."""
-        return PLACES[name](self) if name in PLACES else self.stop(name).position
-
-    def length(self, value: Any) -> float:
-        """Returns a length, angle or opening."""
-        match value:
-            case 'size':
-                return self.size
-            case [base, share]:
-                return base + share * self.size
-            case {'normal': deviation}:
-                return float(self.draws.play.normal(0.0, deviation))
-            case {'side': far}:
-                return self.draws.sign * far
-            case {'drawn_side': far}:
-                return self.side('drawn') * self.length(far)
-        return float(value)
-
-    def way(self, by: By, stop: WayPoint, factor: float = 1.0) -> FloatArray:
-        """Returns a way (3,) as lengths along directions; each of those is drawn once."""
-        total = np.zeros(3)
-        for name, far in by.items():
-            of = WAYS[name.rstrip('_123')]
-            if name in self._ways:
-                unit = self._ways[name]
-            elif of.of_stop:
-                unit = of.make(self, stop)
-            else:
-                unit = self._ways[name] = of.make(self, stop)
-            total = total + self.length(far) * factor * unit
-        return total
-
-    def side(self, which: str) -> float:
-        """Returns +1 or -1: the move's, or one that every draw of a plan has anew."""
-        if which == 'given':
-            return self.draws.sign
-        self._side = self._side or float(self.draws.play.choice((-1.0, 1.0)))
-        return self._side
-
-
-def _number(spec: Any, old: float, move: Move, stop: WayPoint, weight: float) -> float:
+def _number(spec: Any, old: float, move: EditedMove, stop: WayPoint, weight: float) -> float:
     """An opening, yaw or lean: a length, or what becomes of the old one."""
     if not isinstance(spec, dict):
         return move.length(spec)
@@ -126,13 +45,13 @@ def _number(spec: Any, old: float, move: Move, stop: WayPoint, weight: float) ->
     return old
 
 
-def _number_of(move: Move, stop: WayPoint) -> int:
+def _number_of(move: EditedMove, stop: WayPoint) -> int:
     return next(i for i, other in enumerate(move.stops) if other is stop)
 
 
 def changed(
     stop: WayPoint,
-    move: Move,
+    move: EditedMove,
     factor: float = 1.0,
     weight: float = 1.0,
     *,
@@ -170,7 +89,7 @@ def changed(
 
 
 def edit(
-    move: Move,
+    move: EditedMove,
     *,
     phases: Sequence[str] = (),
     span: Sequence[str] = (),
@@ -194,7 +113,7 @@ def edit(
 
 
 def insert(
-    move: Move,
+    move: EditedMove,
     *,
     at: str,
     rows: Sequence[Mapping[str, Any]],
@@ -214,7 +133,7 @@ def insert(
 
 
 def made_of(
-    move: Move,
+    move: EditedMove,
     rows: Sequence[Mapping[str, Any]],
     like: str,
     repeat: Sequence[float | str],
@@ -231,7 +150,7 @@ def made_of(
 
 
 def push(
-    move: Move,
+    move: EditedMove,
     *,
     at: str,
     to: By,
@@ -258,7 +177,7 @@ def push(
     move.stops = [*move.stops[:number], *rows, *move.stops[number:]]
 
 
-def shake(move: Move, *, at: str, to: str, times: int, **row: Any) -> None:
+def shake(move: EditedMove, *, at: str, to: str, times: int, **row: Any) -> None:
     """From the way point before to either side of it by the size and back, several times."""
     number = move.at(at)
     stop = changed(move.stops[number - 1], move, **row)
@@ -268,7 +187,7 @@ def shake(move: Move, *, at: str, to: str, times: int, **row: Any) -> None:
     move.end = number + len(rows)
 
 
-def rock(move: Move, *, at: str, times: int = 3, least: float = 0.6, **row: Any) -> None:
+def rock(move: EditedMove, *, at: str, times: int = 3, least: float = 0.6, **row: Any) -> None:
     """Leans to either side of the way point before, by angles up to the size, and back to it."""
     number = move.at(at)
     stop = changed(move.stops[number - 1], move, **row)
@@ -279,7 +198,7 @@ def rock(move: Move, *, at: str, times: int = 3, least: float = 0.6, **row: Any)
 
 
 def circle(
-    move: Move,
+    move: EditedMove,
     *,
     at: str,
     radius: Sequence[Any],
@@ -314,7 +233,7 @@ def circle(
     move.stops = [*move.stops[:number], *ring, *move.stops[number:]]
 
 
-def release_on_the_way(move: Move) -> None:
+def release_on_the_way(move: EditedMove) -> None:
     """The gripper opens before the last `size` of the way from the lift to the place."""
     stops, (begin, end) = move.stops, map(move.index, ('lift', 'lower'))
     at = begin + (1 - move.size) * (end - begin)
@@ -329,25 +248,25 @@ def release_on_the_way(move: Move) -> None:
     move.stops = [*stops[: number + 1], *let_go, *rest]
 
 
-def _reach(move: Move, number: int) -> float:
+def _reach(move: EditedMove, number: int) -> float:
     return float(np.linalg.norm((move.stops[number].position - move.stops[-1].position)[:2]))
 
 
-def _reach_share(move: Move, number: int) -> float:
+def _reach_share(move: EditedMove, number: int) -> float:
     return _reach(move, number) / max(_reach(move, k) for k in range(len(move.stops)))
 
 
-def _height(move: Move, number: int) -> float:
+def _height(move: EditedMove, number: int) -> float:
     return float(move.stops[number].position[2] - move.stop('grasp').position[2])
 
 
-def _carried(move: Move, number: int) -> float:
+def _carried(move: EditedMove, number: int) -> float:
     pairs = pairwise(move.stops[move.index('lift') - 1 : number + 1])
     return sum(float(np.linalg.norm((b.position - a.position)[:2])) for a, b in pairs)
 
 
 #: by what an edit is larger at one way point than at another [m]
-WEIGHTS: Mapping[str, Callable[[Move, int], float]] = {
+WEIGHTS: Mapping[str, Callable[[EditedMove, int], float]] = {
     'reach': _reach,
     'reach_share': _reach_share,
     'height': _height,
@@ -356,7 +275,7 @@ WEIGHTS: Mapping[str, Callable[[Move, int], float]] = {
 
 
 def _random(draw: Callable[[Stops, float, Draws], Stops]) -> Callable[..., None]:
-    def step(move: Move) -> None:
+    def step(move: EditedMove) -> None:
         move.stops = draw(move.stops, move.size, move.draws)
 
     return step
@@ -371,7 +290,7 @@ PRIMITIVES: Mapping[str, Callable[..., None]] = {
 
 def edited(program: Program, stops: Stops, size: float, draws: Draws) -> Stops:
     """Returns the way points of a move after a program."""
-    move = Move(stops, size, draws)
+    move = EditedMove(stops, size, draws)
     for step in program:
         for name, options in step.items():
             PRIMITIVES[name](move, **options)

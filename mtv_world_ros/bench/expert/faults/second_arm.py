@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
-from mtv_world_ros.bench.expert.faults.edits import changed, made_of, Move
-from mtv_world_ros.bench.expert.faults.surroundings import FLAT, UP
+from mtv_world_ros.bench.expert.faults.edited_move import EditedMove, FLAT, UP
+from mtv_world_ros.bench.expert.faults.edits import changed, made_of
 from mtv_world_ros.bench.expert.way_points import Draws, Stops, WayPoint
+from mtv_world_ros.config import ListOf, Schema, Wait
 from mtv_world_ros.data_types import FloatArray
 
 #: shortest stay where it waits for the other one [s]
@@ -21,9 +23,43 @@ _STAYS_S = 0.4
 _BESIDE_M, _LEAST_M, _ROAM_RISE_M = 0.04, 0.02, 0.07
 
 
+class SecondArm(Schema):
+    """What a second arm does meanwhile: an entry of `config/faults`.
+
+    Attributes:
+        to: the place that it visits, by name.
+        share: of the way there.
+        level: it goes less far in the plane alone.
+        like: way point of the first arm that it is like; empty = as it rests.
+        but: how it differs from that.
+        rows: its way points, as differences from that.
+        before: way point of the first arm before which `done` of the rows are done.
+        after: the same after a way point, or after a number of them.
+        done: number of rows.
+        late: time from there [s].
+        waits: the first arm waits at its first way point if the second one takes longer.
+        roams: through places near objects, as many as the size says.
+        follows: it goes to the first arm's places.
+    """
+
+    to: str = ''
+    share: Annotated[float, Field(ge=0, le=1)] | Literal['size'] = 1.0
+    level: bool = False
+    like: str = ''
+    but: dict[str, Any] = {}
+    rows: ListOf[dict[str, Any]] = ()
+    before: str = ''
+    after: str | int = 0
+    done: int = 0
+    late: Wait = 0.0
+    waits: bool = False
+    roams: bool = False
+    follows: bool = False
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Visit:
-    """What a second arm does meanwhile.
+    """A visit of a second arm in one move.
 
     Attributes:
         ways: its way points up to where it rests, by the share of the way there that it goes.
@@ -43,73 +79,63 @@ class Visit:
 
 
 def visit_of(
-    spec: Mapping[str, Any],
+    spec: SecondArm,
     stops: Stops,
     size: float,
     draws: Draws,
     home: WayPoint,
     times: Sequence[float],
 ) -> Visit:
-    """Returns the visit that an entry of `config/faults` describes.
+    """Returns the visit of a second arm in a move of the first one.
 
     Args:
-        spec: `to`, a place by name; `share` of the way there (1); `level`: not so far in the
-            plane alone; `like`, a way point of the first arm that it is like (where it rests),
-            with changes; `rows` relative to it; `done` of them `before` or `after` a way point of
-            the first arm, or `after` some of its way points, or `late` [s]. Or `roams`, or
-            `follows`.
+        spec: what it does.
         stops: way points of the first arm.
         size: of the fault.
         draws: what is drawn for the move.
         home: where the second arm rests.
         times: of the first arm's way points, before scaling [s].
     """
-    move = Move(stops, size, draws)
-    ways = partial(_rows_of, spec, stops, size, draws, home, times)
-    if spec.get('roams'):
+    move = EditedMove(stops, size, draws)
+    ways = partial(_rows_of, spec, move, home, times)
+    if spec.roams:
         ways = partial(_roaming, _roamed(round(size), draws), home)
-    elif spec.get('follows'):
+    elif spec.follows:
         ways = partial(_following, stops, home, times)
-    number = move.index(spec['before']) if 'before' in spec else spec.get('after', 0)
+    number = move.index(spec.before) if spec.before else spec.after
     if isinstance(number, str):
         number = move.index(number) + 1
     return Visit(
         ways=ways,
-        share=move.length(spec.get('share', 1.0)),
-        meets=sum(times[:number]) + spec.get('late', 0.0),
-        done=spec.get('done', 0),
-        waits=bool(spec.get('waits')),
-        is_timed=bool({'before', 'after'} & spec.keys()),
+        share=move.length(spec.share),
+        meets=sum(times[:number]) + spec.late,
+        done=spec.done,
+        waits=spec.waits,
+        is_timed=bool(spec.before or spec.after),
     )
 
 
 def _rows_of(
-    spec: Mapping[str, Any],
-    stops: Stops,
-    size: float,
-    draws: Draws,
-    home: WayPoint,
-    times: Sequence[float],
-    share: float,
+    spec: SecondArm, given: EditedMove, home: WayPoint, times: Sequence[float], share: float
 ) -> Stops:
-    move = Move(stops, size, draws)
-    place = move.place(spec['to'])
+    move = EditedMove(given.stops, given.size, given.draws)  # directions are drawn anew
+    place = move.place(spec.to)
     there = replace(home, phase='above', position=home.position + share * (place - home.position))
-    if spec.get('level'):
+    if spec.level:
         short = (1 - share) * (home.position - place) * FLAT
         there = replace(there, position=place + short)
-    if 'like' in spec:
-        there = replace(move.stop(spec['like']), position=there.position)
+    if spec.like:
+        there = replace(move.stop(spec.like), position=there.position)
     move.there, move.home = there, home
-    move.there = changed(there, move, **spec.get('but', {}))
+    move.there = changed(there, move, **spec.but)
     rows = []
-    for row in spec['rows']:
+    for row in spec.rows:
         is_until = row.get('seconds') == 'meanwhile'
         rows.append({**row, 'seconds': _between(move, times)} if is_until else row)
     return [*made_of(move, rows, 'there', (1,), {}), home]
 
 
-def _between(move: Move, times: Sequence[float]) -> float:
+def _between(move: EditedMove, times: Sequence[float]) -> float:
     """Time from where the first arm has closed until it is over its goal [s]."""
     closed = move.index('close')
     over = max(move.index('over'), closed)

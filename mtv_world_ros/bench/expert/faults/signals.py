@@ -58,14 +58,13 @@ class Commands:
     @cached_property
     def closed(self) -> FloatArray:
         """(G,) positions of the grippers when shut."""
-        tools = [tool for tool in self.robot.tools if tool.gripper_joint is not None]
-        return np.array([tool.gripper_closed for tool in tools])
+        return np.array([t.gripper_closed for t in self.robot.tools if t.gripper_joint])
 
     @cached_property
     def travel(self) -> FloatArray:
         """(G,) ways of the grippers from shut to open."""
-        tools = [tool for tool in self.robot.tools if tool.gripper_joint is not None]
-        return np.array([tool.gripper_open for tool in tools]) - self.closed
+        opened = [tool.gripper_open for tool in self.robot.tools if tool.gripper_joint]
+        return np.array(opened) - self.closed
 
     @property
     def middles(self) -> FloatArray:
@@ -89,6 +88,12 @@ class Commands:
         whole[:, self.grippers] = self.positions[:, self.grippers]
         return whole
 
+    def grippers_of(self, changed: FloatArray) -> FloatArray:
+        """Returns (T, J) of which the grippers (T, G) are changed and the arms as they are."""
+        whole = self.positions.copy()
+        whole[:, self.grippers] = changed
+        return whole
+
     def moving(self, rng: np.random.Generator) -> int:
         """Returns the column of one of the arm joints that move, drawn."""
         travel = np.ptp(self.positions, axis=0)
@@ -100,6 +105,11 @@ class Commands:
         first = np.repeat(self.positions[:1], num, axis=0)
         last = np.repeat(self.positions[-1:], num, axis=0)
         return np.concatenate([self.positions, last]), np.concatenate([first, self.positions])
+
+    def pulse(self, begin: float, rises: float, lasts: float, falls: float) -> FloatArray:
+        """Returns (T,) from 0 to 1 and back, from a row on; times [s] that each part takes."""
+        since = (self.rows - begin) * self.period
+        return np.interp(since, np.cumsum([0.0, rises, lasts, falls]), [0.0, 1.0, 1.0, 0.0])
 
     def ramp(self, seconds: float, since: FloatArray | float = 0.0) -> FloatArray:
         """Returns (T,) from 0 at a time to 1 after some seconds."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,11 +35,14 @@ class WayPointFaults:
         # what a second arm does begins before all else
         kinds = [(FAULTS[kind], size) for kind, size in variant.faults]
         self._faults = sorted(kinds, key=lambda fault: bool(fault[0].second_arm))
-        self._move, self._angle = float(rng.uniform()), float(rng.uniform(0, 2 * np.pi))
-        self._sign = float(rng.choice((-1.0, 1.0)))
-        self._errors = rng.normal(size=(_MOST_STOPS, 3))
-        self._openings = rng.normal(size=_MOST_STOPS)
-        self._play = np.random.default_rng(rng.integers(2**32))
+        self._move = float(rng.uniform())
+        self._drawn: dict[str, Any] = {
+            'angle': float(rng.uniform(0, 2 * np.pi)),
+            'sign': float(rng.choice((-1.0, 1.0))),
+            'errors': rng.normal(size=(_MOST_STOPS, 3)),
+            'openings': rng.normal(size=_MOST_STOPS),
+            'play': np.random.default_rng(rng.integers(2**32)),
+        }
 
     @property
     def keeps_tempo(self) -> bool:
@@ -59,16 +63,7 @@ class WayPointFaults:
             objects: (3,) centre of every object of the scene [m].
             other_home: (3,) where another arm's tool rests [m].
         """
-        return Draws(
-            yaw=yaw,
-            sign=self._sign,
-            angle=self._angle,
-            errors=self._errors,
-            openings=self._openings,
-            play=self._play,
-            objects=objects,
-            other_home=other_home,
-        )
+        return Draws(yaw=yaw, objects=objects, other_home=other_home, **self._drawn)
 
     def applied(self, stops: Stops, draws: Draws) -> Stops:
         """Returns the way points of a move with all faults, in the catalogue's order."""
@@ -137,18 +132,14 @@ def refuse_robot(variant: PolicyVariant, robot: RobotModel) -> None:
         PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
             that has none.
     """
-    of_two, of_grippers = (
-        [name for name, kind in zip(dict(variant.sizes), variant.kinds, strict=True)
-         if need in FAULTS[kind].needs]
-        for need in ('two_arms', 'gripper')
-    )  # fmt: skip
-    if of_two and len(robot.tools) < 2:
-        raise PolicyError(
-            f"policy '{variant.name}': {', '.join(of_two)} takes two arms, robot '{robot.name}' "
-            f'has {len(robot.tools)}; leave it out'
-        )
-    if of_grippers and all(tool.gripper_joint is None for tool in robot.tools):
-        raise PolicyError(
-            f"policy '{variant.name}': {', '.join(of_grippers)} takes a gripper, robot "
-            f"'{robot.name}' has none; leave it out"
-        )
+    arms, grippers = len(robot.tools), [t.gripper_joint for t in robot.tools if t.gripper_joint]
+    for need, lacks, what in (
+        ('two_arms', arms < 2, f"two arms, robot '{robot.name}' has {arms}"),
+        ('gripper', not grippers, f"a gripper, robot '{robot.name}' has none"),
+    ):
+        pairs = zip(dict(variant.sizes), variant.kinds, strict=True)
+        names = [name for name, kind in pairs if need in FAULTS[kind].needs]
+        if lacks and names:
+            raise PolicyError(
+                f"policy '{variant.name}': {', '.join(names)} takes {what}; leave it out"
+            )
