@@ -255,7 +255,7 @@ class Grasp:
     """How a top-down gripper takes a shape; its fingers close along the object's x.
 
     Attributes:
-        height: of the tool over the object's bottom, as a share of the object's height.
+        height: height of the tool over the object's bottom, as a share of the object's height.
         rim_m: thickness of the rim that is held, on the object's side of the table; None = across
             the middle.
         opening: of the gripper on the way down, 0..1.
@@ -289,10 +289,10 @@ class Shape:
         geoms: (size, rgb) -> MJCF geoms in the frame of the bounding box's centre.
         smallest: full extents (x, y, z) of the smallest one [m].
         largest: of the largest one; sizes in between keep to the line from one to the other.
-        grasp: how it is taken; None for what is never moved.
+        grasp: how a gripper holds it; None = it is never moved.
         colours: words of the palette that it comes in.
         step: turn about z after which it looks the same to a gripper [rad].
-        hollow: what is put on it comes to rest on its floor.
+        hollow: objects placed on it rest on its inner floor.
     """
 
     geoms: Callable[[Size, Rgb], str]

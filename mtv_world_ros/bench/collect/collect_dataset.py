@@ -78,12 +78,13 @@ def collect(
     Args:
         tasks: names, comma-separated names, or `all`.
         num_episodes: episodes per task, with siblings scenes per task; of zero-shot sets, in all.
-        seed: of the data set.
+        seed: the data set's random seed.
         out: folder of the data set; one episode folder appears in it at a time.
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
         workers: processes.
-        config: what is randomised and how it is sampled.
-        failures_of_ten: how many of ten episodes of a task miss their grasp; not of zero-shot.
+        config: randomisation and sampling.
+        failures_of_ten: number of episodes in ten of a task that miss their grasp; none in
+            zero-shot sets.
         sheets: also write a larger contact sheet of every task.
         progress: show a progress bar, on a terminal.
 

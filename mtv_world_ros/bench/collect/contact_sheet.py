@@ -24,7 +24,7 @@ def film_strip(path: Path, num_frames: int, width: int) -> ByteArray:
     Args:
         path: the episode.
         num_frames: columns.
-        width: of a frame in the strip [px].
+        width: width of a frame in the strip [px].
 
     Returns:
         (V * (h + 2), num_frames * (width + 2), 3) uint8 RGB; 2 px of paper follow each frame.
@@ -96,8 +96,8 @@ def contact_sheet(
         out: folder of the data set.
         entries: its episodes, at least one.
         pairs: rows per task, each a success and a failure.
-        num_frames: of each episode.
-        width: of a frame [px].
+        num_frames: number of frames of each episode.
+        width: width of a frame [px].
     """
     rows = [_row(out, pair, num_frames, width) for pair in _pairs(entries, pairs)]
     gap = np.full((_GAP, rows[0].shape[1], 3), _PAPER, np.uint8)

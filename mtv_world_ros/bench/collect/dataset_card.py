@@ -37,9 +37,9 @@ class CardEntry:
         outcome: `success` or `failure`.
         seed: reproduces the scene.
         attempt: seeds dropped before this one.
-        num_frames: of each view.
+        num_frames: number of frames of each view.
         duration_s: from the first to the last message [s].
-        instruction: what the robot is told.
+        instruction: the language instruction.
         objects: names, in the order of the mask ids.
         scene: name of the scene that it shares with its siblings; empty = it has none.
     """

@@ -25,13 +25,13 @@ class CollectJob:
     Attributes:
         task: name of the task.
         index: number within the task, in a zero-shot set within its kind and task.
-        seed: of the data set.
+        seed: the data set's random seed.
         miss: whether the grasp misses.
         path: folder to make.
         zero_shot: `view`, `task` or `object`; None = an ordinary episode.
         policy: name of the scripted policy that acts in place of the expert; empty = the expert.
         attempt: the only one to make; None = attempts until one is as wanted.
-        more: further metadata of the episode.
+        more: additional metadata of the episode.
     """
 
     task: str
@@ -80,11 +80,11 @@ def jobs_of(
     """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
 
     Args:
-        tasks: what to do.
-        num_episodes: of each.
-        seed: of the data set.
+        tasks: the tasks to carry out.
+        num_episodes: number of episodes of each.
+        seed: the data set's random seed.
         out: its folder.
-        num_of_ten: how many of ten grasps of the expert miss.
+        num_of_ten: number of grasps of the expert in ten that miss.
         policies: scripted policies that take turns in every task, where each task begins further
             down the list, so that many policies all come up in few episodes; none = the expert.
 

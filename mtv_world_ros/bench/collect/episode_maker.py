@@ -40,7 +40,7 @@ class CollectConfig:
         randomization: objects, light, cameras and their jitter.
         expert: heights, speeds and timing.
         record: sampling and noise.
-        zero_shot: where the cameras of zero-shot views stand.
+        zero_shot: ranges of the camera poses of zero-shot views.
         moved_share: share of ordinary episodes whose cameras stand elsewhere too.
         moves: ranges that such an episode chooses from; they leave zero-shot views unseen.
         policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of

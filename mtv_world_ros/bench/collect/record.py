@@ -47,7 +47,7 @@ class RecordConfig:
             0.02 s, and stamped with it.
         chunk_s: the policy publishes an action chunk this often, of this horizon [s].
         point_period_s: between the points of a chunk [s]; a multiple of 0.02.
-        jpeg_quality: of the recorded frames, 1 to 100.
+        jpeg_quality: JPEG quality of the recorded frames, 1 to 100.
         max_attempts: seeds tried before an episode is given up.
         pictures: `all` frames have them, or only the `first`.
     """
@@ -86,7 +86,7 @@ class Take:
     Attributes:
         observations: T, one a frame.
         control_positions: (C, J) measured joints at every control period.
-        commands: what the policy commanded.
+        commands: the commanded trajectory.
         ever: the task was done in some frame.
         final: it was done in each of the last frames.
         moved: role -> distance of the object from its start at the end [m].
@@ -137,10 +137,10 @@ def simulate(
 
     Args:
         sim: is reset.
-        expert: plans.
-        task: what to do.
-        seed: of the episode.
-        config: how it is sampled.
+        expert: the scripted expert, which plans.
+        task: the task to carry out.
+        seed: the episode's random seed.
+        config: sampling of frames and commands.
         miss: the expert displaces one grasp.
         variant: runs in place of the expert; None = the expert.
 
@@ -179,10 +179,10 @@ def carry_out(
 
     Args:
         sim: has just been reset, or given a scene.
-        task: what success is judged by.
-        commands: of every control period.
-        first: what the simulator returned.
-        config: how it is sampled.
+        task: the task whose relations decide success.
+        commands: one row per control period.
+        first: the simulator's first observation.
+        config: sampling of frames and commands.
     """
     started, rendering = time.perf_counter(), 0.0
     commands = as_published(commands, config)
@@ -219,7 +219,7 @@ def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajec
     """Returns commands of every control period as the action chunks tell them.
 
     Chunks have fewer points, so that what is quicker than them is not in them. The arms do what
-    the recording says, or nobody could learn from it what follows from which command.
+    the recording says, so that commands and motion match.
     """
     num = len(commands.times) - 1
     starts = np.arange(0, num, round(config.chunk_s / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S
@@ -269,10 +269,10 @@ def write_take(
     Args:
         path: folder to make.
         sim: still holding the take's scene and task.
-        take: what to write.
-        seed: that draws its scene; None = none does.
-        config: the one that `take` was made with.
-        extra: further MCAP metadata.
+        take: the take to write.
+        seed: seed that draws its scene; None = none does.
+        config: sampling that `take` was made with.
+        extra: additional MCAP metadata.
     """
     objects = tuple(item.name for item in sim.scene.objects)
     metadata = {

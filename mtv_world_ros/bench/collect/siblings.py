@@ -41,11 +41,11 @@ class Sibling:
     Attributes:
         scene: its name, `<task>_<index>`.
         number: 0 is the expert.
-        seed: of the scene and the policy.
+        seed: random seed of the scene and the policy.
         attempt: seeds dropped before this one.
         policy: its name.
-        kind: of its fault; empty = none.
-        size: of its fault.
+        kind: its fault kind; empty = none.
+        size: size of its fault.
         diverges_s: time of the first command that is not the expert's [s]; 0 for the expert.
     """
 
@@ -100,11 +100,11 @@ class BoundarySearch:
     """Searches the siblings of one scene after the other in one process.
 
     Args:
-        expert: plans.
+        expert: the scripted expert, which plans.
         make_sim: seed -> physics of an episode, as it will be recorded.
         kinds: fault kinds to choose from.
-        num_siblings: of a scene, with the expert.
-        config: how episodes are sampled, and how many seeds are tried.
+        num_siblings: number of siblings of a scene, the expert included.
+        config: sampling of episodes, and the largest number of seeds tried.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ def find_boundary(
     """Returns a fault that just succeeds and one that just fails, or why there is no boundary.
 
     Args:
-        kind: of the fault.
+        kind: the fault kind.
         succeeds: whether a variant succeeds; may raise PolicyError where there is no plan.
     """
     fault = FAULTS[kind_named(kind)].size
@@ -233,7 +233,7 @@ def search_siblings(
     """Returns the siblings by scene; what was found by an earlier run is not searched again.
 
     Args:
-        scenes: to search.
+        scenes: the scenes to search.
         make_search: called once in every process; picklable.
         out: folder of the data set; gets `SIBLINGS_FILE`.
         workers: processes.

@@ -247,7 +247,7 @@ class Expert:
         Two moves of different arms overlap: one arm reaches out while the other goes home.
 
         Args:
-            task: what to do.
+            task: the task to carry out.
             scene: where everything is at the start, and the goals.
             rng: draws heights, tempo and the size of a miss.
             miss: displace one grasp so that the gripper closes on nothing.

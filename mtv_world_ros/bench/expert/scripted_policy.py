@@ -48,8 +48,8 @@ class ScriptedPolicy:
 
     Args:
         variant: what is wrong with it.
-        expert: plans.
-        task: what to do.
+        expert: the scripted expert, which plans.
+        task: the task to carry out.
         scene: where everything is.
         hold_s: from the end of the plan to the end of the episode [s].
     """
@@ -74,7 +74,7 @@ class ScriptedPolicy:
 
     @property
     def instruction(self) -> str:
-        """What the robot is told in its scene."""
+        """The instruction, with the names of the scene's objects."""
         return instruction_of(self.task, self.scene)
 
     @property
@@ -161,7 +161,7 @@ class ScriptedPolicy:
         """What it may set out to do, in order of preference."""
         if not is_wrong:
             size = self.variant.size('goal_object_moved_after')
-            yield self._meddled(size, rng) if size else (self.task, self.scene)
+            yield self._with_goal_object_moved(size, rng) if size else (self.task, self.scene)
             return
         number = int(rng.integers(len(self.task.moves)))
         for move in self._wrong_moves(self.task.moves[number], rng):
@@ -173,7 +173,7 @@ class ScriptedPolicy:
             goals[number] = goals_of(task, items, [(0.0, 0.0)] * len(moves))[number]
             yield task, replace(self.scene, goals=tuple(goals))
 
-    def _meddled(self, size: float, rng: np.random.Generator) -> tuple[Task, Scene]:
+    def _with_goal_object_moved(self, size: float, rng: np.random.Generator) -> tuple[Task, Scene]:
         """With one more move: what one was put on or beside is moved by `size` [m].
 
         Where nothing like it can be grasped, another move's subject, else its own once more.
@@ -249,7 +249,7 @@ def scripted_policy(
         name: e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
         task: name of a task.
         seed: of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
-        expert: plans.
+        expert: the scripted expert, which plans.
         randomization: as the simulator's.
         hold_s: from the end of the plan to the end of the episode [s].
 
@@ -270,7 +270,7 @@ def policy_of_recording(
     Args:
         name: as in `scripted_policy`.
         recording: the episode's folder.
-        expert: plans.
+        expert: the scripted expert, which plans.
         hold_s: from the end of the plan to the end of the episode [s].
 
     Raises:

@@ -39,9 +39,9 @@ class BothWorlds:
 
     Attributes:
         fps: frames a second of the model.
-        real: what the simulator showed, one an answer of the policy.
-        observed: what was found in it.
-        imagined: chunks that were imagined.
+        real: the simulator's frames and joints, one chunk per answer of the policy.
+        observed: masks and estimates on the real frames.
+        imagined: the imagined chunks.
     """
 
     fps: float

@@ -25,7 +25,7 @@ def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
     """Returns which flips are imagined; see `Optimism.flips`.
 
     Args:
-        results: of all policies.
+        results: the rollouts of all policies.
         folder: with their last frames as `last_frames_png` writes them, `<name>.png`, and where
             objects are, `<name>.objects.png`; rollouts without are left out.
     """
@@ -92,9 +92,9 @@ def flip_sheet(
     above imagined. The flips are spread evenly over all, whether they were imagined or not.
 
     Args:
-        results: of a ranking.
+        results: the rollouts of a ranking.
         flips: see `Optimism.flips`.
-        folder: with the last frames.
+        folder: the folder of their last frames.
         count: rows at most.
     """
     experts = {(r.task, r.index): r for r in results if r.policy == EXPERT}

@@ -35,7 +35,7 @@ class Thing:
     """An object as the first frame shows it.
 
     Attributes:
-        name: as the instruction has it.
+        name: its name in the instruction.
         centre: (3,) [m].
         size: full extents (x, y, z) [m].
         is_rim_held: it is taken by its rim, not across the middle.
@@ -103,10 +103,10 @@ def is_done(
     """Returns whether the task is done at the end, by the rule.
 
     Args:
-        task: whose relations judge.
+        task: the task whose relations decide.
         bound: placeholder -> name of its object.
-        things: where these objects are at first, by name.
-        robot: whose joints are commanded.
+        things: the objects at the start, by name.
+        robot: the commanded robot.
         commands: (C, J) joint positions at the simulator's control rate [rad or m].
 
     Raises:

@@ -83,10 +83,10 @@ class ListedPolicy:
 
     Attributes:
         name: under which its results are listed.
-        config: which policy.
+        config: the policy's configuration.
         command: starts its server; empty = it has none, or it runs already.
         start_timeout_s: longest wait until the server listens [s].
-        tasks: that it is ranked on; empty = all that are asked for.
+        tasks: tasks that it is ranked on; empty = all that are asked for.
         definition: changes with everything that decides what the policy does.
     """
 
@@ -176,7 +176,7 @@ def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[str]) -> tuple[s
     """Returns the tasks that policies are ranked on where the user names none.
 
     Args:
-        policies: of the file.
+        policies: the file's policies.
         others: tasks of those policies that state none.
     """
     found = dict.fromkeys(task for policy in policies for task in policy.tasks or others)
@@ -217,7 +217,7 @@ class ListedPolicies:
     """Makes the policies of a file; picklable until the first one is made.
 
     Attributes:
-        policies: of the file.
+        policies: the file's policies.
         logs: folder for the logs of the servers that are started.
     """
 

@@ -98,10 +98,10 @@ def remarks(summary: Summary) -> list[str]:
         _INTERVALS,
         _OPTIMISM if summary.optimism else '',
     ]
-    told = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
-    if 'uncalibrated' in told:
+    reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
+    if 'uncalibrated' in reasons:
         weights = (
-            'stated ones, not fitted ones' if 'stated weights' in told else 'fitted elsewhere'
+            'stated ones, not fitted ones' if 'stated weights' in reasons else 'fitted elsewhere'
         )
         found.append(f'The estimates are not calibrated: their weights are {weights}.')
     cut = sum(not result.is_over for result in summary.results)

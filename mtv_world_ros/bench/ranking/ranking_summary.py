@@ -98,7 +98,7 @@ class Summary:
         results: one a rollout.
         failed: rollouts without a result, and why.
         num_true: episodes of each task whose true outcomes the powered estimates may use.
-        provenance: what it was made with, by heading.
+        provenance: command, checkpoint and machine, by heading.
         optimism: the benchmark's numbers by checkpoint; empty = not asked for.
     """
 

@@ -26,7 +26,7 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
     """Returns the filters and the cards of all rollouts; see `worst_first`.
 
     Args:
-        results: of a ranking.
+        results: the rollouts of a ranking.
         out: folder of its page; the videos lie below it.
     """
     policy = Filter(key='policy', label='policy', options=_options(r.policy for r in results))
@@ -47,19 +47,23 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
             {
                 'title': f'{result.policy} · {result.task} {result.index}',
                 'verdict': f'{_word(result.final)} in the simulator; imagined '
-                f'{told(result.imagined)}: {verdict(result)}',
+                f'{estimate_text(result.imagined)}: {verdict(result)}',
                 'parts': [
                     f'{what} at {time:.1f} s'
                     for time, what in (when_they_part(result.course) if result.course else ())
                 ],
                 'judged': [
-                    ('imagined', told(result.imagined), '; '.join(result.imagined.reasons)),
+                    (
+                        'imagined',
+                        estimate_text(result.imagined),
+                        '; '.join(result.imagined.reasons),
+                    ),
                     (
                         "on the simulator's frames",
-                        told(result.seen),
+                        estimate_text(result.seen),
                         '; '.join(result.seen.reasons),
                     ),
-                    ('no-picture rule', told(result.no_picture), ''),
+                    ('no-picture rule', estimate_text(result.no_picture), ''),
                 ],
                 'ends': [
                     f'{where}: {end}'
@@ -109,7 +113,7 @@ def verdict(result: Result) -> str:
     return 'right' if said == result.final else f'false {_word(bool(said))}'
 
 
-def told(judged: Judged) -> str:
+def estimate_text(judged: Judged) -> str:
     """Returns an estimate in words."""
     return number(judged.probability, 2) if isfinite(judged.probability) else 'abstains'
 

@@ -54,10 +54,10 @@ class Job:
     Attributes:
         policy: its name.
         task: name of the task.
-        index: of the episode within the task.
-        seed: of the scene, of the policy and of the imagination's noise.
-        definition: tells policies apart that had this name at different times; empty = the name
-            says it all.
+        index: number of the episode within the task.
+        seed: random seed of the scene, the policy and the denoising noise.
+        definition: hash of the policy's configuration, as a name may have meant another policy
+            before; empty = the name is enough.
     """
 
     policy: str
@@ -80,7 +80,7 @@ class Judged:
         probability: NaN = abstains.
         interval: (low, high).
         jaccard: (V, O) J of the objects with where they should be; NaN where not known.
-        reasons: what it rests on, or why it abstains.
+        reasons: evidence of the estimate, or why it abstains.
     """
 
     probability: float
@@ -190,12 +190,12 @@ class Result:
     Attributes:
         policy: its name.
         task: name of the task.
-        index: of the episode within the task.
-        seed: of the episode, the policy and the imagination's noise.
+        index: number of the episode within the task.
+        seed: random seed of the episode, the policy and the denoising noise.
         ever: the task was done at some time, in the simulator.
         final: it held at the end; this is what counts as success.
         imagined: the estimate at the end of the imagined episode.
-        foreseen: what the foreseen motions alone say that it rests on.
+        foreseen: the share of its foreseen motions that succeed.
         pictures: the estimate where none is foreseen, the paper's way.
         seen: the same estimator on the simulator's own frames: what is wrong with it is not the
             world model's fault.
@@ -206,7 +206,7 @@ class Result:
         seconds: time by stage [s].
         end: why the simulated episode ended; empty = not known.
         imagined_end: why the imagined one ended.
-        course: how it went in both worlds; None = not known.
+        course: commands, overlaps and estimates over time in both worlds; None = not known.
         files: pictures of it in base64 by suffix, where they are not yet written beside it.
     """
 
@@ -245,8 +245,8 @@ class Result:
         keys = ('imagined', 'foreseen', 'pictures', 'seen', 'no_picture')
         judged = {key: Judged.from_json(values[key]) for key in keys if key in values}
         course = values.get('course')
-        told = {'course': None if course is None else Course.from_json(course)}
-        return cls(**{**values, **judged, **told})
+        course = None if course is None else Course.from_json(course)
+        return cls(**{**values, **judged, 'course': course})
 
 
 def policies_named(text: str) -> tuple[str, ...]:

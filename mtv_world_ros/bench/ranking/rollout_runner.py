@@ -72,7 +72,7 @@ class RolloutRunner:
 
     Args:
         pipeline: imagines and judges; its robot is the simulator's.
-        config: how episodes are run.
+        config: denoising steps, limits and physics of the episodes.
     """
 
     def __init__(self, pipeline: Pipeline, config: RolloutConfig) -> None:
@@ -203,10 +203,10 @@ class SimulatedRollout:
     """A rollout in the simulator.
 
     Attributes:
-        policy: that acted.
-        world: what was seen and commanded.
-        instruction: what the robot was told.
-        run: how the episode went.
+        policy: the policy that acted.
+        world: the observations and commands.
+        instruction: the language instruction.
+        run: number of answers, end and time of the episode.
         ever: the task was done at some time.
         final: it was done at the end.
     """
@@ -234,7 +234,7 @@ class ComparisonRunner:
     """Runs jobs in the imagination of several checkpoints; each is simulated once.
 
     Args:
-        runners: one a checkpoint; their models have one frame rate.
+        runners: one per checkpoint; their models have the same frame rate.
     """
 
     def __init__(self, runners: Sequence[RolloutRunner]) -> None:

@@ -55,10 +55,10 @@ def run_jobs(
     there already with the same settings are not run again.
 
     Args:
-        jobs: what to run; each is simulated once for all checkpoints.
-        checkpoints: one or more.
-        config: how episodes are run.
-        workers: processes; with Ray, at most so many at once.
+        jobs: the jobs; each is simulated once for all checkpoints.
+        checkpoints: one or more checkpoints.
+        config: denoising steps, limits and physics of the episodes.
+        workers: number of processes; with Ray, the most that run at once.
         ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
         overwrite: replace results of other settings.
         show_progress: draw a progress bar, on a terminal.

@@ -29,7 +29,7 @@ class Judge:
     """Who or what estimates whether a rollout succeeded.
 
     Attributes:
-        title: in the table of what a picture is worth.
+        title: its row in the table of what a picture is worth.
         column: head of its column in the optimism table; empty = it has none.
         episodes: what it judges, in the ranking's own tables; empty = it is not there.
     """
@@ -80,8 +80,8 @@ class Score:
         value: the number.
         interval: 95 %.
         count: policies, rollouts, failures or flips, as the measure has it.
-        hits: of a rate, number of successes; of estimates, their sum.
-        num_unknown: of a rate, rollouts without an estimate.
+        hits: successes of a rate; of estimates, their sum.
+        num_unknown: rollouts of a rate without an estimate.
     """
 
     value: float = nan
@@ -167,9 +167,9 @@ def agreements(
     """Returns Pearson's r and MMRV of a judge's rates over policies: observed, and noise-free.
 
     Args:
-        results: of the policies; those without a verdict do not count.
+        results: the rollouts of the policies; those without a verdict do not count.
         judge: key of `JUDGES`.
-        policies: in which order; default: as they come.
+        policies: order of the policies; default: as they come.
     """
     true = outcomes(results, lambda r: float(r.final), policies)
     judged = outcomes(results, lambda r: judged_by(r, judge).probability, policies)
@@ -242,7 +242,7 @@ def area_interval(
     Args:
         said: (N,) estimates; of two, the first area less the second one is taken.
         real: (N,) outcomes.
-        scenes: of the N rollouts; all of a scene are left out together.
+        scenes: scene of each of the N rollouts; all of a scene are left out together.
 
     Returns:
         The area, its interval on the logit scale (of a difference: as it is); NaN for fewer than

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from mtv_world_ros.bench.ranking.both_worlds import FRAMES
 from mtv_world_ros.bench.ranking.rollout_cards import (
+    estimate_text,
     rollout_file,
-    told,
     verdict,
     when_they_part,
     worst_first,
@@ -58,6 +58,8 @@ def _ranked(folder: Path, result: Result) -> ScoredRollout:
         words += [(time, f'{what} part') for time, what in when_they_part(course)]
     rollout = load_rollout(_path(folder, result))
     last = float(rollout.times[-1])
-    words.append((last, f'imagined {told(result.imagined)}: {"; ".join(result.imagined.reasons)}'))
+    words.append(
+        (last, f'imagined {estimate_text(result.imagined)}: {"; ".join(result.imagined.reasons)}')
+    )
     name = f'{result.policy}/{result.task}_{result.index}'
     return ScoredRollout(name=name, rollout=rollout, estimates=estimates, words=tuple(words))

@@ -91,12 +91,12 @@ def run_policy(
     """Runs a policy that was reset until the episode ends, or up to a limit of answers.
 
     Args:
-        policy: decides.
-        world: where its answers are executed.
-        instruction: what the robot is told.
+        policy: the policy, which was reset.
+        world: the world that executes its answers.
+        instruction: the language instruction.
         chunk_s: the policy is asked again after this time, or where its answer ends [s].
         max_chunks: answers at most.
-        hold: the episode also ends when the task is done, or nobody can tell whether it is, after
+        hold: the episode also ends when the task is done, or the estimate abstains, after
             this number of answers in a row; 0 = then it goes on.
 
     Raises:
@@ -129,11 +129,11 @@ class ImaginedWorld:
     """Predicted frames at the cameras' size, commanded joints, estimates.
 
     Attributes:
-        observation: what is seen now: the real one, then the last predicted frame.
-        chunks: that were imagined.
+        observation: the current one: real at first, then the last predicted frames.
+        chunks: the imagined chunks.
 
     Args:
-        episode: that answers are imagined in.
+        episode: the imagined episode.
         start: the real observation that it begins with.
     """
 
@@ -186,16 +186,16 @@ class SimulatedWorld:
 
     Attributes:
         start: first observation.
-        observation: what is seen now.
-        chunks: what was seen, one an answer.
+        observation: the current observation.
+        chunks: the observed chunks, one per answer of the policy.
         commands: (C, J) that were executed at the control rate, one array an answer.
         physics_s: time that the physics took [s].
         rendering_s: time that pictures took, and building the scene [s].
 
     Args:
-        sim: renders.
+        sim: the simulator.
         fps: of the model; pictures are taken at this rate, answers executed for whole frames.
-        seed: of the episode.
+        seed: the episode's random seed.
         task: name of the task.
     """
 
@@ -210,7 +210,7 @@ class SimulatedWorld:
 
     @property
     def instruction(self) -> str:
-        """What the robot is told."""
+        """The language instruction."""
         return self._sim.instruction
 
     def execute(self, answer: JointTrajectory) -> None:

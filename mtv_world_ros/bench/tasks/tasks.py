@@ -33,11 +33,11 @@ class ObjectRole:
     Attributes:
         role: its part in the task; the placeholder of the task's instruction and relations.
         shapes: keys of `SHAPES`, one of which is drawn; also the noun of its name (`red block`).
-        size_share: which sizes between the shape's smallest (0) and largest (1) are drawn.
-        x_range: where its centre may start, to the right of the table's middle [m].
-        y_range: where its centre may start, away from the robot [m].
-        yaw_range: how it may be turned about z [rad].
-        probability: how often the object is there at all (distractors).
+        size_share: range of sizes, from the shape's smallest (0) to its largest (1).
+        x_range: range of its centre's x, to the right of the table's middle [m].
+        y_range: range of its centre's y, away from the robot [m].
+        yaw_range: range of its yaw [rad].
+        probability: of the object being in the scene (below 1: distractors).
     """
 
     role: str

@@ -11,8 +11,8 @@ class Actuator:
 
     Attributes:
         joint: its name in the MJCF.
-        column: of the robot's joint whose position it follows.
-        multiplier: of that position; the mimic joints of a URDF have others than 1.
+        column: column of the robot's joint that it follows.
+        multiplier: factor of that joint's position; other than 1 for mimic joints of a URDF.
         offset: added to it [rad or m].
         kp: gain [N m/rad or N/m].
         kv: damping [N m s/rad or N s/m].

@@ -36,7 +36,7 @@ class WristCameraSpec:
 
     Attributes:
         view: name of the view.
-        link: that carries it.
+        link: name of the link that carries it.
         position: (x, y, z) in the link [m].
         target: (x, y, z) the point looked at, in the link [m].
         right: (x, y, z) in the link, about the direction of the image's x.
@@ -173,10 +173,10 @@ def camera_model(
     """Returns the calibrated camera for images of `width` x `height` px; no distortion.
 
     Args:
-        spec: of the camera.
-        width: of its images [px].
-        height: likewise.
-        base_link: carries the cameras that are fixed.
+        spec: pose and field of view of the camera.
+        width: image width [px].
+        height: image height [px].
+        base_link: link that carries the fixed cameras.
     """
     focal = width * spec.distance / spec.visible_width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])

@@ -36,7 +36,7 @@ def goal_of(move: Move, items: dict[str, SceneObject], shift: tuple[float, float
     """Returns where a move's subject comes to rest, centre [m].
 
     Args:
-        move: what the expert does.
+        move: the expert's move.
         items: role -> object where it is before the move.
         shift: drawn share (-1..1) of the goal's spread in x and y.
     """

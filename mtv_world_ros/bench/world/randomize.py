@@ -38,7 +38,7 @@ class RandomizationConfig:
         height: image height [px].
         cameras: nominal cameras, in the order of the views; None = those of the workcell.
         jitter: half widths of the camera randomisation.
-        placement: where objects and goals may lie; None = as in the workcell.
+        placement: limits of the places of objects and goals; None = the workcell's.
     """
 
     width: int = 384
@@ -142,7 +142,7 @@ def draw_scene(
     else:
         raise SimulatorError(
             f"no feasible placement for task '{task.name}' in {MAX_DRAWS} draws; widen x_range "
-            'and y_range of its roles (sim/tasks/tasks.py) or lower the clearance '
+            'and y_range of its roles (bench/tasks/tasks.py) or lower the clearance '
             '(config/workcells)'
         )
     cameras = tuple(

@@ -42,7 +42,7 @@ def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
 
     Args:
         path: its folder.
-        workcell: of the robot that it was recorded with.
+        workcell: workcell of the robot that it was recorded with.
 
     Raises:
         EpisodeError: it is none of the simulator's, or holds no scene and its seed draws another.
@@ -57,7 +57,7 @@ def scene_of(episode: Episode, workcell: Workcell) -> Scene:
 
     Args:
         episode: simulated.
-        workcell: of the robot that it was recorded with.
+        workcell: workcell of the robot that it was recorded with.
 
     Raises:
         EpisodeError: it holds no scene, and no seed or one that does not draw its scene any more.

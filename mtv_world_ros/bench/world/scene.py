@@ -155,8 +155,8 @@ def check_cameras(scene: Scene, base_link: str) -> None:
     """Refuses a scene in which a fixed camera does not see every object as a whole.
 
     Args:
-        scene: with its cameras.
-        base_link: carries the fixed ones.
+        scene: the scene, with its cameras.
+        base_link: link that carries the fixed cameras.
 
     Raises:
         SimulatorError: names the camera and the objects outside its image.
@@ -167,7 +167,7 @@ def check_cameras(scene: Scene, base_link: str) -> None:
             raise SimulatorError(
                 f"camera '{camera.view}' does not see {', '.join(hidden)} as a whole; move its "
                 'target or widen visible_width (config/workcells), or narrow the region of '
-                'the objects (sim/tasks/tasks.py)'
+                'the objects (bench/tasks/tasks.py)'
             )
 
 

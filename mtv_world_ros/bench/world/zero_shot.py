@@ -66,11 +66,11 @@ def variant(
     """Returns the task and the randomisation of one episode; as given where `kind` is None.
 
     Args:
-        kind: of `KINDS`, or None.
+        kind: one of `KINDS`, or None.
         task: the task it is derived from.
-        seed: of the episode.
-        randomization: of training.
-        moves: how far the cameras of `view` stand from those of training.
+        seed: the episode's random seed.
+        randomization: the randomisation of training.
+        moves: distance of the cameras of `view` from those of training.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     if kind == 'view':

@@ -36,23 +36,27 @@ RECORDED = json.loads((Path(__file__).parents[2] / 'golden' / 'kinds.json').read
 
 
 @cache
-def trajectory(expert, name: str) -> JointTrajectory:
-    policy = scripted_policy(name, TASK, SEED, expert)
-    policy.reset(seed=SEED)
+def trajectory(expert, name: str, task: str = TASK, seed: int = SEED) -> JointTrajectory:
+    policy = scripted_policy(name, task, seed, expert)
+    policy.reset(seed=seed)
     return policy.plan
 
 
-def plan(expert, name: str) -> np.ndarray:
-    return trajectory(expert, name).positions
+def plan(expert, name: str, task: str = TASK, seed: int = SEED) -> np.ndarray:
+    return trajectory(expert, name, task, seed).positions
+
+
+def applied(name: str, stops: list[WayPoint], objects, seed: int = 0) -> list[WayPoint]:
+    """What the faults of a policy make of way points, where these objects are in the scene."""
+    faults = WayPointFaults(parse_variant(name), np.random.default_rng(seed))
+    return faults.applied(stops, faults.draws(0.0, objects))
 
 
 @pytest.mark.parametrize('name', [name for name in RECORDED if name != 'expert'])
 def test_every_kind_gives_the_plan_that_its_own_function_gave(expert, name):
     """Recorded by `test/golden/record.py` at v0.1.0, where each kind was a function of its own."""
     seed, num_commands, *wanted = RECORDED[name]
-    policy = scripted_policy(name, 'stack_blocks_two', seed, expert)
-    policy.reset(seed=seed)
-    at = policy.plan.positions
+    at = plan(expert, name, 'stack_blocks_two', seed)
     assert len(at) == num_commands
     found = (at.mean(axis=0), at.std(axis=0), at[len(at) // 2])
     np.testing.assert_allclose(found, wanted, atol=2e-4)
@@ -132,11 +136,7 @@ def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
     'task', ['stack_blocks_two', 'move_object_two', 'collect_toy', 'shake_bottle']
 )
 def test_it_meddles_with_another_object_once_the_task_is_done(expert, task):
-    plans = []
-    for name in ('expert', 'expert-meddle-0.04'):
-        policy = scripted_policy(name, task, SEED, expert)
-        policy.reset(seed=SEED)
-        plans.append(policy.plan.positions)
+    plans = [plan(expert, name, task) for name in ('expert', 'expert-meddle-0.04')]
     openings = [expert.robot.gripper_openings(positions) for positions in plans]
     closed = [
         int((np.diff((opening < 0.05).astype(int), axis=1) == 1).sum()) for opening in openings
@@ -154,8 +154,7 @@ def changed_stops(name: str) -> tuple[list[WayPoint], list[WayPoint]]:
         ('open', goal, 0.7), ('retreat', goal + up, 1.0), ('home', home, 1.0),
     ]  # fmt: skip
     stops = [WayPoint(phase, place, 0.0, opening) for phase, place, opening in places]
-    faults = WayPointFaults(parse_variant(name), np.random.default_rng(0))
-    return stops, faults.applied(stops, faults.draws(0.0, [own]))
+    return stops, applied(name, stops, [own])
 
 
 @pytest.mark.parametrize(
@@ -188,14 +187,12 @@ def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, mo
 def test_a_grasp_is_torn_between_its_object_and_the_nearest_other_one():
     stops, _ = changed_stops('expert')
     own, near, far = stops[1].position, np.array([0.1, 0.2, 0.05]), np.array([-0.2, 0.3, 0.03])
-    faults = WayPointFaults(parse_variant('expert-torn-0.2'), np.random.default_rng(0))
-    changed = faults.applied(stops, faults.draws(0.0, [far, near, own + [0.03, 0, 0]]))
+    changed = applied('expert-torn-0.2', stops, [far, near, own + [0.03, 0, 0]])
     ways = [b.position - a.position for a, b in zip(stops[:3], changed[:3], strict=True)]
     np.testing.assert_allclose(ways, np.broadcast_to([0.02, -0.02, 0], (3, 3)), atol=1e-12)
     assert changed[3:] == stops[3:]
-    assert [stop.phase for stop in faults.applied(stops, faults.draws(0.0, [own]))] == [
-        s.phase for s in stops
-    ]
+    alone = applied('expert-torn-0.2', stops, [own])
+    assert [stop.phase for stop in alone] == [stop.phase for stop in stops]
 
 
 @pytest.mark.parametrize('away', [0.06, 0.2])
@@ -230,8 +227,7 @@ def test_it_is_put_on_the_other_object_next_to_its_goal_and_taken_again(is_near)
     stops, _ = changed_stops('expert')
     own, goal = stops[1].position, stops[6].position
     other = np.array([-0.25, 0.35, 0.04]) if is_near else np.array([0.2, 0.3, 0.04])
-    faults = WayPointFaults(parse_variant('expert-perch-0.03'), np.random.default_rng(0))
-    changed = faults.applied(stops, faults.draws(0.0, [own, other]))
+    changed = applied('expert-perch-0.03', stops, [own, other])
     assert changed[:4] == stops[:4] and changed[11:] == stops[4:] and len(changed) == 16
     over, low, let_go, wide, again, taken, raised = changed[4:11]
     assert [s.opening for s in changed[4:11]] == [0, 0, 0.7, 1, 1, 0, 0]
@@ -268,11 +264,7 @@ def test_directions_are_drawn_anew_and_are_the_same_for_another_size(kind, size)
 
 @pytest.mark.parametrize('seed', range(6))
 def test_grippers_have_a_tempo_of_their_own(expert, seed):
-    positions = []
-    for name in ('expert', 'expert-offbeat-0.4'):
-        policy = scripted_policy(name, TASK, seed, expert)
-        policy.reset(seed=seed)
-        positions.append(policy.plan.positions)
+    positions = [plan(expert, name, seed=seed) for name in ('expert', 'expert-offbeat-0.4')]
     (expert_plan, offbeat), arms = positions, arm_columns(expert)
     num = len(expert_plan)
     np.testing.assert_array_equal(offbeat[:num, arms], expert_plan[:, arms])
@@ -295,8 +287,7 @@ def test_another_object_is_taken_first_moved_and_let_go(is_near):
     # nearest of all is the object itself, then one out of the arm's reach; it rests at x = -0.2
     places = [own + [0.03, 0, 0], np.array([0.1, 0.3, 0.03]), np.array([-0.25, 0.3, 0.05])]
     places = [*places, near] if is_near else places[:2]
-    faults = WayPointFaults(parse_variant('expert-decoy-0.05'), np.random.default_rng(0))
-    changed = faults.applied(stops, faults.draws(0.0, places))
+    changed = applied('expert-decoy-0.05', stops, places)
     assert changed[6:] == stops
     ways = np.array([stop.position - (near if is_near else own) for stop in changed[:6]])
     np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0, 0, 0.1], atol=1e-12)
@@ -316,8 +307,7 @@ def test_way_points_are_left_out(seed):
     stops, _ = changed_stops('expert')
     kept = []
     for size in range(1, 5):
-        faults = WayPointFaults(parse_variant(f'expert-omit-{size}'), np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, [stops[1].position]))
+        changed = applied(f'expert-omit-{size}', stops, [stops[1].position], seed)
         assert len(changed) == len(stops) - size
         # all have different places or openings; none is new, and their order stays
         numbers = [
@@ -337,8 +327,7 @@ def test_any_way_point_but_the_last_may_be_left_out():
     stops, _ = changed_stops('expert')
     phases = set()
     for seed in range(60):
-        faults = WayPointFaults(parse_variant('expert-omit-1'), np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, [stops[1].position]))
+        changed = applied('expert-omit-1', stops, [stops[1].position], seed)
         same = [is_where(*pair) for pair in zip(stops, changed, strict=False)]
         phases.add(stops[same.index(False)].phase)
     assert phases == {stop.phase for stop in stops[:-1]}
@@ -349,9 +338,7 @@ def test_way_points_change_places_with_the_next_one(seed):
     stops, _ = changed_stops('expert')
     before = stops
     for size in range(1, 5):
-        name = parse_variant(f'expert-jumble-{size}')
-        faults = WayPointFaults(name, np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, []))
+        changed = applied(f'expert-jumble-{size}', stops, [], seed)
         # a larger size does what a smaller one does, and one exchange more
         moved = [
             k for k, pair in enumerate(zip(before, changed, strict=True)) if pair[0] != pair[1]
@@ -366,8 +353,7 @@ def test_any_two_way_points_but_the_last_may_change_places():
     stops, _ = changed_stops('expert')
     firsts = set()
     for seed in range(60):
-        faults = WayPointFaults(parse_variant('expert-jumble-1'), np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, []))
+        changed = applied('expert-jumble-1', stops, [], seed)
         firsts.add(next(k for k, stop in enumerate(stops) if stop != changed[k]))
     assert firsts == set(range(len(stops) - 2))
 
@@ -414,8 +400,7 @@ def test_what_was_let_go_before_its_goal_is_dragged_on_from_above(far):
 def test_what_is_next_to_the_goal_is_pushed_once_it_is_done(is_near):
     stops, _ = changed_stops('expert')
     other = np.array([-0.25, 0.35, 0.04]) if is_near else np.array([0.2, 0.3, 0.04])
-    faults = WayPointFaults(parse_variant('expert-jostle-0.05'), np.random.default_rng(0))
-    changed = faults.applied(stops, faults.draws(0.0, [stops[1].position, other]))
+    changed = applied('expert-jostle-0.05', stops, [stops[1].position, other])
     assert changed[:8] == stops[:8] and changed[-1] == stops[-1] and len(changed) == 13
     push = changed[8:12]
     assert all(stop.opening == 0 for stop in push)
@@ -430,11 +415,8 @@ def test_what_is_next_to_the_goal_is_pushed_once_it_is_done(is_near):
 
 def test_down_at_the_object_it_goes_towards_another_one_and_comes_back():
     stops, alone = changed_stops('expert-waver-0.5')
-    own, rng = stops[1].position, np.random.default_rng(0)
-    faults = WayPointFaults(parse_variant('expert-waver-0.5'), rng)
-    changed = faults.applied(
-        stops, faults.draws(0.0, [own, own + [0, 0.1, 0.02], own + [0.3, 0, 0]])
-    )
+    own = stops[1].position
+    changed = applied('expert-waver-0.5', stops, [own, own + [0, 0.1, 0.02], own + [0.3, 0, 0]])
     assert changed[:2] == stops[:2] and changed[4:] == stops[2:]
     np.testing.assert_allclose(changed[2].position - own, [0, 0.05, 0])
     np.testing.assert_array_equal(changed[3].position, own)
@@ -522,8 +504,7 @@ def test_the_other_arm_roams_low_and_open_through_places_near_objects(expert):
 def test_it_first_puts_the_object_next_to_its_own_on_top_of_that():
     stops, alone = changed_stops('expert-heap-0.02')
     own, other = stops[1].position, stops[-1].position + [0.02, 0.05, -0.2]
-    faults = WayPointFaults(parse_variant('expert-heap-0.02'), np.random.default_rng(0))
-    changed = faults.applied(stops, faults.draws(0.0, [own, other]))
+    changed = applied('expert-heap-0.02', stops, [own, other])
     assert changed[8:] == stops
     over, down, shut, raised, above, put, let_go, left = changed[:8]
     assert [stop.opening for stop in changed[:8]] == [1, 1, 0, 0, 0, 0, 1, 1]
@@ -568,11 +549,7 @@ def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, siz
 
 @pytest.mark.parametrize('kind', ['crowd', 'rival'])
 def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert, kind):
-    plans = []
-    for name in ('expert', f'expert-{kind}-1'):
-        policy = scripted_policy(name, 'move_object_two', SEED, expert)
-        policy.reset(seed=SEED)
-        plans.append(policy.plan.positions)
+    plans = [plan(expert, name, 'move_object_two') for name in ('expert', f'expert-{kind}-1')]
     assert len(plans[1]) >= len(plans[0])
     closed = [expert.robot.gripper_openings(positions) < 0.05 for positions in plans]
     lasts = [is_closed.sum(axis=1) for is_closed in closed]
@@ -599,8 +576,7 @@ def test_what_is_held_is_carried_low_to_another_object(seed):
         ('open', goal, 1.0), ('retreat', goal + up, 1.0),
     ]  # fmt: skip
     stops = [WayPoint(phase, place, 0.0, opening) for phase, place, opening in places]
-    faults = WayPointFaults(parse_variant('expert-meet-1'), np.random.default_rng(seed))
-    changed = faults.applied(stops, faults.draws(0.0, [own, other]))
+    changed = applied('expert-meet-1', stops, [own, other], seed)
     (first,) = [k for k, stop in enumerate(changed) if stop.phase == 'open']
     number = {id(stop): k for k, stop in enumerate(stops)}
     assert [number[id(stop)] for stop in changed if id(stop) in number] == list(range(8))
@@ -616,8 +592,7 @@ def test_at_an_object_one_thing_changes_after_the_other():
     place, counts = np.array([0.1, 0.3, 0.05]), {'opening': 0, 'lean': 0, 'yaw': 0, 'position': 0}
     floor = min(stop.position[2] for stop in stops)
     for seed in range(20):
-        faults = WayPointFaults(parse_variant('expert-fidget-6'), np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, [place]))
+        changed = applied('expert-fidget-6', stops, [place], seed)
         own = {id(stop) for stop in stops}
         new = [stop for stop in changed if id(stop) not in own]
         assert len(new) == 9 and len(changed) == len(stops) + 9
@@ -640,8 +615,7 @@ def test_what_is_held_is_pressed_dragged_put_on_objects_and_let_go():
     places = [stops[2].position, np.array([0.1, 0.3, 0.05])]
     low, seen, counts = stops[2].position[2], [], []
     for seed in range(40):
-        faults = WayPointFaults(parse_variant('expert-tinker-6'), np.random.default_rng(seed))
-        changed = faults.applied(stops, faults.draws(0.0, places))
+        changed = applied('expert-tinker-6', stops, places, seed)
         own = {id(stop) for stop in stops}
         new = [number for number, stop in enumerate(changed) if id(stop) not in own]
         assert new == list(range(new[0], new[-1] + 1)), 'in one run'

@@ -57,11 +57,11 @@ class FaultSize(Schema):
     """How large a fault may be.
 
     Attributes:
-        typical: at which success and failure are about as frequent.
-        largest: that a policy may have.
-        unit: of all of them.
-        none: at which there is no fault.
-        ranked: in the rankings of the kind's split.
+        typical: size at which success and failure are about as frequent.
+        largest: largest size of a policy.
+        unit: unit of all sizes; empty = a share or a number.
+        none: size that means no fault.
+        ranked: sizes in the rankings of the kind's split.
     """
 
     typical: Number
@@ -76,16 +76,16 @@ class FaultKind(Schema):
 
     Attributes:
         alias: another name, which earlier recordings have.
-        family: what it is an error of.
+        family: group of kinds, e.g. `timing` or `release`.
         split: `train`, `calibrate` or `test`.
-        size: how large it may be.
-        text: what the size means.
+        size: its typical, largest and ranked sizes.
+        text: meaning of the size, in words.
         contact: whether its failures are failures of contact, which do not show in the arm's path
             alone.
-        needs: what a robot needs for it.
+        needs: parts that a robot must have for it.
         keeps_tempo: added way points take time of their own; else they share the move's.
         edits: steps that change the way points of a move.
-        second_arm: what another arm does meanwhile.
+        second_arm: visit of another arm during the move.
         commands: steps that change the commands of the whole plan.
     """
 
@@ -261,8 +261,8 @@ def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVarian
     """Returns a random policy: the expert, or one or two faults of sizes around the typical one.
 
     Args:
-        kinds: to choose from.
-        rng: draws.
+        kinds: fault kinds to choose from.
+        rng: generator that draws.
     """
     count = int(rng.choice([0, 1, 2], p=[0.12, 0.5, 0.38]))
     chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
@@ -288,8 +288,8 @@ def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
     """Refuses policies with faults of a split.
 
     Args:
-        names: of policies.
-        split: whose kinds must not be there.
+        names: names of policies.
+        split: split whose kinds are refused.
         what: they are not for, in words.
 
     Raises:
@@ -301,9 +301,9 @@ def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
         if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == split])
     }
     if found:
-        told = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
+        listed = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
         raise PolicyError(
-            f'fault kinds of the split {split} are not for {what}: {told}; choose kinds of '
+            f'fault kinds of the split {split} are not for {what}: {listed}; choose kinds of '
             f'{", ".join(s for s in SPLITS if s != split)} (config/faults)'
         )
 

@@ -42,7 +42,7 @@ Rng = np.random.Generator
 
 
 def _own(rng: Rng) -> Rng:
-    """A fault's own generator: whatever it draws, those after it draw the same."""
+    """A generator of the fault's own, so that its draws do not change those of later faults."""
     return np.random.default_rng(rng.integers(2**32))
 
 

@@ -1,4 +1,4 @@
-"""Fault kinds that nobody designed: steps drawn from a seed, with phase, direction and size.
+"""Fault kinds composed from a seed: steps with a drawn phase, direction and size.
 
 A drawn kind is called `drawn_SEED_NUMBER`, and its name alone gives it again. It belongs to the
 split `test`: nothing learns from it.

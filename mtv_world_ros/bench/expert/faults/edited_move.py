@@ -30,8 +30,8 @@ class EditedMove:
 
     Attributes:
         stops: its way points.
-        size: of the fault.
-        draws: what is drawn for the move.
+        size: the fault's size.
+        draws: random draws for the move.
         end: behind the way points that were inserted last.
         there, home: way points of a second arm: where it works, and where it rests.
     """

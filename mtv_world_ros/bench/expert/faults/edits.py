@@ -65,11 +65,11 @@ def changed(
 
     Args:
         stop: the other one.
-        move: that it belongs to.
-        factor: of lengths in `by`.
-        weight: of lengths in `by`, and of angles that are added.
-        place: where it is instead.
-        by: how far it is moved, by direction.
+        move: the move that it belongs to.
+        factor: factor of the lengths in `by`.
+        weight: factor of the lengths in `by` and of angles that are added.
+        place: name of the place that it is moved to.
+        by: displacement, as lengths by direction [m].
         phase: its phase.
         seconds: it takes; the name of a way point = as long as that.
         **shape: `opening`, `yaw` and `lean`.

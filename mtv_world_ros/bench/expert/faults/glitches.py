@@ -1,7 +1,7 @@
 """Glitches: what goes wrong with a policy's commands on their way, drawn at random.
 
 A glitch lasts for a while, somewhere in the plan. Lengths, depths and frequencies are drawn evenly
-over orders of magnitude, so that a few hundred episodes hold what nobody thought of.
+over orders of magnitude, so that a few hundred episodes cover faults of many kinds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SHARE, _LAG_S = (0.3, 1.3), 1.0
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
-    """Returns the positions (T, J) with so many glitches; they may leave the joints' limits."""
+    """Returns the positions (T, J) with `count` glitches; they may leave the joints' limits."""
     changed = commands
     for _ in range(count):
         glitch = _GLITCHES[int(rng.choice(len(_GLITCHES), p=_OFTEN))]
@@ -40,10 +40,7 @@ def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> F
 
 
 def _published(commands: Commands, changed: FloatArray) -> FloatArray:
-    """(T, J) as points of a trajectory tell it: what is quicker nobody is told.
-
-    Straight from point to point where something changed, else as it was.
-    """
+    """(T, J) at the rate of the published points, linear between them where something changed."""
     rows = np.arange(len(changed))
     points = np.append(rows[:: round(_POINTS_S / commands.period)], rows[-1])
     straight = np.stack([np.interp(rows, points, c[points]) for c in changed.T], axis=1)

@@ -28,10 +28,10 @@ class SecondArm(Schema):
 
     Attributes:
         to: the place that it visits, by name.
-        share: of the way there.
+        share: share of the way to that place.
         level: it goes less far in the plane alone.
         like: way point of the first arm that it is like; empty = as it rests.
-        but: how it differs from that.
+        but: changes of that way point.
         rows: its way points, as differences from that.
         before: way point of the first arm before which `done` of the rows are done.
         after: the same after a way point, or after a number of them.
@@ -89,11 +89,11 @@ def visit_of(
     """Returns the visit of a second arm in a move of the first one.
 
     Args:
-        spec: what it does.
+        spec: description of its visit.
         stops: way points of the first arm.
-        size: of the fault.
-        draws: what is drawn for the move.
-        home: where the second arm rests.
+        size: the fault's size.
+        draws: random draws for the move.
+        home: way point at which the second arm rests.
         times: of the first arm's way points, before scaling [s].
     """
     move = EditedMove(stops, size, draws)

@@ -24,7 +24,7 @@ class Commands:
     Attributes:
         positions: (T, J) [rad or m].
         period: between two rows [s].
-        robot: whose joints they are.
+        robot: the robot that these joints belong to.
     """
 
     positions: FloatArray

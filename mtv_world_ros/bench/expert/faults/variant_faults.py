@@ -27,8 +27,8 @@ class WayPointFaults:
     by the kind and the size of their fault alone.
 
     Args:
-        variant: whose faults.
-        rng: draws move and side.
+        variant: the policy variant.
+        rng: generator that draws move and side.
     """
 
     def __init__(self, variant: PolicyVariant, rng: np.random.Generator) -> None:
@@ -79,7 +79,7 @@ class WayPointFaults:
         Args:
             stops: way points of the move, with its faults.
             draws: what is drawn for it.
-            home: where the second arm rests.
+            home: way point at which the second arm rests.
             times: of the way points, before scaling [s].
         """
         visits = (
@@ -98,8 +98,8 @@ def with_faults(
     Args:
         plan: equally spaced.
         variant: its faults of commands are applied.
-        robot: whose joints they are.
-        rng: draws the noise.
+        robot: the robot that these joints belong to.
+        rng: generator that draws the noise.
 
     Raises:
         PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
