@@ -35,7 +35,6 @@ from mtv_world_ros.bench.collect.episode_maker import (
     CollectConfig,
     EpisodeMaker,
     plain_config,
-    Spent,
 )
 from mtv_world_ros.bench.collect.siblings import (
     SceneJob,
@@ -122,7 +121,7 @@ def collect(
     return [data_set.entries[job.path.name] for job in jobs]
 
 
-def _maker(config: CollectConfig) -> Callable[[CollectJob], Spent]:
+def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
     return EpisodeMaker(config).make
 
 

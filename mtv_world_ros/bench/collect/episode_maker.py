@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 import json
-import time
 from typing import Any
 
 import numpy as np
@@ -79,16 +78,6 @@ class CollectConfig:
             )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Spent:
-    """Time that one episode took, dropped attempts included [s], and its frames."""
-
-    physics_s: float
-    rendering_s: float
-    writing_s: float
-    num_frames: int
-
-
 def plain_config(config: CollectConfig) -> dict[str, Any]:
     """Returns the configuration as the card has it, with the cameras of the robot's workcell."""
     workcell = workcell_of(load_robot(bundled('robots', config.robot, '--robot')))
@@ -108,30 +97,21 @@ class EpisodeMaker:
         self._config = config
         self._expert = Expert(self._robot, config.expert, config.physics)
 
-    def make(self, job: CollectJob) -> Spent:
+    def make(self, job: CollectJob) -> None:
         """Simulates attempts until one is as wanted, and writes it.
 
         Raises:
             SimulatorError: none of `max_attempts` seeds gave the wanted outcome, or the episode
                 cannot be written.
         """
-        physics = rendering = 0.0
         attempts = range(self._config.record.max_attempts)
         for attempt in attempts if job.attempt is None else (job.attempt,):
             seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
             sim, take = self._attempt(job, seed)
             try:
-                if take is None:
-                    continue
-                physics, rendering = physics + take.physics_s, rendering + take.rendering_s
-                if take.is_as_wanted():
-                    writing = self._write(job, sim, take, seed, attempt)
-                    return Spent(
-                        physics_s=physics,
-                        rendering_s=rendering,
-                        writing_s=writing,
-                        num_frames=len(take.observations),
-                    )
+                if take is not None and take.is_as_wanted():
+                    self._write(job, sim, take, seed, attempt)
+                    return
             finally:
                 sim.close()
         episode = f"episode {job.index} of task '{job.task}' (seed {job.seed})"
@@ -192,8 +172,7 @@ class EpisodeMaker:
 
     def _write(
         self, job: CollectJob, sim: SimEpisode, take: Take, seed: int, attempt: int
-    ) -> float:
-        started = time.perf_counter()
+    ) -> None:
         extra = {'attempt': str(attempt), 'index': str(job.index), **dict(job.more)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
@@ -204,7 +183,6 @@ class EpisodeMaker:
             write_take(job.path, sim, take, seed, self._config.record, **extra)
         except (OSError, EpisodeError) as error:
             raise SimulatorError(f"cannot write '{job.path}': {error}; {GO_ON}") from error
-        return time.perf_counter() - started
 
 
 def cameras_of(seed: int, config: CollectConfig) -> RandomizationConfig:

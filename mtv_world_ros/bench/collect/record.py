@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-import time
 
 import numpy as np
 
@@ -92,8 +91,6 @@ class Take:
         moved: role -> distance of the object from its start at the end [m].
         missed: role of the object that the gripper is to miss; None = none.
         any_outcome: the policy has faults, and what comes of them is as wanted.
-        physics_s: time of planning and physics.
-        rendering_s: time of building the scene and rendering.
         object_poses: (T, O, 4, 4) T_base_object [m].
     """
 
@@ -105,8 +102,6 @@ class Take:
     moved: dict[str, float]
     missed: str | None = None
     any_outcome: bool = False
-    physics_s: float
-    rendering_s: float
     object_poses: FloatArray
 
     def is_as_wanted(self) -> bool:
@@ -148,23 +143,18 @@ def simulate(
         SimulatorError: the expert cannot reach a way point.
         PolicyError: the variant finds no plan.
     """
-    started = time.perf_counter()
     first = sim.reset(seed, task)
-    rendering = time.perf_counter() - started
     if variant is None:
         commands = expert.plan(task, sim.scene, expert_generator(seed), miss=miss)
     else:
         policy = ScriptedPolicy(variant, expert, task, sim.scene)
         policy.reset(seed=seed)
         commands = policy.plan
-    planning = time.perf_counter() - started - rendering
     take = carry_out(sim, task, commands, first, config)
     return replace(
         take,
         missed=expert.missed_object(task, expert_generator(seed)) if miss else None,
         any_outcome=variant is not None,
-        physics_s=take.physics_s + planning,
-        rendering_s=take.rendering_s + rendering,
     )
 
 
@@ -184,7 +174,6 @@ def carry_out(
         first: the simulator's first observation.
         config: sampling of frames and commands.
     """
-    started, rendering = time.perf_counter(), 0.0
     commands = as_published(commands, config)
     observations, measured = [first], [sim.positions()]
     last = len(commands.times) - 1
@@ -194,9 +183,7 @@ def carry_out(
         sim.advance(commands.positions[min(k, last)])
         measured.append(sim.positions())
         if k == config.frame_at(len(observations)):
-            before = time.perf_counter()
             observations.append(sim.observe(rendering=config.pictures == 'all'))
-            rendering += time.perf_counter() - before
     situation = sim.situation()
     ever, final = ever_and_final(task.succeeds(situation))
     return Take(
@@ -209,8 +196,6 @@ def carry_out(
             role: float(np.linalg.norm(centres[-1] - centres[0]))
             for role, centres in situation.positions.items()
         },
-        physics_s=time.perf_counter() - started - rendering,
-        rendering_s=rendering,
         object_poses=sim.seen_poses(),
     )
 
