@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 from tqdm import tqdm
 
 from mtv_world_ros.bench.collect.episode_jobs import CollectJob, episode_seed
@@ -250,19 +251,15 @@ def search_siblings(
     return {scene.name: found[scene.name] for scene in scenes}
 
 
+_SCENES = TypeAdapter(dict[str, SearchedScene])
+
+
 def _read(path: Path) -> dict[str, SearchedScene]:
     if not path.is_file():
         return {}
     try:
-        stored = read_json(path)
-        return {
-            name: SearchedScene(
-                siblings=tuple(Sibling(**one) for one in values['siblings']),
-                skipped=values['skipped'],
-            )
-            for name, values in stored.items()
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return _SCENES.validate_python(read_json(path))
+    except (OSError, ValueError) as error:
         raise SimulatorError(
             f"'{path}' is not what 'collect --siblings' writes ({error!r}); move it away"
         ) from error

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import isfinite, nan
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, ConfigDict, TypeAdapter
 
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed
 from mtv_world_ros.bench.expert.expert import Expert
@@ -16,6 +18,8 @@ from mtv_world_ros.data_types import SuccessEstimate
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.success.estimator import verdict
 
+#: NaN is null in a file
+Number = Annotated[float, BeforeValidator(lambda value: nan if value is None else value)]
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (
     'place_block_a2b_left',
@@ -83,9 +87,11 @@ class Judged:
         reasons: evidence of the estimate, or why it abstains.
     """
 
-    probability: float
-    interval: tuple[float, float]
-    jaccard: tuple[tuple[float, ...], ...]
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
+    probability: Number
+    interval: tuple[Number, Number]
+    jaccard: tuple[tuple[Number, ...], ...]
     reasons: tuple[str, ...]
 
     @classmethod
@@ -114,25 +120,10 @@ class Judged:
         interval = (probability, probability)
         return cls(probability=probability, interval=interval, jaccard=(), reasons=(reason,))
 
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Judged:
-        """Reads what `Result.as_json` wrote."""
-        low, high = map(_number, values['interval'])
-        return cls(
-            probability=_number(values['probability']),
-            interval=(low, high),
-            jaccard=tuple(tuple(map(_number, row)) for row in values['jaccard']),
-            reasons=tuple(values['reasons']),
-        )
-
     @property
     def success(self) -> float:
         """1 or 0; NaN where there is no verdict, see `verdict`."""
         return verdict(self.probability)
-
-
-def _number(value: float | None) -> float:
-    return nan if value is None else float(value)
 
 
 _NOT_MEASURED = Judged.stated(nan, 'abstains: not measured')
@@ -158,29 +149,24 @@ class Course:
             NaN = never.
     """
 
-    times: tuple[float, ...]
-    command_gaps: tuple[float, ...]
-    overlaps: tuple[float, ...]
-    ends: tuple[float, ...]
-    seen: tuple[float, ...]
-    imagined: tuple[float, ...]
-    commands_part_s: float = nan
-    objects_part_s: float = nan
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
+    times: tuple[Number, ...]
+    command_gaps: tuple[Number, ...]
+    overlaps: tuple[Number, ...]
+    ends: tuple[Number, ...]
+    seen: tuple[Number, ...]
+    imagined: tuple[Number, ...]
+    commands_part_s: Number = nan
+    objects_part_s: Number = nan
     parted_object: str = ''
-    verdicts_part_s: float = nan
+    verdicts_part_s: Number = nan
 
     @property
     def part_s(self) -> float:
         """When commands or objects first part [s]; NaN = never."""
         known = [t for t in (self.commands_part_s, self.objects_part_s) if isfinite(t)]
         return min(known, default=nan)
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Course:
-        """Reads plain values, NaN as None."""
-        many = ('times', 'command_gaps', 'overlaps', 'ends', 'seen', 'imagined')
-        read = {key: nan if value is None else value for key, value in values.items()}
-        return cls(**{**read, **{key: tuple(map(_number, values[key])) for key in many}})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,6 +195,8 @@ class Result:
         course: commands, overlaps and estimates over time in both worlds; None = not known.
         files: pictures of it in base64 by suffix, where they are not yet written beside it.
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     policy: str
     task: str
@@ -241,12 +229,15 @@ class Result:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Result:
-        """Reads what `as_json` returned, NaN as null."""
-        keys = ('imagined', 'foreseen', 'pictures', 'seen', 'no_picture')
-        judged = {key: Judged.from_json(values[key]) for key in keys if key in values}
-        course = values.get('course')
-        course = None if course is None else Course.from_json(course)
-        return cls(**{**values, **judged, 'course': course})
+        """Reads what `as_json` returned, NaN as null.
+
+        Raises:
+            ValueError: a key is unknown or missing, or a value is wrong.
+        """
+        return _RESULT.validate_python(values)
+
+
+_RESULT = TypeAdapter(Result)
 
 
 def policies_named(text: str) -> tuple[str, ...]:

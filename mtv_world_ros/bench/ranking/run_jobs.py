@@ -167,9 +167,10 @@ def read_results(out: Path) -> list[Result]:
         try:
             found.append(Result.from_json(read_json(path)['result']))
         except (OSError, ValueError, KeyError, TypeError) as error:
+            reason = f'{type(error).__name__}: {" ".join(str(error).split())}'
             raise ConfigError(
-                f"'{path}' cannot be read ({type(error).__name__}: {error}); run `mtv-world rank` "
-                'again: it goes on where it stopped'
+                f"'{path}' cannot be read ({reason}); run `mtv-world rank` again: it goes on "
+                'where it stopped'
             ) from error
     return found
 
