@@ -19,7 +19,7 @@ from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.success.estimator import verdict
 
 #: NaN is null in a file
-Number = Annotated[float, BeforeValidator(lambda value: nan if value is None else value)]
+_Float = Annotated[float, BeforeValidator(lambda value: nan if value is None else value)]
 #: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (
     'place_block_a2b_left',
@@ -89,9 +89,9 @@ class Judged:
 
     __pydantic_config__ = ConfigDict(extra='forbid')
 
-    probability: Number
-    interval: tuple[Number, Number]
-    jaccard: tuple[tuple[Number, ...], ...]
+    probability: _Float
+    interval: tuple[_Float, _Float]
+    jaccard: tuple[tuple[_Float, ...], ...]
     reasons: tuple[str, ...]
 
     @classmethod
@@ -151,16 +151,16 @@ class Course:
 
     __pydantic_config__ = ConfigDict(extra='forbid')
 
-    times: tuple[Number, ...]
-    command_gaps: tuple[Number, ...]
-    overlaps: tuple[Number, ...]
-    ends: tuple[Number, ...]
-    seen: tuple[Number, ...]
-    imagined: tuple[Number, ...]
-    commands_part_s: Number = nan
-    objects_part_s: Number = nan
+    times: tuple[_Float, ...]
+    command_gaps: tuple[_Float, ...]
+    overlaps: tuple[_Float, ...]
+    ends: tuple[_Float, ...]
+    seen: tuple[_Float, ...]
+    imagined: tuple[_Float, ...]
+    commands_part_s: _Float = nan
+    objects_part_s: _Float = nan
     parted_object: str = ''
-    verdicts_part_s: Number = nan
+    verdicts_part_s: _Float = nan
 
     @property
     def part_s(self) -> float:
