@@ -1,4 +1,4 @@
-"""Simulates one episode with the expert or a faulty variant of it; writes and reads its bag."""
+"""Simulates one episode with the expert or a faulty variant of it; writes its bag."""
 
 from __future__ import annotations
 
@@ -11,23 +11,15 @@ import numpy as np
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import PolicyVariant
 from mtv_world_ros.bench.expert.scripted_policy import ScriptedPolicy
-from mtv_world_ros.bench.tasks.tasks import Task, task_named
-from mtv_world_ros.bench.world.recorded_scene import dump_scene, SCENE, scene_of
-from mtv_world_ros.bench.world.simulator import (
-    CONTROL_PERIOD_S,
-    SimEpisode,
-    SimObservation,
-    situation_of,
-)
-from mtv_world_ros.bench.world.workcell import workcell_of
-from mtv_world_ros.data.episode import Episode, PHYSICS
+from mtv_world_ros.bench.tasks.tasks import Task
+from mtv_world_ros.bench.world.recorded_scene import dump_scene, SCENE
+from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
+from mtv_world_ros.data.episode import PHYSICS
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError, SimulatorError
+from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final
 
 #: stamp of every episode's first frame [ns]; ROS takes zero for "not set"
@@ -294,26 +286,6 @@ def write_take(
             if k % chunk_every == 0 and k < last:
                 commands = chunk(take.commands, k * CONTROL_PERIOD_S, config)
                 writer.write_trajectory(stamp, commands)
-
-
-def true_poses(episode: Episode, robot: RobotModel) -> TruePoses:
-    """Returns where the objects of a simulated episode were, at every frame.
-
-    Sizes and goals are those of the scene, see `scene_of`.
-
-    Raises:
-        EpisodeError: it holds no poses, or its scene is not known.
-    """
-    info = episode.info
-    states = episode.joint_states
-    if episode.object_poses is None or states is None:
-        raise EpisodeError(f"'{info.path}' has no object poses; only simulated ones do")
-    scene = scene_of(episode, workcell_of(robot))
-    task = task_named(info.task)
-    stamps, poses = episode.object_poses
-    rows = np.searchsorted(states.stamps_ns, stamps)
-    openings = robot.gripper_openings(states.positions[rows])
-    return situation_of(scene, task, poses, openings)
 
 
 def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:

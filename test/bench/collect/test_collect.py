@@ -16,10 +16,12 @@ from rosbags.typesys import get_typestore, Stores
 from mtv_world_ros.bench.collect.collect_dataset import collect, locked
 from mtv_world_ros.bench.collect.episode_jobs import episode_seed, jobs_of, misses
 from mtv_world_ros.bench.collect.episode_maker import CollectConfig
-from mtv_world_ros.bench.collect.record import RecordConfig, true_poses
+from mtv_world_ros.bench.collect.record import RecordConfig
 from mtv_world_ros.bench.tasks.tasks import task_named, tasks_named
 from mtv_world_ros.bench.world.randomize import RandomizationConfig
-from mtv_world_ros.bench.world.recorded_scene import SCENE
+from mtv_world_ros.bench.world.recorded_scene import SCENE, scene_of
+from mtv_world_ros.bench.world.simulator import situation_of
+from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import iter_messages, read_episode, read_info
 from mtv_world_ros.errors import EpisodeError, SimulatorError
@@ -322,9 +324,11 @@ def test_relations_on_recorded_poses_say_what_was_recorded(data_set, robot):
     outcomes = set()
     for name in _names(data_set):
         episode = read_episode(data_set / name)
-        ever, final = ever_and_final(
-            task_named(episode.info.task).succeeds(true_poses(episode, robot))
-        )
+        task, scene = task_named(episode.info.task), scene_of(episode, workcell_of(robot))
+        stamps, poses = episode.object_poses
+        rows = np.searchsorted(episode.joint_states.stamps_ns, stamps)
+        openings = robot.gripper_openings(episode.joint_states.positions[rows])
+        ever, final = ever_and_final(task.succeeds(situation_of(scene, task, poses, openings)))
         assert episode.info.metadata['ever'] == str(ever).lower()
         assert episode.info.metadata['final'] == str(final).lower()
         outcomes.add(episode.info.outcome == 'success')
@@ -332,16 +336,14 @@ def test_relations_on_recorded_poses_say_what_was_recorded(data_set, robot):
     assert True in outcomes
 
 
-def test_poses_of_an_episode_whose_scene_is_not_known_are_refused(data_set, robot):
+def test_an_episode_whose_scene_is_not_known_is_refused(data_set, robot):
     episode = read_episode(data_set / _names(data_set)[0])
     rest = {key: text for key, text in episode.info.metadata.items() if key != SCENE}
     seed = episode.info.seed
     assert seed is not None
     other = replace(episode, info=replace(episode.info, seed=seed + 1, metadata=rest))
     with pytest.raises(EpisodeError, match='record it again with mtv-world collect'):
-        true_poses(other, robot)
-    with pytest.raises(EpisodeError, match='no object poses'):
-        true_poses(replace(episode, object_poses=None), robot)
+        scene_of(other, workcell_of(robot))
 
 
 def test_81_frames_at_16_fps_and_288x384_can_be_cut(tmp_path, data_set):

@@ -54,6 +54,10 @@ class EditedMove:
                 return max(self.index('open') - 2, 0)
         return next(i for i, stop in enumerate(self.stops) if stop.phase == name)
 
+    def number_of(self, stop: WayPoint) -> int:
+        """Returns the number of a way point."""
+        return next(i for i, other in enumerate(self.stops) if other is stop)
+
     def stop(self, name: str) -> WayPoint:
         """Returns a way point by name."""
         return self.there if name == 'there' else self.stops[self.index(name)]
@@ -186,8 +190,7 @@ def unit(way: FloatArray) -> FloatArray:
 
 def _wandering(move: EditedMove, stop: WayPoint) -> FloatArray:
     """An error of its own, by the size, but not below the lowest way point."""
-    number = next(i for i, other in enumerate(move.stops) if other is stop)
-    x, y, z = move.size * move.draws.errors[number]
+    x, y, z = move.size * move.draws.errors[move.number_of(stop)]
     floor = min(other.position[2] for other in move.stops)
     return np.array([x, y, max(stop.position[2] + z, floor) - stop.position[2]])
 

@@ -40,13 +40,9 @@ def _number(spec: Any, old: float, move: EditedMove, stop: WayPoint, weight: flo
         case {'add': value, 'side': side}:
             return old + weight * move.side(side) * move.length(value)
         case {'noise': value}:
-            error = move.draws.openings[_number_of(move, stop)]
+            error = move.draws.openings[move.number_of(stop)]
             return float(np.clip(old + move.length(value) * error, 0.0, 1.0))
     return old
-
-
-def _number_of(move: EditedMove, stop: WayPoint) -> int:
-    return next(i for i, other in enumerate(move.stops) if other is stop)
 
 
 def changed(
