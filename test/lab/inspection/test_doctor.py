@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode import Track
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.shape import draw_silhouettes, load_shape, rods
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.inspect import Inspector, load_inspector
-from mtv_world_ros.lab.inspection.motion_residual import measure_residual, ResidualSearch
+from mtv_world_ros.lab.inspection.inspect import delays, Inspector, load_inspector
+from mtv_world_ros.lab.inspection.motion_residual import (
+    measure_residual,
+    MotionResidual,
+    ResidualSearch,
+)
 
 QUICK = ResidualSearch(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
 
@@ -220,3 +225,27 @@ def test_rods_run_from_joint_to_joint_and_to_the_tool(tmp_path):
     ends = shape.parts[0].points[:, 2]
     assert (ends.min(), ends.max()) == pytest.approx((0, 0.3))
     assert robot.joint_names == ('turn',)
+
+
+@pytest.mark.parametrize(
+    ('views', 'told'),
+    [
+        ({'a': (0.4, 0.05)}, {'a'}),
+        ({'a': (0.4, 0.02)}, set()),  # fits hardly better, or in one half of the recording alone
+        ({'a': (0.4, 0.05), 'b': (-0.4, 0.05)}, set()),  # the same clock cannot be early and late
+        ({'a': (0.4, 0.05), 'b': (0.0, 0.0)}, {'a'}),  # a camera of its own may be slow
+        ({'a': (0.2, 0.05)}, set()),  # one frame at 5 Hz
+        ({'a': (0.2, 0.15)}, {'a'}),
+    ],
+)
+def test_a_delay_is_told_where_the_data_show_it(views, told):
+    stamps = np.arange(40, dtype=np.int64) * 200_000_000
+    track = Track(stamps, np.zeros((40, 2, 2, 3), np.uint8))
+    measured = {
+        view: (MotionResidual(lag_s=lag_s, lag_gain=gain, num_pairs=20), track)
+        for view, (lag_s, gain) in views.items()
+    }
+    found = delays(measured)
+    assert set(found) == told
+    for view in told:
+        assert f'{views[view][0]:+.1f} s later' in found[view][0].text
