@@ -325,6 +325,9 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _calibrate_camera(arguments: argparse.Namespace) -> int:
+    if not arguments.views or arguments.same_focal and len(arguments.views) < 2:
+        least = 'two views, e.g. --view front,side' if arguments.same_focal else 'a view'
+        raise ConfigError(f"--view '{','.join(arguments.views)}': name at least {least}")
     if is_shared(arguments):
         return calibrate_shared(arguments)
     arguments.episode, arguments.view = arguments.episodes[0], arguments.views[0]

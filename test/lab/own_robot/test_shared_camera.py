@@ -115,3 +115,11 @@ def test_points_that_are_none_are_named(recorded, tmp_path, capsys):
         file.write_text(text)
         assert main([*command, '--points', str(file)]) == 1
         assert said in capsys.readouterr().err
+
+
+def test_one_focal_length_is_of_two_views_or_more(recorded, capsys):
+    _, _, paths = recorded
+    assert main(['calibrate-camera', str(paths[0]), '--view', 'door', '--same-focal']) == 1
+    assert 'at least two views' in capsys.readouterr().err
+    assert main(['calibrate-camera', str(paths[0]), '--view', ',']) == 1
+    assert 'at least a view' in capsys.readouterr().err
