@@ -96,7 +96,7 @@ def more(parser: argparse.ArgumentParser) -> None:
 
 def policies_of(faults: str, size: float, count: int) -> list[str]:
     """Returns the expert and a policy of each kind of fault; known ones in their usual size."""
-    sizes = {kind: size if is_drawn(kind) else FAULTS[kind].typical for kind in kinds_of(faults)}
+    sizes = {kind: size if is_drawn(kind) else FAULTS[kind].size.typical for kind in kinds_of(faults)}
     return [EXPERT, *(PolicyVariant.of({k: v}).name for k, v in sizes.items())][:count]
 
 
