@@ -96,7 +96,8 @@ def more(parser: argparse.ArgumentParser) -> None:
 
 def policies_of(faults: str, size: float, count: int) -> list[str]:
     """Returns the expert and a policy of each kind of fault; known ones in their usual size."""
-    sizes = {kind: size if is_drawn(kind) else FAULTS[kind].size.typical for kind in kinds_of(faults)}
+    kinds = kinds_of(faults)
+    sizes = {kind: size if is_drawn(kind) else FAULTS[kind].size.typical for kind in kinds}
     return [EXPERT, *(PolicyVariant.of({k: v}).name for k, v in sizes.items())][:count]
 
 
